@@ -122,7 +122,7 @@ def ray_rows(sensor: SensorCalibration, placing: BaseTransform, repeats: int) ->
     return [
         (
             "undistort, sheet, pose",
-            lambda: base_from_sensor.apply(intersect_sheets(pixels, sheet, sensor)[0]),
+            lambda: intersect_sheets(pixels, sheet, sensor, base_from_sensor),
             repeats,
             0,
         ),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Self, TypeAlias, dataclass_transform
 
@@ -55,7 +56,12 @@ def frozen_floats(
         If the shape differs or a value is not finite.
     """
     array: FloatArray = _frozen(values, np.dtype(np.float64), shape, name)
-    if (allow_nan and allow_infinite) or np.isfinite(array).all():
+    if allow_nan and allow_infinite:
+        return array
+    with np.errstate(all="ignore"):
+        total = float(array.sum())
+    # a sum is finite only where all its terms are, and needs no array of answers
+    if math.isfinite(total) or np.isfinite(array).all():
         return array
     bad = ~np.isfinite(array)
     if allow_nan or allow_infinite:

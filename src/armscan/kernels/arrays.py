@@ -37,6 +37,8 @@ MapOut: TypeAlias = NDArray[np.int32]
 TableOut: TypeAlias = NDArray[np.float64]
 FloatsOut: TypeAlias = NDArray[np.float64]
 IntsOut: TypeAlias = NDArray[np.int64]
+Three: TypeAlias = tuple[float, float, float]
+Four: TypeAlias = tuple[float, float, float, float]
 
 _TYPES: dict[str, Any] = {
     "Image": types.Array(types.float32, 2, "C", readonly=True),
@@ -59,6 +61,8 @@ _TYPES: dict[str, Any] = {
     "None": types.void,
     "bool": types.boolean,
     "tuple[int, int]": types.UniTuple(types.int64, 2),  # type: ignore[no-untyped-call]
+    "Three": types.UniTuple(types.float64, 3),  # type: ignore[no-untyped-call]
+    "Four": types.UniTuple(types.float64, 4),  # type: ignore[no-untyped-call]
 }
 """Inputs are read-only, so that frozen records and writable arrays share one compiled version."""
 
@@ -70,27 +74,41 @@ ROW = 1
 """A point at an integer row: its centre was sought along that row."""
 
 
+FUSED = frozenset({"contract", "reassoc", "arcp", "nsz"})
+"""Freedoms of arithmetic that leave NaN and infinity what they are."""
+
+
 def compiled(
-    *, fastmath: bool = False, error_model: Literal["python", "numpy"] = "python"
+    *,
+    fastmath: bool | frozenset[str] = False,
+    error_model: Literal["python", "numpy"] = "python",
+    is_inlined: bool = False,
 ) -> Callable[[F], F]:
     """Compile a kernel for the types that its annotations name (the aliases of this module).
 
     Parameters
     ----------
     fastmath
-        Sums may be taken in another order.
+        Sums may be taken in another order; or which freedoms there are.
     error_model
         ``numpy``: a division by zero gives infinity or NaN instead of an exception.
+    is_inlined
+        Becomes a part of the loops that call it, without which these are not vectorised.
     """
+    freedoms = set(fastmath) if isinstance(fastmath, frozenset) else fastmath
 
     def compile_kernel(kernel: F) -> F:
         named = dict(kernel.__annotations__)
         signature = _TYPES[named.pop("return")](*(_TYPES[name] for name in named.values()))
 
         def built(*, cache: bool) -> F:
-            found: Any = njit(cache=cache, nogil=True, fastmath=fastmath, error_model=error_model)(
-                kernel
-            )
+            found: Any = njit(
+                cache=cache,
+                nogil=True,
+                fastmath=freedoms,
+                error_model=error_model,
+                forceinline=is_inlined,
+            )(kernel)
             if found is kernel:
                 # compilation is switched off, as for a debugger
                 return kernel

@@ -8,13 +8,16 @@ import math
 import numpy as np
 
 from armscan.kernels.arrays import (
+    FUSED,
     Floats,
     FloatsOut,
+    Four,
     Ints,
     IntsOut,
     IntTable,
     Table,
     TableOut,
+    Three,
     compiled,
 )
 
@@ -25,12 +28,14 @@ SHEET_STEPS = 12
 SHEET_TOLERANCE_MM = 1e-6
 SETTLED_MM = 1e-7
 """Of a step along the ray; Newton's next one is its square."""
+LEAST_SLOPE = 1e-6
+"""Of a ray to a sheet, below which it is left to the careful search."""
 NEAREST_SOURCE = 0.2
 """As in the models of the camera and the light sheet."""
 
 
 @compiled(error_model="numpy")
-def _distort(x: float, y: float, camera: Floats, out: FloatsOut) -> None:
+def distort(x: float, y: float, camera: Floats, out: FloatsOut) -> None:
     """Distorted x and y, and their derivatives xx, xy = yx, yy, into ``out`` (5,)."""
     k1, k2, p1, p2, k3 = camera[4], camera[5], camera[6], camera[7], camera[8]
     r2 = x * x + y * y
@@ -45,19 +50,14 @@ def _distort(x: float, y: float, camera: Floats, out: FloatsOut) -> None:
 
 
 @compiled(error_model="numpy")
-def _undistort(
-    u: float, v: float, from_u: float, from_v: float, camera: Floats, out: FloatsOut
-) -> bool:
-    """Newton's inverse of `_distort`: x and y into ``out`` (7,) behind its five numbers.
-
-    It begins ``from_u``, ``from_v`` beside the distorted place.
-    """
-    x = u + from_u
-    y = v + from_v
+def _undistort(u: float, v: float, camera: Floats, out: FloatsOut) -> bool:
+    """Newton's inverse of `distort`: x and y into ``out`` (7,) behind its five numbers."""
+    x = u
+    y = v
     if not (math.isfinite(u) and math.isfinite(v)):
         return False
     for _ in range(RAY_STEPS):
-        _distort(x, y, camera, out)
+        distort(x, y, camera, out)
         det = out[2] * out[4] - out[3] * out[3]
         if not (det > 0.0 and out[2] > 0.0):
             return False
@@ -75,7 +75,7 @@ def _undistort(
 
 
 @compiled(error_model="numpy")
-def _height(x: float, y: float, z: float, sheet: Floats, out: FloatsOut) -> None:
+def height_of(x: float, y: float, z: float, sheet: Floats, out: FloatsOut) -> None:
     """Distance from a sheet, its gradient, and by the parameters, into ``out`` (12,).
 
     ``sheet``: (20,) origin, axes, scale, bow, fan.
@@ -120,7 +120,7 @@ def _height(x: float, y: float, z: float, sheet: Floats, out: FloatsOut) -> None
 
 @compiled(error_model="numpy")
 def _meet(x: float, y: float, sheet: Floats, out: FloatsOut) -> float:
-    """Depth at which the ray (x, y, 1) meets a sheet, 0 if it does not; ``out`` as `_height`."""
+    """Depth at which the ray (x, y, 1) meets a sheet, 0 if it does not; ``out`` as `height_of`."""
     slope = x * sheet[9] + y * sheet[10] + sheet[11]
     if not abs(slope) > 1e-9 * math.sqrt(x * x + y * y + 1.0):
         return 0.0
@@ -130,7 +130,7 @@ def _meet(x: float, y: float, sheet: Floats, out: FloatsOut) -> float:
         is_bowed = is_bowed or sheet[i] != 0.0
     step = 0.0
     for _ in range(SHEET_STEPS if is_bowed else 0):
-        _height(x * depth, y * depth, depth, sheet, out)
+        height_of(x * depth, y * depth, depth, sheet, out)
         along = x * out[1] + y * out[2] + out[3]
         if not abs(along) > 1e-9:
             return 0.0
@@ -141,102 +141,214 @@ def _meet(x: float, y: float, sheet: Floats, out: FloatsOut) -> float:
     return depth if depth > 0.0 and abs(step) < SHEET_TOLERANCE_MM else 0.0
 
 
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def bow_and_slopes(u: float, v: float, sheet: Floats) -> Three:
+    """Height of the bow over a sheet's plane, and its slopes by u and v; see `height_of`."""
+    lean = sheet[18]
+    w = 1.0 + sheet[19] * v
+    spread = sheet[19] if w > NEAREST_SOURCE else 0.0
+    w = w if w > NEAREST_SOURCE else NEAREST_SOURCE
+    u0 = (u - lean * v) / w
+    root = math.sqrt(1.0 + sheet[19] * u0 * (sheet[19] * u0))
+    both = 1.0 + root
+    share = 2.0 * u0 / (root * both)
+    square = sheet[13] * u0 * root * share + sheet[16] * u0 * u0 * u0
+    slope = sheet[13] * both * share + 3.0 * sheet[16] * u0 * u0
+    along_v = sheet[14] + sheet[17] * u
+    bow = w * square + v * (u * along_v + sheet[15] * v)
+    by_u = slope + v * (along_v + sheet[17] * u)
+    by_v = spread * (square - u0 * slope) - lean * slope + u * along_v + 2.0 * sheet[15] * v
+    return bow, by_u, by_v
+
+
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def lens_slopes(x: float, y: float, camera: Floats) -> Four:
+    """What `distort` gives: the derivatives xx, xy, yy of the lens, and its radial factor."""
+    k1, k2, p1, p2, k3 = camera[4], camera[5], camera[6], camera[7], camera[8]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))
+    xx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+    xy = x * y * slope + 2.0 * (p1 * x + p2 * y)
+    yy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+    return xx, xy, yy, radial
+
+
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def _lens_step(x: float, y: float, u: float, v: float, camera: Floats, safe: float) -> Four:
+    """One of Newton's steps to the inverse of `distort`.
+
+    The new place, the step's size, and the least of ``safe`` and what it divides by.
+    """
+    p1, p2 = camera[6], camera[7]
+    xx, xy, yy, radial = lens_slopes(x, y, camera)
+    r2 = x * x + y * y
+    ex = x * radial + p1 * 2.0 * x * y + p2 * (r2 + 2.0 * x * x) - u
+    ey = y * radial + p1 * (r2 + 2.0 * y * y) + p2 * 2.0 * x * y - v
+    det = xx * yy - xy * xy
+    safe = det if det < safe else safe
+    safe = xx if xx < safe else safe
+    step_x = (yy * ex - xy * ey) / det
+    step_y = (xx * ey - xy * ex) / det
+    return x - step_x, y - step_y, abs(step_x) + abs(step_y), safe
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def _meet_run(
+    pixels: Floats, camera: Floats, sheet: Floats, turn: Floats, points: FloatsOut, is_met: IntsOut
+) -> None:
+    """Points of pixels on one sheet, by a fixed count of steps without a branch.
+
+    That count is enough for usual lenses and sheets. ``is_met`` is 0 for a point for which it was
+    not, or for which anything is doubtful: `meet_sheets` asks again.
+    """
+    lens = camera.copy()
+    bow = sheet.copy()
+    fx, fy, cx, cy = 1.0 / lens[0], 1.0 / lens[1], lens[2], lens[3]
+    fold = lens[9] * lens[9]
+    scale = 1.0 / bow[12]
+    ux, uy, uz = bow[3] * scale, bow[4] * scale, bow[5] * scale
+    vx, vy, vz = bow[6] * scale, bow[7] * scale, bow[8] * scale
+    nx, ny, nz = bow[9], bow[10], bow[11]
+    origin_u = bow[0] * ux + bow[1] * uy + bow[2] * uz
+    origin_v = bow[0] * vx + bow[1] * vy + bow[2] * vz
+    origin_n = bow[0] * nx + bow[1] * ny + bow[2] * nz
+    for i in range(is_met.shape[0]):
+        u = (pixels[2 * i] - cx) * fx
+        v = (pixels[2 * i + 1] - cy) * fy
+        x, y, _, safe = _lens_step(u, v, u, v, lens, 1.0)
+        x, y, _, safe = _lens_step(x, y, u, v, lens, safe)
+        x, y, shift, safe = _lens_step(x, y, u, v, lens, safe)
+        by_u = x * ux + y * uy + uz
+        by_v = x * vx + y * vy + vz
+        by_n = x * nx + y * ny + nz
+        depth = origin_n / by_n
+        high, _, _ = bow_and_slopes(depth * by_u - origin_u, depth * by_v - origin_v, bow)
+        depth += high / by_n
+        high, slope_u, slope_v = bow_and_slopes(
+            depth * by_u - origin_u, depth * by_v - origin_v, bow
+        )
+        per_mm = 1.0 / (by_n - slope_u * by_u - slope_v * by_v)
+        depth -= (depth * by_n - origin_n - high) * per_mm
+        high, _, _ = bow_and_slopes(depth * by_u - origin_u, depth * by_v - origin_v, bow)
+        step = (depth * by_n - origin_n - high) * per_mm
+        depth -= step
+        is_settled = (safe > 0.0) & (shift < RAY_TOLERANCE) & (abs(step) < SETTLED_MM)
+        is_settled &= (x * x + y * y < fold) & (abs(by_n) > LEAST_SLOPE) & (depth > 0.0)
+        is_met[i] = 1 if is_settled else 0
+        points[3 * i] = depth * (turn[0] * x + turn[1] * y + turn[2]) + turn[3]
+        points[3 * i + 1] = depth * (turn[4] * x + turn[5] * y + turn[6]) + turn[7]
+        points[3 * i + 2] = depth * (turn[8] * x + turn[9] * y + turn[10]) + turn[11]
+
+
 @compiled(error_model="numpy")
 def meet_sheets(
-    pixels: Table,
+    pixels: Floats,
     sheet: Ints,
     camera: Floats,
     sheets: Table,
-    points: TableOut,
+    turn: Floats,
+    points: FloatsOut,
     is_met: IntsOut,
-    by_px: TableOut,
-    by_sensor: TableOut,
 ) -> None:
-    """Intersect the rays of pixels with light sheets, with derivatives if asked.
+    """Intersect the rays of pixels with light sheets.
 
-    ``pixels``: (N, 2). ``sheet``: (N,) row of ``sheets``, -1 for none. ``camera``: (10,) its
+    Consecutive pixels on one sheet are done together.
+
+    ``pixels``: (2 N,). ``sheet``: (N,) row of ``sheets``, -1 for none. ``camera``: (10,) its
     parameters and the radius at which the model folds over. ``sheets``: (S, 20) origin, axes,
-    scale, bow, fan. ``points``: (N, 3) output, left as it is where nothing is met. ``is_met``: (N,)
-    output, 1 where met. ``by_px``, ``by_sensor``: (N, 6) and (N, 51) output, the rows' (3, 2) and
-    (3, 17) derivatives by the pixel, and by the camera and the sheet; no rows if not wanted.
+    scale, bow, fan. ``turn``: (12,) rows of rotation and shift from Sensor to the points' frame.
+    ``points``: (3 N,) output, zero where nothing is met. ``is_met``: (N,) zeros, 1 where met.
+    """
+    n = sheet.shape[0]
+    lens = np.zeros(7)
+    surface = np.zeros(12)
+    first = 0
+    while first < n:
+        number = sheet[first]
+        last = first + 1
+        while last < n and sheet[last] == number:
+            last += 1
+        if number >= 0:
+            _meet_run(
+                pixels[2 * first : 2 * last],
+                camera,
+                sheets[number],
+                turn,
+                points[3 * first : 3 * last],
+                is_met[first:last],
+            )
+        first = last
+    for i in range(n):
+        if sheet[i] < 0 or is_met[i] == 1:
+            continue
+        u = (pixels[2 * i] - camera[2]) / camera[0]
+        v = (pixels[2 * i + 1] - camera[3]) / camera[1]
+        depth = 0.0
+        if _undistort(u, v, camera, lens):
+            depth = _meet(lens[5], lens[6], sheets[sheet[i]], surface)
+        is_met[i] = 1 if depth > 0.0 else 0
+        for a in range(3):
+            at = turn[4 * a] * lens[5] + turn[4 * a + 1] * lens[6] + turn[4 * a + 2]
+            points[3 * i + a] = at * depth + turn[4 * a + 3] if depth > 0.0 else 0.0
+
+
+@compiled(error_model="numpy")
+def differentiate_sheets(
+    points: Table, sheet: Ints, camera: Floats, sheets: Table, by_px: TableOut, by_sensor: TableOut
+) -> None:
+    """Derivatives of points on light sheets by their pixels, by the camera and by the sheet.
+
+    ``points``: (N, 3) in Sensor. ``sheet``, ``camera``, ``sheets``: As for `meet_sheets`; nothing
+    is done for a point with -1. ``by_px``, ``by_sensor``: (N, 6) and (N, 51) output, the rows'
+    (3, 2) and (3, 17).
     """
     lens = np.zeros(7)
     surface = np.zeros(12)
-    ddepth = np.zeros(2)
     by_camera = np.zeros((2, 9))
-    has_ray = False
-    is_differentiated = False
-    shift_u = shift_v = 0.0
-    number = 0
-    of_sheet = sheets[number]
     fx = camera[0]
     fy = camera[1]
-    is_full = by_px.shape[0] > 0
-    for i in range(pixels.shape[0]):
-        is_same = i > 0 and pixels[i, 0] == pixels[i - 1, 0] and pixels[i, 1] == pixels[i - 1, 1]
-        if not is_same:
-            u = (pixels[i, 0] - camera[2]) / fx
-            v = (pixels[i, 1] - camera[3]) / fy
-            # of its neighbour, which is nearly the pixel's own
-            has_ray = _undistort(u, v, shift_u, shift_v, camera, lens)
-            if not has_ray and (shift_u != 0.0 or shift_v != 0.0):
-                has_ray = _undistort(u, v, 0.0, 0.0, camera, lens)
-            shift_u = lens[5] - u if has_ray else 0.0
-            shift_v = lens[6] - v if has_ray else 0.0
-            is_differentiated = False
-        if not has_ray or sheet[i] < 0:
+    for i in range(points.shape[0]):
+        if sheet[i] < 0:
             continue
-        x = lens[5]
-        y = lens[6]
-        if sheet[i] != number:
-            number = sheet[i]
-            of_sheet = sheets[number]
-        depth = _meet(x, y, of_sheet, surface)
-        if not depth > 0.0:
-            continue
-        is_met[i] = 1
-        points[i, 0] = x * depth
-        points[i, 1] = y * depth
-        points[i, 2] = depth
-        if not is_full:
-            continue
-        if not is_differentiated:
-            is_differentiated = True
-            # of the inverse of the lens, at a fixed pixel
-            _distort(x, y, camera, lens)
-            det = lens[2] * lens[4] - lens[3] * lens[3]
-            ixx = lens[4] / det
-            ixy = -lens[3] / det
-            iyy = lens[2] / det
-            r2 = x * x + y * y
-            for c in range(5):
-                if c == 2:
-                    kx = 2.0 * x * y
-                    ky = r2 + 2.0 * y * y
-                elif c == 3:
-                    kx = r2 + 2.0 * x * x
-                    ky = 2.0 * x * y
-                else:
-                    power = r2 if c == 0 else (r2 * r2 if c == 1 else r2 * r2 * r2)
-                    kx = x * power
-                    ky = y * power
-                by_camera[0, 4 + c] = -(ixx * kx + ixy * ky)
-                by_camera[1, 4 + c] = -(ixy * kx + iyy * ky)
-            by_camera[0, 2] = -ixx / fx
-            by_camera[1, 2] = -ixy / fx
-            by_camera[0, 3] = -ixy / fy
-            by_camera[1, 3] = -iyy / fy
-            for j in range(2):
-                by_camera[j, 0] = by_camera[j, 2] * lens[0]
-                by_camera[j, 1] = by_camera[j, 3] * lens[1]
-        _height(x * depth, y * depth, depth, of_sheet, surface)
+        depth = points[i, 2]
+        x = points[i, 0] / depth
+        y = points[i, 1] / depth
+        # of the inverse of the lens, at a fixed pixel
+        distort(x, y, camera, lens)
+        det = lens[2] * lens[4] - lens[3] * lens[3]
+        ixx = lens[4] / det
+        ixy = -lens[3] / det
+        iyy = lens[2] / det
+        r2 = x * x + y * y
+        for c in range(5):
+            if c == 2:
+                kx = 2.0 * x * y
+                ky = r2 + 2.0 * y * y
+            elif c == 3:
+                kx = r2 + 2.0 * x * x
+                ky = 2.0 * x * y
+            else:
+                power = r2 if c == 0 else (r2 * r2 if c == 1 else r2 * r2 * r2)
+                kx = x * power
+                ky = y * power
+            by_camera[0, 4 + c] = -(ixx * kx + ixy * ky)
+            by_camera[1, 4 + c] = -(ixy * kx + iyy * ky)
+        by_camera[0, 2] = -ixx / fx
+        by_camera[1, 2] = -ixy / fx
+        by_camera[0, 3] = -ixy / fy
+        by_camera[1, 3] = -iyy / fy
+        for j in range(2):
+            by_camera[j, 0] = by_camera[j, 2] * lens[0]
+            by_camera[j, 1] = by_camera[j, 3] * lens[1]
+        height_of(points[i, 0], points[i, 1], depth, sheets[sheet[i]], surface)
         along = x * surface[1] + y * surface[2] + surface[3]
-        ddepth[0] = -surface[1] * depth / along
-        ddepth[1] = -surface[2] * depth / along
+        ddepth_x = -surface[1] * depth / along
+        ddepth_y = -surface[2] * depth / along
         for a in range(3):
             ray = x if a == 0 else (y if a == 1 else 1.0)
-            dx = ray * ddepth[0] + (depth if a == 0 else 0.0)
-            dy = ray * ddepth[1] + (depth if a == 1 else 0.0)
+            dx = ray * ddepth_x + (depth if a == 0 else 0.0)
+            dy = ray * ddepth_y + (depth if a == 1 else 0.0)
             by_px[i, 2 * a] = -(dx * by_camera[0, 2] + dy * by_camera[1, 2])
             by_px[i, 2 * a + 1] = -(dx * by_camera[0, 3] + dy * by_camera[1, 3])
             for c in range(9):
@@ -270,142 +382,13 @@ def sum_off_planes(
 
 
 @compiled(error_model="numpy")
-def move_by_shape(
-    points: Table, rays: Table, sheet: Ints, sheets: Table, size_mm: Floats, moved: TableOut
-) -> None:
-    """Move of points (N, 3) along their rays (N, 3) by a size (S,) across their sheets (N,).
-
-    ``sheets``: As for `meet_sheets`. ``moved``: (N, 3) output.
-    """
+def sheet_gradients(points: Table, sheet: Ints, sheets: Table, gradients: TableOut) -> None:
+    """Gradients (N, 3) of the distance from their sheets at points (N, 3); as `meet_sheets`."""
     surface = np.zeros(12)
     for i in range(points.shape[0]):
-        _height(points[i, 0], points[i, 1], points[i, 2], sheets[sheet[i]], surface)
-        along = surface[1] * rays[i, 0] + surface[2] * rays[i, 1] + surface[3] * rays[i, 2]
-        share = size_mm[sheet[i]] / along if abs(along) > 0.0 else 0.0
+        height_of(points[i, 0], points[i, 1], points[i, 2], sheets[sheet[i]], surface)
         for a in range(3):
-            moved[i, a] = rays[i, a] * share
-
-
-@compiled(fastmath=True)
-def spread_by_factor(point: Floats, by_sensor: Floats, factor: Table, moved: TableOut) -> None:
-    """Errors (3, K) of one point in Sensor by those of sensor and hand-eye.
-
-    ``point``: (3,). ``by_sensor``: (3 Q,) derivatives. ``factor``: (Q + 6, K): of the sensor, then
-    of the hand-eye's turn and shift in Sensor.
-    """
-    q = by_sensor.shape[0] // 3
-    width = factor.shape[1]
-    first, second, third = moved[0], moved[1], moved[2]
-    x, y, z = point[0], point[1], point[2]
-    about_x, about_y, about_z = factor[q], factor[q + 1], factor[q + 2]
-    shift_x, shift_y, shift_z = factor[q + 3], factor[q + 4], factor[q + 5]
-    for k in range(width):
-        first[k] = about_y[k] * z - about_z[k] * y + shift_x[k]
-        second[k] = about_z[k] * x - about_x[k] * z + shift_y[k]
-        third[k] = about_x[k] * y - about_y[k] * x + shift_z[k]
-    for c in range(q):
-        x, y, z = by_sensor[c], by_sensor[q + c], by_sensor[2 * q + c]
-        # what one camera alone saw does not depend on the other
-        if x == 0.0 and y == 0.0 and z == 0.0:
-            continue
-        row = factor[c]
-        for k in range(width):
-            first[k] += x * row[k]
-            second[k] += y * row[k]
-            third[k] += z * row[k]
-
-
-@compiled(fastmath=True)
-def sum_products(moved: Table, products: FloatsOut) -> None:
-    """Add the products of rows (3, K) with each other: 00 01 02 11 12 22."""
-    first, second, third = moved[0], moved[1], moved[2]
-    xx = xy = xz = yy = yz = zz = 0.0
-    for k in range(first.shape[0]):
-        xx += first[k] * first[k]
-        xy += first[k] * second[k]
-        xz += first[k] * third[k]
-        yy += second[k] * second[k]
-        yz += second[k] * third[k]
-        zz += third[k] * third[k]
-    products[0] += xx
-    products[1] += xy
-    products[2] += xz
-    products[3] += yy
-    products[4] += yz
-    products[5] += zz
-
-
-@compiled()
-def propagate_points(
-    points: Table,
-    own: Table,
-    shape: Table,
-    by_sensor: Table,
-    factor: Table,
-    base_from_sensor: Table,
-    arm: Table,
-    rows: Ints,
-    placed: TableOut,
-    covariance: TableOut,
-) -> None:
-    """Points of one sheet in Base, with all of their covariance, in one pass.
-
-    The errors of sensor and hand-eye are carried as factors in Sensor, own noise is added, and the
-    sum is turned to Base, where the arm's is added.
-
-    ``points``, ``shape``: (N, 3) in Sensor, and their move by one sigma of the sheet's own shape.
-    ``own``: (N, 3 J) of each independent noise, by coordinate. ``by_sensor``: (N, 3 Q).
-    ``factor``: As for `spread_by_factor`. ``base_from_sensor``: (3, 4) turn and shift. ``arm``:
-    (3, 3) variances of its shift and turns, and the two points in Base about which it turns.
-    ``rows``: (M,) of the points. ``placed``: (N, 3), ``covariance``: (N, 9) output.
-    """
-    moved = np.zeros((3, factor.shape[1]))
-    sums = np.zeros(6)
-    inner = np.zeros((3, 3))
-    half = np.zeros((3, 3))
-    n_own = own.shape[1] // 3
-    turn = base_from_sensor
-    for i in rows:
-        spread_by_factor(points[i], by_sensor[i], factor, moved)
-        for k in range(6):
-            sums[k] = 0.0
-        sum_products(moved, sums)
-        x, y, z = shape[i, 0], shape[i, 1], shape[i, 2]
-        for k in range(n_own + 1):
-            if k < n_own:
-                x, y, z = own[i, k], own[i, n_own + k], own[i, 2 * n_own + k]
-            else:
-                x, y, z = shape[i, 0], shape[i, 1], shape[i, 2]
-            sums[0] += x * x
-            sums[1] += x * y
-            sums[2] += x * z
-            sums[3] += y * y
-            sums[4] += y * z
-            sums[5] += z * z
-        inner[0, 0], inner[1, 1], inner[2, 2] = sums[0], sums[3], sums[5]
-        inner[0, 1] = inner[1, 0] = sums[1]
-        inner[0, 2] = inner[2, 0] = sums[2]
-        inner[1, 2] = inner[2, 1] = sums[4]
-        for a in range(3):
-            total = turn[a, 0] * points[i, 0] + turn[a, 1] * points[i, 1]
-            placed[i, a] = total + turn[a, 2] * points[i, 2] + turn[a, 3]
-            for b in range(3):
-                total = turn[a, 0] * inner[0, b] + turn[a, 1] * inner[1, b]
-                half[a, b] = total + turn[a, 2] * inner[2, b]
-        for a in range(3):
-            for b in range(a + 1):
-                total = half[a, 0] * turn[b, 0] + half[a, 1] * turn[b, 1] + half[a, 2] * turn[b, 2]
-                if a == b:
-                    total += arm[0, 0]
-                for about in range(1, 3):
-                    lever_a = placed[i, a] - arm[about, a]
-                    lever_b = placed[i, b] - arm[about, b]
-                    total -= arm[0, about] * lever_a * lever_b
-                    if a == b:
-                        for c in range(3):
-                            total += arm[0, about] * (placed[i, c] - arm[about, c]) ** 2
-                covariance[i, 3 * a + b] = total
-                covariance[i, 3 * b + a] = total
+            gradients[i, a] = surface[1 + a]
 
 
 @compiled(fastmath=True)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured points to what a voxel adds up: weighted places, covariances, normals and counts."""
+"""Measured points to what a voxel adds up: weighted places, covariances, normals and counts.
+
+And sums over cells of a grid: cubes numbered by one integer, found by hashing.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import math
 
 import numpy as np
 
-from armscan.kernels.arrays import IntsOut, Table, TableOut, compiled
+from armscan.kernels.arrays import Ints, IntsOut, Table, TableOut, compiled
 
 N_VALUES = 28
 """Weight; weighted offset from the voxel's centre (3), covariance (6), covariance of the noise
@@ -18,6 +21,8 @@ MIDDLE = 2 ** (BLOCK_BITS + PART_BITS - 1)
 """Number along an axis of the voxel whose lower corner is the origin."""
 NOTHING = 1e-15
 """Off-diagonals below this part of the diagonal are rounding."""
+SPREAD = 0x2545F4914F6CDD1D
+"""Odd multiplier of a linear congruential step (L'Ecuyer 1999): neighbouring numbers land apart."""
 JACOBI_SWEEPS = 6
 """Sweeps of a symmetric 3 x 3 matrix; three leave nothing but rounding (Golub and Van Loan 8.5)."""
 
@@ -154,3 +159,59 @@ def voxel_values(
         values[n, 26] = 1.0
         values[n, 27] = weight * noise[n, 2]
     return len(points_mm)
+
+
+@compiled()
+def add_to_cells(
+    keys: Ints,
+    values: Table,
+    start: int,
+    slots: IntsOut,
+    cell_keys: IntsOut,
+    sums: TableOut,
+    count: IntsOut,
+) -> int:
+    """Add rows to the sums of their cells, in order, until one more cell does not fit.
+
+    Parameters
+    ----------
+    keys
+        (N,) number of each row's cell.
+    values
+        (N, K).
+    start
+        First row to add.
+    slots
+        (S,) hash table, S a power of two of at least twice the cells: row of the cell, -1 if free.
+    cell_keys
+        (M,) number of each cell.
+    sums
+        (M, K).
+    count
+        (1,) cells in use.
+
+    Returns
+    -------
+    int
+        Row that was not added any more; N if all were.
+    """
+    mask = len(slots) - 1
+    for n in range(start, len(keys)):
+        key = keys[n]
+        mixed = key * SPREAD
+        slot = (mixed ^ (mixed >> 29)) & mask
+        while slots[slot] >= 0 and cell_keys[slots[slot]] != key:
+            slot = (slot + 1) & mask
+        row = slots[slot]
+        if row < 0:
+            row = count[0]
+            if row == len(cell_keys):
+                return n
+            slots[slot] = row
+            cell_keys[row] = key
+            for k in range(values.shape[1]):
+                sums[row, k] = 0.0
+            count[0] = row + 1
+        for k in range(values.shape[1]):
+            sums[row, k] += values[n, k]
+    return len(keys)

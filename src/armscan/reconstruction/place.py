@@ -16,9 +16,16 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.shapes import fit_plane
-from armscan.kernels.rays import propagate_points
-from armscan.models.calibration import ArmNoise, ScannerCalibration
-from armscan.reconstruction.triangulate import StripePoints, sensor_columns, stripe_cloud
+from armscan.kernels.placing import carry_stripe, propagate_points
+from armscan.models.calibration import ArmNoise, ScannerCalibration, SensorCalibration
+from armscan.reconstruction.triangulate import (
+    StripePoints,
+    lens_numbers,
+    sensor_columns,
+    sheet_numbers,
+    sheet_rows,
+    stripe_cloud,
+)
 from armscan.records.cloud import PointCloud
 from armscan.records.profile import PointProfile, Profile
 
@@ -100,14 +107,24 @@ class BaseTransform:
         return BaseTransform(scanner, factors, np.asarray(middle))
 
     @cached_property
-    def factors_in_sensor(self) -> tuple[FloatArray, ...]:
-        """The factors with the hand-eye's six errors turned to Sensor, for all poses of the arm."""
+    def errors_in_sensor(self) -> tuple[FloatArray, ...]:
+        """The factors turned about, (K, Q + 6), one independent error a row, for all poses.
+
+        The hand-eye's six errors are turned to Sensor. Row k is zero before column k: such a factor
+        of the same covariance always exists, and half of the products with it need not be made.
+        """
         back = self.scanner.hand_eye.tool_from_sensor.rotation.T
         turned = []
         for factor in self.factors:
             own = factor[-6:].reshape(2, 3, -1)
-            turned.append(np.concatenate([factor[:-6], *(back @ own)]))
+            whole = np.concatenate([factor[:-6], *(back @ own)])
+            turned.append(np.ascontiguousarray(np.linalg.qr(whole.T, mode="r")))
         return tuple(turned)
+
+    @cached_property
+    def factors_in_sensor(self) -> tuple[FloatArray, ...]:
+        """(Q + 6, K) the same, one error a column."""
+        return tuple(np.ascontiguousarray(errors.T) for errors in self.errors_in_sensor)
 
     @property
     def sheet_names(self) -> tuple[str, ...]:
@@ -158,26 +175,73 @@ def propagate_to_base(
         middle = base_from_sensor.apply(stripe.points_mm).mean(axis=0) if n else np.zeros(3)
     else:
         middle = base_from_sensor.apply(transform.scan_point_mm)
-    placed, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    carried = (base_from_sensor.rotation, base_from_sensor.translation_mm[:, None])
-    for k, factor in enumerate(transform.factors_in_sensor):
-        propagate_points(
-            stripe.points_mm,
-            stripe.noise_mm.reshape(n, 3 * stripe.noise_mm.shape[2]),
-            stripe.shape_mm,
-            stripe.by_sensor.reshape(n, 3 * stripe.by_sensor.shape[2]),
-            factor,
-            np.concatenate(carried, axis=1),
-            np.stack([hand_eye.arm_noise.variances, middle, base_from_tool.translation_mm]),
-            np.flatnonzero(stripe.sheet == k),
-            placed,
-            covariance.reshape(n, 9),
-        )
+    arm = np.stack([hand_eye.arm_noise.variances, middle, base_from_tool.translation_mm])
+    if stripe.dpoint_dsensor is None and stripe.sensor is not None and stripe.sensor.second is None:
+        placed, covariance = _carried(stripe, stripe.sensor, base_from_sensor, arm, transform)
+    else:
+        placed, covariance = _propagated(stripe, base_from_sensor, arm, transform)
     for array in (placed, covariance):
         array.setflags(write=False)
     return stripe_cloud(
         "Base", stripe, profile, placed, covariance, sheet_names=transform.sheet_names
     )
+
+
+def _carried(
+    stripe: StripePoints,
+    sensor: SensorCalibration,
+    base_from_sensor: Pose[Base, Sensor],
+    arm: FloatArray,
+    transform: BaseTransform,
+) -> tuple[FloatArray, FloatArray]:
+    """Points (N, 3) of one camera on their sheets, with covariances (N, 3, 3); ``arm`` (3, 3)."""
+    n = len(stripe)
+    placed, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    turn = np.column_stack([base_from_sensor.rotation, base_from_sensor.translation_mm])
+    carried = np.concatenate([turn, arm], axis=None)
+    lens, numbers = lens_numbers(sensor), sheet_numbers(sensor)
+    for k, rows in sheet_rows(stripe.sheet):
+        outputs = placed[rows], covariance[rows]
+        carry_stripe(
+            stripe.points_mm[rows].reshape(-1),
+            stripe.noise_mm[rows].reshape(-1),
+            stripe.shape_mm[rows].reshape(-1),
+            lens,
+            numbers[k],
+            transform.errors_in_sensor[k],
+            carried,
+            outputs[0].reshape(-1),
+            outputs[1].reshape(-1),
+        )
+        if not isinstance(rows, slice):
+            placed[rows], covariance[rows] = outputs
+    return placed, covariance
+
+
+def _propagated(
+    stripe: StripePoints,
+    base_from_sensor: Pose[Base, Sensor],
+    arm: FloatArray,
+    transform: BaseTransform,
+) -> tuple[FloatArray, FloatArray]:
+    """As `_carried`, of points that come with their derivatives."""
+    n, by_sensor = len(stripe), stripe.by_sensor
+    placed, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    turn = np.column_stack([base_from_sensor.rotation, base_from_sensor.translation_mm])
+    for k, factor in enumerate(transform.factors_in_sensor):
+        propagate_points(
+            stripe.points_mm,
+            stripe.noise_mm.reshape(n, 3 * stripe.noise_mm.shape[2]),
+            stripe.shape_mm,
+            by_sensor.reshape(n, 3 * by_sensor.shape[2]),
+            factor,
+            turn,
+            arm,
+            np.flatnonzero(stripe.sheet == k),
+            placed,
+            covariance.reshape(n, 9),
+        )
+    return placed, covariance
 
 
 def delivered_points(profile: PointProfile) -> StripePoints:
@@ -201,7 +265,7 @@ def delivered_points(profile: PointProfile) -> StripePoints:
         points_mm=profile.points_mm,
         noise_mm=noise,
         shape_mm=np.zeros((n, 3)),
-        by_sensor=np.zeros((n, 3, 0)),
+        dpoint_dsensor=np.zeros((n, 3, 0)),
         sheet=np.zeros(n, dtype=np.int64),
     )
 

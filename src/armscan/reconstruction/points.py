@@ -10,13 +10,16 @@ of another source, however well it meets the sheet.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.rotations import skew
+from armscan.kernels.placing import fuse_stripes
 from armscan.models.calibration import SensorCalibration
+from armscan.models.camera import fold_radius
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.epipolar import (
     Crossings,
@@ -35,10 +38,14 @@ from armscan.reconstruction.triangulate import (
     N_SHEET,
     DepthRange,
     StripePoints,
+    differentiated,
+    gradients,
+    lens_numbers,
+    meet,
     moved_by_shape,
-    sensor_columns,
     sensor_covariance,
-    shape_mm,
+    shapes_mm,
+    sheet_numbers,
     triangulate_stripe,
 )
 from armscan.records.profile import Profile
@@ -54,9 +61,9 @@ CONSISTENCY_SIGMAS = 5.0
 """Points whose left and right picture disagree by more are dropped."""
 BESIDE_ROWS = 3
 """Where the right picture is larger, not every right point has a left one: this many between."""
-N_OBSERVED = 3
-"""Distances across the left stripe, across the right stripe, and from the sheet."""
 N_STRIPES = 2
+N_COLUMNS = 32
+"""Parameters that a point of two cameras depends on: 9, 8 of its sheet, 15 of the second one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,78 +339,34 @@ def fuse_points(
         The noises are those of the left stripe and of the right stripe.
     """
     n = len(projected.sheet)
-    ddistance_dpoint, ddistance_dsensor = _observations(projected, crossings, normals_px, sensor)
-    shape = np.array([shape_mm(sensor, k) for k in range(len(sensor.sheets))])
-    noise = np.column_stack([sigma_px, np.maximum(shape[projected.sheet], 1e-6)])
-    covariance = np.zeros((n, N_OBSERVED, N_OBSERVED))
-    for k in np.unique(projected.sheet):
-        of_sheet = np.flatnonzero(projected.sheet == k)
-        j = ddistance_dsensor[of_sheet, 1:]
-        covariance[of_sheet] = (j @ sensor_covariance(sensor, int(k))) @ j.transpose(0, 2, 1)
-    covariance[:, np.arange(N_OBSERVED), np.arange(N_OBSERVED)] += noise**2
-    gain = _gain(ddistance_dpoint, covariance)
-    missed = np.zeros((n, 1 + N_OBSERVED))
-    missed[:, 2] = crossings.residual_px - shift_px
-    points = projected.points_mm - np.einsum("nij,nj->ni", gain, missed)
+    sigma = np.column_stack([sigma_px, np.maximum(shapes_mm(sensor)[projected.sheet], 1e-6)])
+    covariances = [sensor_covariance(sensor, k).ravel() for k in range(len(sensor.sheets))]
+    points, moves, by_sensor = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, N_COLUMNS))
+    fuse_stripes(
+        np.ascontiguousarray(projected.points_mm),
+        np.ascontiguousarray(projected.sheet),
+        np.column_stack([normals_px, crossings.normal]),
+        sigma,
+        np.ascontiguousarray(crossings.residual_px - shift_px),
+        np.ascontiguousarray(projected.dq_dpoint).reshape(n, -1),
+        np.ascontiguousarray(projected.dq_dsecond).reshape(n, -1),
+        lens_numbers(sensor),
+        sheet_numbers(sensor),
+        np.stack(covariances),
+        points,
+        moves.reshape(n, 9),
+        by_sensor.reshape(n, 3 * N_COLUMNS),
+    )
+    for array in (points, by_sensor):
+        array.setflags(write=False)
     return StripePoints(
         row=row,
         points_mm=points,
-        noise_mm=gain[:, :, 1:N_OBSERVED] * noise[:, None, : N_OBSERVED - 1],
-        shape_mm=gain[:, :, N_OBSERVED] * noise[:, None, N_OBSERVED - 1],
-        by_sensor=-gain @ ddistance_dsensor,
+        noise_mm=moves[:, :, :N_STRIPES],
+        shape_mm=moves[:, :, N_STRIPES],
+        dpoint_dsensor=by_sensor,
         sheet=projected.sheet,
     )
-
-
-def _observations(
-    projected: Projections,
-    crossings: Crossings,
-    normals_px: FloatArray,
-    sensor: SensorCalibration,
-) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of four distances by the point (M, 4, 3) and by the sensor (M, 4, 32).
-
-    The first is along the left stripe, then across the left stripe, across the right stripe, and
-    from the sheet.
-    """
-    points = projected.points_mm
-    second = N_CAMERA + N_SHEET
-    by_point = np.zeros((len(points), 4, 3))
-    by_sensor = np.zeros((len(points), 4, second + projected.dq_dsecond.shape[2]))
-    _, dq_dpoint, dq_dcamera = sensor.camera.camera.project_with_jacobian(points)
-    tangents = np.stack([-normals_px[:, 1], normals_px[:, 0]], axis=1)
-    axes = np.stack([tangents, normals_px], axis=1)
-    by_point[:, :2], by_sensor[:, :2, :N_CAMERA] = axes @ dq_dpoint, axes @ dq_dcamera
-    across = crossings.normal[:, None, :]
-    by_point[:, 2] = (across @ projected.dq_dpoint)[:, 0]
-    by_sensor[:, 2, second:] = (across @ projected.dq_dsecond)[:, 0]
-    for k in np.unique(projected.sheet):
-        of_sheet = np.flatnonzero(projected.sheet == k)
-        sheet = sensor.sheets[k].sheet
-        _, gradient, dheight_dsheet = sheet.height_with_jacobian(points[of_sheet])
-        by_point[of_sheet, 3] = gradient
-        by_sensor[of_sheet, 3, N_CAMERA:second] = dheight_dsheet
-    return by_point, by_sensor
-
-
-def _gain(by_point: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(M, 3, 4) least-squares change of the point by each of the four distances.
-
-    The first distance is kept at zero exactly; the others are weighed.
-    """
-    along, rest = by_point[:, 0], by_point[:, 1:]
-    first = along / np.sum(along**2, axis=1, keepdims=True)
-    second = np.cross(along, by_point[:, 1])
-    second /= np.linalg.norm(second, axis=1, keepdims=True)
-    third = np.cross(along, second)
-    third /= np.linalg.norm(third, axis=1, keepdims=True)
-    free = np.stack([second, third], axis=2)
-    design = rest @ free
-    weighed = np.linalg.solve(covariance, design).transpose(0, 2, 1)
-    solve = free @ np.linalg.solve(weighed @ design, weighed)
-    # moving along the stripe changes the other distances too, which the solution takes back
-    place = first - np.einsum("nij,njk,nk->ni", solve, rest, first)
-    return np.concatenate([place[:, :, None], solve], axis=2)
 
 
 def _left_alone(
@@ -421,7 +384,7 @@ def _left_alone(
         points_mm=projected.points_mm,
         noise_mm=noise,
         shape_mm=moved_by_shape(projected.points_mm, projected.points_mm, projected.sheet, sensor),
-        by_sensor=by_sensor,
+        dpoint_dsensor=by_sensor,
         sheet=projected.sheet,
         noise_length=None if length is None else length[row],
     )
@@ -455,42 +418,43 @@ def triangulate_right(
     """
     if sensor.second is None:
         raise InputError("the sensor has one camera")
-    pose, camera = sensor.second.right_from_sensor, sensor.second.camera.camera
-    turn = pose.rotation.T
-    xy, has_ray, dxy_dpx, dxy_dcamera = camera.undistort_with_jacobian(profile.points_px[row])
-    n = len(row)
-    points, noise, shape = np.zeros((n, 3)), np.zeros((n, 3, N_STRIPES)), np.zeros((n, 3))
-    by_sensor = np.zeros((n, 3, len(sensor_columns(sensor, 0))))
-    is_met = np.zeros(n, dtype=np.bool_)
-    second = N_CAMERA + N_SHEET
-    for k, calibrated in enumerate(sensor.sheets):
-        at = np.flatnonzero(has_ray & (sheet[row] == k))
-        if not len(at):
-            continue
-        in_right = calibrated.sheet.in_frame(pose.rotation, pose.translation_mm)
-        found, met, dpoint_dxy, dpoint_dsheet = in_right.intersect_with_jacobian(xy[at])
-        at, found, dpoint_dxy = at[met], found[met], dpoint_dxy[met]
-        is_met[at] = True
-        from_centre = found - pose.translation_mm
-        points[at] = from_centre @ turn.T
-        _, gradient, _ = calibrated.sheet.height_with_jacobian(points[at])
-        ray = found @ turn.T
-        along = np.sum(gradient * ray, axis=1)
-        across = np.einsum("nij,njk,nk->ni", dpoint_dxy, dxy_dpx[at], profile.normals_px[row[at]])
-        noise[at, :, 1] = (across @ turn.T) * profile.sigma_px[row[at], None]
-        shape[at] = ray / along[:, None] * shape_mm(sensor, k)
-        by_sensor[at, :, N_CAMERA:second] = turn @ dpoint_dsheet[met]
-        by_sensor[at, :, second : second + N_CAMERA] = turn @ (dpoint_dxy @ dxy_dcamera[at])
-        moved = np.concatenate([turn @ skew(from_centre), np.tile(-turn, (len(at), 1, 1))], axis=2)
-        # a moved camera slides the point along its ray back onto the sheet
-        slide = np.einsum("ni,nij->nj", gradient, moved) / along[:, None]
-        by_sensor[at, :, second + N_CAMERA :] = moved - ray[:, :, None] * slide[:, None, :]
+    pose, (lens, numbers) = sensor.second.right_from_sensor, _right_numbers(sensor)
+    found, is_met = meet(profile.points_px[row], sheet[row], lens, numbers)
+    row, found = row[is_met], found[is_met]
+    own, n, turn = sheet[row], len(row), pose.rotation.T
+    by_px, by_right = differentiated(found, own, lens, numbers)
+    from_centre = found - pose.translation_mm
+    points, ray = from_centre @ turn.T, found @ turn.T
+    gradient = gradients(points, own, sensor)
+    along = np.sum(gradient * ray, axis=1)
+    noise = np.zeros((n, 3, N_STRIPES))
+    across = np.einsum("nij,nj->ni", by_px, profile.normals_px[row])
+    noise[:, :, 1] = (across @ turn.T) * profile.sigma_px[row, None]
+    by_sensor, second = np.zeros((n, 3, N_COLUMNS)), N_CAMERA + N_SHEET
+    turned = turn @ by_right
+    by_sensor[:, :, N_CAMERA:second] = turned[:, :, N_CAMERA:]
+    by_sensor[:, :, second : second + N_CAMERA] = turned[:, :, :N_CAMERA]
+    moved = np.concatenate([turn @ skew(from_centre), np.tile(-turn, (n, 1, 1))], axis=2)
+    # a moved camera slides the point along its ray back onto the sheet
+    slide = np.einsum("ni,nij->nj", gradient, moved) / along[:, None]
+    by_sensor[:, :, second + N_CAMERA :] = moved - ray[:, :, None] * slide[:, None, :]
     return StripePoints(
         row=row,
         points_mm=points,
         noise_mm=noise,
-        shape_mm=shape,
-        by_sensor=by_sensor,
-        sheet=sheet[row],
+        shape_mm=ray * (shapes_mm(sensor)[own] / along)[:, None],
+        dpoint_dsensor=by_sensor,
+        sheet=own,
         noise_length=None if profile.noise_length is None else profile.noise_length[row],
-    ).select(is_met)
+    )
+
+
+@lru_cache(maxsize=8)
+def _right_numbers(sensor: SensorCalibration) -> tuple[FloatArray, FloatArray]:
+    """The right camera and the sheets in its frame, as `meet` takes them."""
+    if sensor.second is None:
+        raise InputError("the sensor has one camera")
+    pose, camera = sensor.second.right_from_sensor, sensor.second.camera.camera
+    sheets = [one.sheet.in_frame(pose.rotation, pose.translation_mm) for one in sensor.sheets]
+    lens = np.append(camera.parameters, fold_radius(camera.distortion))
+    return lens, np.stack([one.numbers for one in sheets])

@@ -3,13 +3,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
-from armscan.kernels.rays import meet_sheets, move_by_shape
+from armscan.geometry.poses import Pose, Sensor
+from armscan.kernels.placing import spread_stripe
+from armscan.kernels.rays import differentiate_sheets, meet_sheets, sheet_gradients
 from armscan.models.calibration import (
     SHEET_PARAMETER_NAMES,
     SensorCalibration,
@@ -20,6 +25,8 @@ from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.records.profile import PointProfile, Profile
 
 N_CAMERA, N_SHEET = 9, len(SHEET_PARAMETER_NAMES)
+IN_SENSOR = np.eye(3, 4).ravel()
+"""Rows of no turn and no shift."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +73,10 @@ calibrated."""
 
 
 def intersect_sheets(
-    points_px: FloatArray, sheet_of_point: IntArray, sensor: SensorCalibration
+    points_px: FloatArray,
+    sheet_of_point: IntArray,
+    sensor: SensorCalibration,
+    at: Pose[Any, Sensor] | None = None,
 ) -> tuple[FloatArray, BoolArray]:
     """Intersect the rays of pixels with their sheets, without covariance.
 
@@ -78,39 +88,45 @@ def intersect_sheets(
         (N,) index into ``sensor.sheets``; -1 for none.
     sensor
         Camera and sheets.
+    at
+        Where the sensor was; None to stay in its frame.
 
     Returns
     -------
     points_mm
-        (N, 3) in the Sensor frame; zero where there is none.
+        (N, 3) in the Sensor frame, or where ``at`` leads; zero where there is none.
     is_valid
         (N,) False without sheet, without inverse of the distortion, and where the ray misses.
     """
-    points = np.zeros((len(points_px), 3))
-    none = np.zeros((0, 0))
-    return points, _meet(points_px, sheet_of_point, sensor, points, none, none)
+    carried = None if at is None else np.column_stack([at.rotation, at.translation_mm])
+    turn = IN_SENSOR if carried is None else carried.ravel()
+    return meet(points_px, sheet_of_point, lens_numbers(sensor), sheet_numbers(sensor), turn)
 
 
-def _meet(
+def meet(
     points_px: FloatArray,
-    sheet_of_point: IntArray,
-    sensor: SensorCalibration,
-    *written: FloatArray,
-) -> BoolArray:
-    """Call the kernel `meet_sheets`, which writes points and derivatives; (N,) True where met."""
+    sheet: IntArray,
+    lens: FloatArray,
+    sheets: FloatArray,
+    turn: FloatArray = IN_SENSOR,
+) -> tuple[FloatArray, BoolArray]:
+    """Points (N, 3) of pixels (N, 2) on sheets (N,), and (N,) True where met, by `meet_sheets`.
+
+    ``lens`` and ``sheets`` are those of `lens_numbers` and `sheet_numbers`, in the frame of the
+    camera; ``turn`` leads from there to the points' frame.
+    """
+    own = np.ascontiguousarray(sheet, dtype=np.int64)
+    points, is_met = np.zeros((len(own), 3)), np.zeros(len(own), dtype=np.int64)
+    pixels = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1)
+    meet_sheets(pixels, own, lens, sheets, turn, points.reshape(-1), is_met)
+    return points, is_met.astype(np.bool_)
+
+
+@lru_cache(maxsize=8)
+def lens_numbers(sensor: SensorCalibration) -> FloatArray:
+    """(10,) the left camera or the only one, as the kernels read it."""
     camera = sensor.camera.camera
-    is_met = np.zeros(len(points_px), dtype=np.int64)
-    meet_sheets(
-        np.ascontiguousarray(points_px, dtype=np.float64),
-        np.ascontiguousarray(sheet_of_point, dtype=np.int64),
-        np.append(camera.parameters, fold_radius(camera.distortion)),
-        _numbers(sensor),
-        written[0],
-        is_met,
-        written[1],
-        written[2],
-    )
-    return is_met.astype(np.bool_)
+    return np.append(camera.parameters, fold_radius(camera.distortion))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,16 +155,41 @@ def intersect_with_jacobian(
     points_px: FloatArray, sheet_of_point: IntArray, sensor: SensorCalibration
 ) -> SheetPoints:
     """Intersect the rays of pixels (N, 2) with their sheets (N,), -1 for none; differentiate."""
-    n = len(points_px)
-    points = np.tile([0.0, 0.0, 1.0], (n, 1))
-    n_parameters = N_CAMERA + N_SHEET
-    by_px, by_sensor = np.zeros((n, 3, 2)), np.zeros((n, 3, n_parameters))
-    flat = by_px.reshape(n, 6), by_sensor.reshape(n, 3 * n_parameters)
-    is_met = _meet(points_px, sheet_of_point, sensor, points, *flat)
+    points, is_met = np.zeros((len(points_px), 3)), np.zeros(len(points_px), dtype=np.bool_)
+    # pixels on one sheet are met together, so they are brought together
+    order = np.argsort(sheet_of_point, kind="stable")
+    points[order], is_met[order] = intersect_sheets(points_px[order], sheet_of_point[order], sensor)
+    points[~is_met] = (0.0, 0.0, 1.0)
+    by_px, by_sensor = differentiated(
+        points,
+        np.where(is_met, sheet_of_point, -1),
+        lens_numbers(sensor),
+        sheet_numbers(sensor),
+    )
     # read-only and their own, so that records take them as they are
     for array in (points, by_px, by_sensor):
         array.setflags(write=False)
     return SheetPoints(points, is_met, by_px, by_sensor)
+
+
+def differentiated(
+    points_mm: FloatArray, sheet: IntArray, lens: FloatArray, sheets: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(N, 3, 2) and (N, 3, 17) derivatives of points on their sheets; zero for a sheet of -1.
+
+    ``lens`` and ``sheets`` as for `meet`; all in the frame of the camera.
+    """
+    n, n_parameters = len(points_mm), N_CAMERA + N_SHEET
+    by_px, by_sensor = np.zeros((n, 3, 2)), np.zeros((n, 3, n_parameters))
+    differentiate_sheets(
+        np.ascontiguousarray(points_mm),
+        np.ascontiguousarray(sheet, dtype=np.int64),
+        lens,
+        sheets,
+        by_px.reshape(n, 6),
+        by_sensor.reshape(n, 3 * n_parameters),
+    )
+    return by_px, by_sensor
 
 
 class StripePoints(RowRecord):
@@ -167,9 +208,11 @@ class StripePoints(RowRecord):
     shape_mm
         (M, 3) move of the point by one standard deviation of the sheet's own shape, which the
         model leaves (see `SheetCalibration`): smooth over the sheet, so that neighbours share it.
-    by_sensor
+    dpoint_dsensor
         (M, 3, Q) derivative by the parameters that `sensor_columns` names for the point's sheet:
-        the camera's 9, the sheet's 8, and the 15 of a second camera, if there is one.
+        the camera's 9, the sheet's 8, and the 15 of a second camera, if there is one. None where
+        it follows from the places alone: of points of the left camera or the only one that lie on
+        their sheets.
     sheet
         (M,) index into ``sensor.sheets``.
     noise_length
@@ -181,9 +224,28 @@ class StripePoints(RowRecord):
     points_mm: FloatArray = floats("N", 3)
     noise_mm: FloatArray = floats("N", 3, None)
     shape_mm: FloatArray = floats("N", 3)
-    by_sensor: FloatArray = floats("N", 3, None)
+    dpoint_dsensor: FloatArray | None = floats("N", 3, None, default=None)
     sheet: IntArray = ints("N")
     noise_length: FloatArray | None = floats("N", default=None)
+    sensor: SensorCalibration | None = None
+
+    @property
+    def by_sensor(self) -> FloatArray:
+        """(M, 3, Q) ``dpoint_dsensor``, found from the places where it is not held.
+
+        Raises
+        ------
+        InputError
+            If neither it nor the sensor is given.
+        """
+        if self.dpoint_dsensor is not None:
+            return self.dpoint_dsensor
+        if self.sensor is None:
+            raise InputError("points without derivatives and without the sensor that saw them")
+        numbers = lens_numbers(self.sensor), sheet_numbers(self.sensor)
+        found = differentiated(self.points_mm, self.sheet, *numbers)[1]
+        n_rest = len(sensor_columns(self.sensor, 0)) - found.shape[2]
+        return np.concatenate([found, np.zeros((len(self), 3, n_rest))], axis=2)
 
     @property
     def own_covariance_mm2(self) -> FloatArray:
@@ -235,7 +297,9 @@ def stripe_cloud(
 ) -> PointCloud:
     """The points of one exposure, given in a frame with symmetric covariances, as a cloud."""
     if isinstance(profile, Profile):
-        segment, intensity = profile.segment[stripe.row], profile.intensity[stripe.row]
+        # what is complete is not copied
+        chosen = slice(None) if len(stripe) == len(profile) else stripe.row
+        segment, intensity = profile.segment[chosen], profile.intensity[chosen]
     else:
         segment, intensity = np.zeros_like(stripe.row), np.zeros(len(stripe))
     return PointCloud(
@@ -278,27 +342,65 @@ def triangulate_stripe(
         If ``sheet_of_point`` does not fit the profile or the sheets.
     """
     sheets = _checked_sheets(profile, sheet_of_point, sensor)
-    asked = np.flatnonzero(sheets >= 0)
-    met = intersect_with_jacobian(profile.points_px[asked], sheets[asked], sensor)
-    noise = np.zeros((len(asked), 3, 1))
-    across = (profile.normals_px * profile.sigma_px[:, None])[asked]
-    np.einsum("nij,nj->ni", met.dpoint_dpx, across, out=noise[:, :, 0])
-    noise.setflags(write=False)
+    row = np.flatnonzero(sheets >= 0)
+    # what is complete is not copied
+    chosen = slice(None) if len(row) == len(sheets) else row
+    points, is_met = intersect_sheets(profile.points_px[chosen], sheets[chosen], sensor)
+    if not is_met.all():
+        row, points = row[is_met], points[is_met]
+        chosen = row
+    stripes = profile.normals_px[chosen], profile.sigma_px[chosen]
+    of_row = np.ascontiguousarray(sheets[chosen], dtype=np.int64)
+    noise, shape = _spread(points, *stripes, of_row, sensor)
     length = profile.noise_length
-    by_sensor, n_rest = met.dpoint_dsensor, len(sensor_columns(sensor, 0)) - N_CAMERA - N_SHEET
-    if n_rest:
-        rest = np.zeros((len(asked), 3, n_rest))
-        by_sensor = np.concatenate([by_sensor, rest], axis=2)
-    found = StripePoints(
-        row=asked,
-        points_mm=met.points_mm,
+    for array in (row, points, noise, shape):
+        array.setflags(write=False)
+    return StripePoints(
+        row=row,
+        points_mm=points,
         noise_mm=noise,
-        shape_mm=moved_by_shape(met.points_mm, met.points_mm, sheets[asked], sensor),
-        by_sensor=by_sensor,
-        sheet=sheets[asked],
-        noise_length=None if length is None else length[asked],
+        shape_mm=shape,
+        sheet=of_row,
+        noise_length=None if length is None else length[chosen],
+        sensor=sensor,
     )
-    return found if met.is_met.all() else found.select(met.is_met)
+
+
+def _spread(
+    points_mm: FloatArray,
+    normals_px: FloatArray,
+    sigma_px: FloatArray,
+    sheet: IntArray,
+    sensor: SensorCalibration,
+) -> tuple[FloatArray, FloatArray]:
+    """Moves of points (M, 3) by a sigma of their stripes, (M, 3, 1), and of shape, (M, 3)."""
+    noise, shape = np.zeros((len(points_mm), 3, 1)), np.zeros((len(points_mm), 3))
+    lens, numbers = lens_numbers(sensor), sheet_numbers(sensor)
+    for k, rows in sheet_rows(sheet):
+        outputs = noise[rows], shape[rows]
+        spread_stripe(
+            points_mm[rows].reshape(-1),
+            normals_px[rows].reshape(-1),
+            sigma_px[rows],
+            lens,
+            numbers[k],
+            shape_mm(sensor, k),
+            *(array.reshape(-1) for array in outputs),
+        )
+        if not isinstance(rows, slice):
+            noise[rows], shape[rows] = outputs
+    return noise, shape
+
+
+def sheet_rows(sheet: IntArray) -> Iterator[tuple[int, IntArray | slice]]:
+    """Each sheet of points (M,) and their rows: a slice where all are on one."""
+    if not len(sheet):
+        return
+    if bool((sheet == sheet[0]).all()):
+        yield int(sheet[0]), slice(None)
+        return
+    for k in np.unique(sheet):
+        yield int(k), np.flatnonzero(sheet == k)
 
 
 OLD_SHAPE_SHARE = 0.3
@@ -319,23 +421,36 @@ def moved_by_shape(
 
     All in the Sensor frame; ``sheet`` (M,) is the index of each point's sheet.
     """
-    moved = np.zeros((len(points_mm), 3))
-    size = np.array([shape_mm(sensor, k) for k in range(len(sensor.sheets))])
-    at = np.ascontiguousarray(points_mm, dtype=np.float64)
-    along = np.ascontiguousarray(rays, dtype=np.float64)
+    along = np.sum(gradients(points_mm, sheet, sensor) * rays, axis=1)
+    size = shapes_mm(sensor)[sheet]
+    return np.asarray(
+        rays * np.divide(size, along, out=np.zeros_like(along), where=along != 0)[:, None]
+    )
+
+
+def gradients(points_mm: FloatArray, sheet: IntArray, sensor: SensorCalibration) -> FloatArray:
+    """(M, 3) gradient of the distance from their sheets (M,) at points (M, 3) in Sensor."""
+    found = np.zeros((len(points_mm), 3))
     own = np.ascontiguousarray(sheet, dtype=np.int64)
-    move_by_shape(at, along, own, _numbers(sensor), size, moved)
-    return moved
+    sheet_gradients(np.ascontiguousarray(points_mm), own, sheet_numbers(sensor), found)
+    return found
 
 
-def _numbers(sensor: SensorCalibration) -> FloatArray:
+def shapes_mm(sensor: SensorCalibration) -> FloatArray:
+    """(S,) standard deviation of each sheet's true surface about its model."""
+    return np.array([shape_mm(sensor, k) for k in range(len(sensor.sheets))])
+
+
+@lru_cache(maxsize=8)
+def sheet_numbers(sensor: SensorCalibration) -> FloatArray:
     """(S, 20) the sheets, as the kernels read them."""
     return np.stack([one.sheet.numbers for one in sensor.sheets])
 
 
 def noise_size_mm(noise_mm: FloatArray) -> FloatArray:
     """(M,) root sum square of the independent noises (M, 3, J) of each point."""
-    return np.asarray(np.sqrt(np.einsum("nij,nij->n", noise_mm, noise_mm)))
+    flat = noise_mm.reshape(len(noise_mm), -1)
+    return np.asarray(np.sqrt(np.einsum("ni,ni->n", flat, flat)))
 
 
 def _checked_sheets(

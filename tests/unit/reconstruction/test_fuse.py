@@ -211,3 +211,47 @@ def test_right_alone_meets_the_point_that_it_is_the_picture_of() -> None:
     found = triangulate_right(profile, np.arange(len(right)), np.full(len(right), SHEET), sensor)
     back = TwoViews.of_sensor(sensor).left.project(found.points_mm)
     assert np.abs(back - left).max() < 1e-4
+
+
+def test_fusing_solves_the_weighted_equations_with_the_place_along_the_stripe_held() -> None:
+    """The kernel against Lagrange's equations, solved point by point with NumPy."""
+    sensor = head().drawn_calibration(np.random.default_rng(2))
+    left, normals, right = pixels()
+    right = right + np.array([[0.1, 0.0], [-0.2, 0.1], [0.0, 0.3], [0.05, -0.1]])
+    found = fused(sensor, left, right, right_sigma_px=0.11)
+    there = project_on_sheets(left, np.full(len(left), SHEET), sensor)
+    across_right = np.full(2, np.sqrt(0.5))
+    _, by_point, by_camera = sensor.camera.camera.project_with_jacobian(there.points_mm)
+    _, gradient, by_sheet = sensor.sheets[SHEET].sheet.height_with_jacobian(there.points_mm)
+    sigma = np.array([SIGMA_PX, 0.11, max(shape_mm(sensor, SHEET), 1e-6)])
+    joint = sensor_covariance(sensor, SHEET)
+    for i, normal in enumerate(normals):
+        along = np.array([-normal[1], normal[0]])
+        wanted = np.vstack(
+            [
+                along @ by_point[i],
+                normal @ by_point[i],
+                across_right @ there.dq_dpoint[i],
+                gradient[i],
+            ]
+        )
+        by_sensor = np.zeros((4, 32))
+        by_sensor[0, :9], by_sensor[1, :9] = along @ by_camera[i], normal @ by_camera[i]
+        by_sensor[2, 17:] = across_right @ there.dq_dsecond[i]
+        by_sensor[3, 9:17] = by_sheet[i]
+        weight = np.linalg.inv(by_sensor[1:] @ joint @ by_sensor[1:].T + np.diag(sigma**2))
+        whole = np.zeros((4, 4))
+        whole[:3, :3] = wanted[1:].T @ weight @ wanted[1:]
+        whole[3, :3] = whole[:3, 3] = wanted[0]
+        right_side = np.zeros((4, 4))
+        right_side[3, 0], right_side[:3, 1:] = 1.0, wanted[1:].T @ weight
+        gain = np.linalg.solve(whole, right_side)[:3]
+        missed = across_right @ (there.q_px[i] - right[i])
+        scale = np.abs(gain).max()
+        at = there.points_mm[i] - gain[:, 2] * missed
+        np.testing.assert_allclose(found.points_mm[i], at, atol=1e-9)
+        np.testing.assert_allclose(found.noise_mm[i], gain[:, 1:3] * sigma[:2], atol=1e-8 * scale)
+        np.testing.assert_allclose(found.shape_mm[i], gain[:, 3] * sigma[2], atol=1e-8 * scale)
+        expected = -gain @ by_sensor
+        size = np.abs(expected).max(axis=0)
+        assert np.all(np.abs(found.by_sensor[i] - expected) <= 1e-7 * size + 1e-12)

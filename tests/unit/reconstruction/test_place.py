@@ -12,7 +12,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Points, Pose
 from armscan.geometry.rotations import rotation_from_vector, skew
-from armscan.kernels.rays import propagate_points
+from armscan.kernels.placing import propagate_points
 from armscan.models.calibration import ArmNoise
 from armscan.models.camera import CameraModel
 from armscan.reconstruction.place import (
@@ -22,7 +22,11 @@ from armscan.reconstruction.place import (
     place_with_jacobian,
     propagate_to_base,
 )
-from armscan.reconstruction.triangulate import intersect_sheets, triangulate_stripe
+from armscan.reconstruction.triangulate import (
+    intersect_sheets,
+    intersect_with_jacobian,
+    triangulate_stripe,
+)
 from armscan.records.profile import PointProfile
 from rigs import placing_rig as rig
 from rigs.sheet_rig import thesis_rig
@@ -253,7 +257,10 @@ def test_propagation_in_one_pass_is_that_of_the_whole_product() -> None:
     by_sensor = rng.normal(size=(40, 3, 11))
     by_sensor[::3, :, 4:9] = 0.0
     by_sensor[1::3, 0] = 0.0
-    factor, turn = rng.normal(size=(17, 13)), rotation_from_vector(np.array([0.3, -0.8, 0.5]))
+    factor, turn = (
+        np.tril(rng.normal(size=(17, 13))),
+        rotation_from_vector(np.array([0.3, -0.8, 0.5])),
+    )
     shift, arm = np.array([10.0, -20.0, 5.0]), rng.uniform(0.0, 1.0, (3, 3))
     rows = np.arange(1, 40, 2)
     placed, covariance = np.zeros((40, 3)), np.zeros((40, 3, 3))
@@ -281,3 +288,39 @@ def test_propagation_in_one_pass_is_that_of_the_whole_product() -> None:
             expected += variance * lever @ lever.T
         np.testing.assert_allclose(covariance[i], expected, rtol=1e-10)
     assert not covariance[::2].any()
+
+
+def test_derivatives_made_on_the_way_give_the_covariance_of_derivatives_that_are_held() -> None:
+    """Bent sheets whose light fans out, a lens that distorts, and points of both sheets mixed."""
+    rng = np.random.default_rng(11)
+    scanner = rig.scanner()
+    sensor = scanner.sensor
+    assert sensor is not None
+    bent = [
+        replace(
+            one,
+            sheet=replace(one.sheet, bow_mm=rng.normal(0.0, 0.1, 5), fan=rng.uniform(-0.3, 0.3, 2)),
+        )
+        for one in sensor.sheets
+    ]
+    lens = replace(sensor.camera.camera, distortion=np.array([-0.1, 0.15, 2e-3, -1e-3, 0.05]))
+    camera = replace(sensor.camera, camera=lens)
+    scanner = replace(scanner, sensor=replace(sensor, camera=camera, sheets=tuple(bent)))
+    places = np.tile(PLACES_PX, (40, 1)) + rng.normal(0.0, 20.0, (40 * len(PLACES_PX), 2))
+    sheet = np.tile(SHEET_OF, 40)
+    profile = rig.profile_at(places)
+    placing = BaseTransform.of(scanner)
+    stripe = triangulate_stripe(profile, sheet, scanner.sensor)
+    assert len(np.unique(stripe.sheet)) == len(bent)
+    held = replace(stripe, dpoint_dsensor=stripe.by_sensor)
+    made, known = (
+        propagate_to_base(one, profile, rig.BASE_FROM_TOOL, placing) for one in (stripe, held)
+    )
+    np.testing.assert_allclose(made.points_mm, known.points_mm, rtol=1e-12)
+    size = np.abs(known.covariance_mm2).max(axis=(1, 2), keepdims=True)
+    assert np.all(np.abs(made.covariance_mm2 - known.covariance_mm2) <= 1e-9 * size)
+    found = intersect_with_jacobian(places[stripe.row], sheet[stripe.row], scanner.sensor)
+    np.testing.assert_allclose(found.points_mm, stripe.points_mm, rtol=1e-12)
+    across = (profile.normals_px * profile.sigma_px[:, None])[stripe.row]
+    expected = np.einsum("nij,nj->ni", found.dpoint_dpx, across)
+    np.testing.assert_allclose(stripe.noise_mm[:, :, 0], expected, rtol=1e-9, atol=1e-12)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A running scan is watched: angle of sight, coverage, passes apart, distance from the model."""
+
 from __future__ import annotations
 
 from dataclasses import replace

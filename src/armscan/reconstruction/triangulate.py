@@ -449,8 +449,7 @@ def sheet_numbers(sensor: SensorCalibration) -> FloatArray:
 
 def noise_size_mm(noise_mm: FloatArray) -> FloatArray:
     """(M,) root sum square of the independent noises (M, 3, J) of each point."""
-    flat = noise_mm.reshape(len(noise_mm), -1)
-    return np.asarray(np.sqrt(np.einsum("ni,ni->n", flat, flat)))
+    return np.asarray(np.sqrt(np.einsum("nij,nij->n", noise_mm, noise_mm)))
 
 
 def _checked_sheets(

@@ -16,6 +16,7 @@ from armscan.reconstruction.epipolar import RightStripes, find_crossings, projec
 from armscan.reconstruction.points import fuse_points, triangulate_right
 from armscan.reconstruction.triangulate import (
     StripePoints,
+    noise_size_mm,
     sensor_columns,
     sensor_covariance,
     shape_mm,
@@ -71,6 +72,26 @@ def fused(
         sensor=sensor,
         shift_px=np.zeros(n),
     )
+
+
+def test_a_pair_without_points_has_none() -> None:
+    sensor, (left, normals, _) = head().calibration(), pixels()
+    there = project_on_sheets(left, np.full(len(left), SHEET), sensor)
+    right = RightStripes.of(make_profile("right", [(left + 1000.0, normals)], SIGMA_PX))
+    beside = find_crossings(there, normals, np.full(len(left), SIGMA_PX), right, 3.0)
+    assert (beside.row == -1).all()
+    none = np.zeros(0, dtype=np.int64)
+    found = fuse_points(
+        none,
+        there.select(none),
+        beside.select(none),
+        np.zeros((0, 2)),
+        np.zeros((0, 2)),
+        sensor=sensor,
+        shift_px=np.zeros(0),
+    )
+    assert found.points_mm.shape == (0, 3)
+    assert noise_size_mm(found.noise_mm).shape == (0,)
 
 
 def parameter_error(column: int, size: float) -> FloatArray:

@@ -23,13 +23,14 @@ from armscan.cli import (
 )
 from armscan.cli import reconstruct as reconstruct_command
 from armscan.cli.live.console import CONSOLE_EXAMPLE, console
+from armscan.cli.live.record import RECORD_EXAMPLE, record
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
     *("demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers", "register"),
     *("clean", "inspect", "verify", "mesh"),
-    "console",
+    *("record", "console"),
     *("convert", "recover", "info", "devices", "doctor"),
 )
 """The chain, then what looks at files; left to itself the library lists groups last."""
@@ -109,6 +110,7 @@ app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
 app.command("clean", epilog=clean.CLEAN_EXAMPLE)(clean.clean)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
 app.command("mesh", epilog=surface.MESH_EXAMPLE)(surface.mesh)
+app.command("record", epilog=RECORD_EXAMPLE)(record)
 app.command("console", epilog=CONSOLE_EXAMPLE)(console)
 app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)
 app.command("recover", epilog=files.RECOVER_EXAMPLE)(files.recover)

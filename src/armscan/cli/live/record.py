@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan record``: a rig's images, poses and lasers to one file."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from armscan.cli.options import AsJson, DefaultOf, Force, given, show
+
+RIG = "armscan.pipeline.live.rig:RigDescription."
+RECORD_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan record rig.toml -o scan.mcap\n"
+    "  armscan record rig.toml --scanner scanner.json --seconds 60 -o scan.mcap\n"
+    "  armscan record --camera webcam:0 -o bench.mcap"
+)
+
+
+def record(
+    *,
+    rig: Annotated[
+        Path | None, typer.Argument(help="rig.toml; or name the devices.", show_default=False)
+    ] = None,
+    camera: Annotated[
+        list[str] | None, typer.Option(help="Address of a camera; twice for two, left first.")
+    ] = None,
+    arm: Annotated[str, typer.Option(help="Address of the arm.")] = "",
+    lasers: Annotated[str, typer.Option(help="Address of the laser controller.")] = "",
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Triggers a second of the controller.", show_default=DefaultOf(RIG + "rate_hz")
+        ),
+    ] = None,
+    common_trigger: Annotated[
+        bool,
+        typer.Option("--common-trigger", help="Frames and arm samples bear ids of one trigger."),
+    ] = False,
+    scanner: Annotated[
+        Path | None,
+        typer.Option(help="scanner.json: measure and show points too.", show_default=False),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="End after so long; else Ctrl-C ends it.")
+    ] = None,
+    exposures: Annotated[int | None, typer.Option(help="End after so many.")] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Recording to write: .mcap.")
+    ] = Path("scan.mcap"),
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Record cameras, arm and lasers to one file until Ctrl-C; with a scanner, see points too."""
+    from armscan.jobs.live.record import RecordRequest, record_scan
+    from armscan.pipeline.live.rig import RigDescription
+
+    devices = given(
+        RigDescription,
+        cameras=tuple(camera or ()),
+        arm=arm,
+        lasers=lasers,
+        trigger="external" if lasers else "free",
+        rate_hz=rate,
+        is_common_trigger=common_trigger,
+    )
+    request = RecordRequest(rig, devices, scanner, seconds or 0.0, exposures or 0)
+    is_live = sys.stderr.isatty()
+
+    def tell(line: str) -> None:
+        # one line that is written over, unless it is kept in a file
+        typer.echo(f"\r\x1b[K{line}" if is_live else line, err=True, nl=not is_live)
+
+    summary = record_scan(request, output, tell, is_overwriting=force)
+    if is_live:
+        typer.echo(err=True)
+    show(summary, as_json=as_json)

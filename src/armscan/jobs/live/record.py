@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recording a rig to one file until somebody ends it, and measuring meanwhile where it is known."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from armscan.devices.registry import open_device
+from armscan.errors import DeviceError, OptionError, OutputError
+from armscan.jobs.live.recordings import SUFFIX
+from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.live.acquire import LiveEvent
+from armscan.pipeline.live.recorder import LiveRecorder
+from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
+from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
+from armscan.report.quantity import Quantity, Summary
+from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.files import check_outputs
+from armscan.storage.recordings.write_mcap import WriterStatus
+
+TOLD_EVERY_S = 1.0
+CLOCKS_S = 5.0
+"""Recording begins when the devices' clocks are known, or after so long with those that are."""
+LOOK_S = 0.02
+TWIN = "twin:"
+
+
+@dataclass(frozen=True, slots=True)
+class RecordRequest:
+    """What is recorded, and until when.
+
+    Parameters
+    ----------
+    rig
+        Path of ``rig.toml``; None where the addresses are given.
+    devices
+        Devices by address in place of ``rig.toml``.
+    scanner
+        Path of ``scanner.json``, to measure meanwhile; None for that of ``rig.toml``, if any.
+    seconds, n_exposures
+        End after so long, or so many; 0 for never.
+    """
+
+    rig: Path | None = None
+    devices: RigDescription = field(default_factory=lambda: RigDescription(()))
+    scanner: Path | None = None
+    seconds: float = 0.0
+    n_exposures: int = 0
+
+    def description(self) -> RigDescription:
+        """The rig that is asked for.
+
+        Raises
+        ------
+        OptionError
+            If none is, or two are.
+        FileFormatError
+            If its description cannot be read.
+        """
+        is_named = bool(self.devices.cameras or self.devices.arm or self.devices.lasers)
+        if self.rig is not None and is_named:
+            raise OptionError(
+                "both a rig's description and devices are given", remedy="leave one of them out"
+            )
+        if self.seconds < 0.0 or self.n_exposures < 0:
+            raise OptionError("a negative time or count", remedy="give one above 0")
+        if self.rig is not None:
+            return read_rig(self.rig)
+        if not self.devices.cameras:
+            raise OptionError(
+                "no camera is named",
+                remedy="give rig.toml, or --camera with an address that `armscan devices` lists",
+            )
+        return self.devices
+
+
+def record_scan(
+    request: RecordRequest,
+    output: Path,
+    tell: Callable[[str], None],
+    *,
+    is_overwriting: bool = False,
+) -> Summary:
+    """Record until the time or count is reached, or Ctrl-C; what is there is then whole.
+
+    Parameters
+    ----------
+    request
+        What.
+    output
+        File to write, ``.mcap``; it grows while it is recorded.
+    tell
+        Told once a second how it goes, and at once of faults.
+    is_overwriting
+        Replace a file that exists.
+
+    Raises
+    ------
+    OptionError
+        If the request contradicts itself.
+    DeviceError
+        If a device does not answer at the start, or no image came at all.
+    OutputError
+        If the file exists, or the disk is full; what was written stays.
+    """
+    description = request.description()
+    if output.suffix.lower() != SUFFIX:
+        raise OptionError(
+            f"the output's name ends in '{output.suffix}'", where=f"-o {output}",
+            remedy=f"end it in {SUFFIX}",
+        )  # fmt: skip
+    check_outputs((output,), is_overwriting=is_overwriting)
+    place = request.scanner or (Path(description.scanner) if description.scanner else None)
+    scanner = None if place is None else read_scanner_calibration(place)
+    with Rig.open(description, open_device) as rig:
+        rig.set_windows()
+        output.unlink(missing_ok=True)
+        run = _Recording(rig, scanner, output, tell)
+        run.until_the_end(request)
+    return run.summary(place)
+
+
+class _Recording:
+    """One recording from its begin to its end."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        scanner: ScannerCalibration | None,
+        output: Path,
+        tell: Callable[[str], None],
+    ) -> None:
+        self._output, self._tell = output, tell
+        simulated = all(one.startswith(TWIN) for one in rig.description.cameras)
+        self._recorder = LiveRecorder(output, rig, is_simulated=simulated)
+        options = LiveOptions.of(rig.description)
+        self._session = LiveSession(rig, scanner, options=options, recorder=self._recorder)
+        self._session.add_listener(self._hear)
+        self._has_arm = rig.arm is not None
+        self._is_measuring = scanner is not None
+        self._n_faults = 0
+        self._seconds = 0.0
+        self._end = WriterStatus(0, 0, 0.0, 0, 0)
+        self._before = replace(self._end), 0.0
+        self._is_interrupted = False
+
+    def until_the_end(self, request: RecordRequest) -> None:
+        """Record; the file is whole afterwards, whatever happens."""
+        self._session.open()
+        try:
+            self._wait_for_clocks()
+            self._recorder.begin()
+            self._session.add_listener(self._recorder.hear)
+            start = time.monotonic()
+            self._session.start()
+            try:
+                self._watch(request, start)
+            except KeyboardInterrupt:
+                self._is_interrupted = True
+            self._seconds = time.monotonic() - start
+        finally:
+            self._session.stop()
+            with suppress(OutputError):
+                self._end = self._recorder.status()
+        self._end = self._recorder.close()
+        if not self._end.n_written:
+            self._output.unlink(missing_ok=True)
+            raise DeviceError(
+                f"no image came in {self._seconds:.1f} s",
+                remedy="check camera and trigger; `armscan devices` lists what answers",
+            )
+
+    def _wait_for_clocks(self) -> None:
+        """Without an arm nothing is placed by time, so that nobody waits for clocks."""
+        end = time.monotonic() + CLOCKS_S
+        while self._has_arm and not self._session.is_timed and time.monotonic() < end:
+            time.sleep(LOOK_S)
+
+    def _watch(self, request: RecordRequest, start: float) -> None:
+        told = start
+        while True:
+            time.sleep(LOOK_S)
+            now = time.monotonic()
+            status = self._recorder.status()
+            is_over = 0.0 < request.seconds <= now - start
+            if is_over or 0 < request.n_exposures <= status.n_accepted:
+                return
+            if not self._session.is_recording:
+                return
+            if now - told >= TOLD_EVERY_S:
+                told = now
+                self._tell(self._line(status, now - start))
+
+    def _line(self, status: WriterStatus, seconds: float) -> str:
+        """How it goes, in one line."""
+        before, then = self._before
+        self._before = status, seconds
+        speed = (status.n_bytes - before.n_bytes) / max(seconds - then, 1e-3)
+        rate = (status.n_accepted - before.n_accepted) / max(seconds - then, 1e-3)
+        free = shutil.disk_usage(self._output.parent).free
+        lasts = f" ({free / speed / 60.0:,.0f} min)" if speed > 0.0 else ""
+        n_lost, n_late = self._losses()
+        words = [
+            f"{seconds:5.0f} s",
+            f"{status.n_accepted:,} exposures",
+            f"{rate:.1f}/s",
+            f"lost {n_lost}, late {n_late}",
+            f"{speed / 1e6:.0f} MB/s, {free / 1e9:,.0f} GB left{lasts}",
+        ]
+        if status.fill > 0.5:
+            words.append(f"the disk is behind ({100.0 * status.fill:.0f} % of the buffer)")
+        shown = self._session.snapshot()
+        if self._is_measuring:
+            words.append(f"{shown.n_points:,} points in {shown.n_passes} passes")
+        if shown.latency_ms is not None:
+            words.append(f"{shown.latency_ms[0]:.0f} ms to the screen")
+        return "  ".join(words)
+
+    def _losses(self) -> tuple[int, int]:
+        """Elements of all streams that never came, and that came after newer ones."""
+        counts = self._session.stream_counts
+        return sum(one.n_missing for one in counts), sum(one.n_late for one in counts)
+
+    def _hear(self, event: LiveEvent) -> None:
+        if event.kind in ("fault", "recovered", "warning"):
+            self._n_faults += event.kind == "fault"
+            where = f"{event.device}: " if event.device and event.device not in event.text else ""
+            self._tell(f"{event.kind}: {where}{event.text}")
+
+    def summary(self, scanner: Path | None) -> Summary:
+        """What was written."""
+        n_lost, n_late = self._losses()
+        shown = self._session.snapshot()
+        speed = self._end.n_bytes / 1e6 / max(self._seconds, 1e-3)
+        quantities = [
+            Quantity("exposures", "exposures", self._end.n_written),
+            Quantity("seconds", "duration", self._seconds, unit="s"),
+            Quantity("lost", "lost", n_lost, meaning="counted by the devices, never delivered"),
+            Quantity("late", "late", n_late, meaning="delivered after newer ones"),
+            Quantity("aside", "not to be used", self._recorder.n_aside,
+                     meaning="kept: parts or times were lost"),
+            Quantity("megabytes", "size", self._end.n_bytes / 1e6, unit="MB"),
+            Quantity("megabytes_per_second", "disk rate", speed, unit="MB/s"),
+        ]  # fmt: skip
+        if self._is_measuring:
+            placed = shown.counts.get(LiveStatus.PLACED, 0)
+            quantities.append(Quantity("placed", "measured live", placed))
+            quantities.append(Quantity("points", "points shown", shown.n_points))
+        if shown.latency_ms is not None:
+            quantities.append(
+                Quantity("latency_ms", "exposure to screen", shown.latency_ms[0], unit="ms",
+                         meaning=f"median; 95 % within {shown.latency_ms[1]:.0f} ms")
+            )  # fmt: skip
+        others = {one.value: n for one, n in shown.counts.items() if one is not LiveStatus.PLACED}
+        warnings = [f"{n} instants: {what}" for what, n in others.items()]
+        if self._n_faults:
+            warnings.insert(0, f"devices failed {self._n_faults} times; the recording says when")
+        next_step = f"armscan convert {self._output} {self._output.with_suffix('')}"
+        return Summary(
+            title="Recorded.",
+            quantities=tuple(quantities),
+            warnings=tuple(warnings),
+            written=(self._output,),
+            next_step=next_step,
+            extra={"kind": "recording", "interrupted": self._is_interrupted,
+                   "live": {one.name.lower(): n for one, n in shown.counts.items()}},
+        )  # fmt: skip

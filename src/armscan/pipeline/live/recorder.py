@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a live rig delivers, as one recording: the tables as they are read again, and beside them
+events with the devices' own counts and times.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armscan.devices.clocks import ElementStatus
+from armscan.devices.matching import MatchedInstant, TimedSample
+from armscan.devices.protocols import Frame, LaserEvent
+from armscan.errors import ArmscanError
+from armscan.geometry.arrays import FloatArray
+from armscan.pipeline.live.acquire import LiveEvent
+from armscan.pipeline.live.rig import Rig
+from armscan.records.recording import NO_TRIGGER, ArmTrack, ExposureRow, PoseForm, Session
+from armscan.storage.arm import ARM_MODEL_FILE, arm_model_toml
+from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions, WriterStatus
+
+BATCH_NS = 100_000_000
+"""Samples of the arm are written so many together."""
+_REPEATED = (ElementStatus.DUPLICATE, ElementStatus.LATE)
+
+
+class LiveRecorder:
+    """Writes a rig's streams to an MCAP file; see `armscan.pipeline.live.acquire.Recorder`.
+
+    All times of the tables are this computer's. A frame that no table may place is written with
+    its pixels, its flag (``incomplete``, ``no-time``, ``late``, ``back``) and the time of the frame
+    before it, 0 for the first: whoever reads the recording sets it aside, and counts it.
+
+    Parameters
+    ----------
+    path
+        File to write; must not exist.
+    rig
+        Whose streams come; opened, its windows set.
+    is_simulated
+        Whether images are rendered.
+    options
+        How the file is written; defaults if None.
+
+    Attributes
+    ----------
+    n_aside
+        Frames that are kept and that no table places.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        rig: Rig,
+        *,
+        is_simulated: bool = False,
+        options: WriterOptions | None = None,
+    ) -> None:
+        self.n_aside = 0
+        self._writer = RecordingWriter(path, options)
+        self._rig, self._is_triggered = rig, rig.description.is_common_trigger
+        by_joints = rig.arm is not None and rig.arm.pose_form == "joints"
+        self._form: PoseForm = "joints" if by_joints else "quaternion"
+        self._session = Session(
+            "scan",
+            tuple(camera.setup for camera in rig.cameras),
+            pose_form=self._form,
+            is_simulated=is_simulated,
+        )
+        self._index = 0
+        self._last_ns = [0] * len(rig.cameras)
+        self._last_sample_ns = -1
+        self._samples: list[TimedSample] = []
+
+    def begin(self) -> None:
+        """Make the file.
+
+        Raises
+        ------
+        OutputError
+            If it exists or cannot be made.
+        """
+        model = self._rig.arm_model
+        documents = {} if model is None else {ARM_MODEL_FILE: arm_model_toml(model)}
+        self._writer.begin(self._session, documents)
+
+    def status(self) -> WriterStatus:
+        """How far the file is."""
+        return self._writer.status()
+
+    def close(self) -> WriterStatus:
+        """Write all that waits, and the file's end.
+
+        Raises
+        ------
+        OutputError
+            If the disk is full or refuses; says how much is safe.
+        """
+        try:
+            self._write_samples()
+        finally:
+            status = self._writer.close()
+        return status
+
+    def hear(self, event: LiveEvent) -> None:
+        """Keep what a session tells: faults, buttons, passes, settings."""
+        facts = {"text": event.text, "device": event.device}
+        # what happens after the file's end, or a full disk, is told to whoever sees to the scan
+        with suppress(ArmscanError):
+            self._writer.add_event(time.monotonic_ns(), event.kind, facts)
+
+    def add_frame(self, camera: int, frame: Frame, status: ElementStatus) -> None:
+        """Keep a frame's own count and times; its pixels come with its instant, if it has one."""
+        facts: dict[str, Any] = {
+            "camera": camera,
+            "number": frame.number,
+            "t_device_ns": frame.t_device_ns,
+            "t_host_ns": frame.t_host_ns,
+            "status": status.label,
+            "trigger_id": frame.trigger_id,
+        }
+        self._writer.add_event(frame.t_host_ns, "frame", facts)
+        if status == ElementStatus.LATE:
+            self._add(camera, frame, None, (), ["late"])
+
+    def add_samples(self, samples: tuple[TimedSample, ...]) -> None:
+        """Keep those of the arm, some together."""
+        self._samples += samples
+        if self._samples:
+            first, last = (self._samples[k].sample.t_host_ns for k in (0, -1))
+            if last - first >= BATCH_NS:
+                self._write_samples()
+
+    def add_events(self, events: tuple[LaserEvent, ...]) -> None:
+        """Keep what was on, with the controller's own count and times."""
+        for event in events:
+            facts = {
+                "trigger_id": event.trigger_id,
+                "t_device_ns": event.t_device_ns,
+                "t_host_ns": event.t_host_ns,
+                "lasers": list(event.lasers),
+            }
+            self._writer.add_event(event.t_host_ns, "lasers", facts)
+
+    def add_instant(self, instant: MatchedInstant) -> None:
+        """Write its images."""
+        for camera, frame in enumerate(instant.frames):
+            if frame is None:
+                continue
+            # where ids decide, or there is no arm, a time orders the exposures and places nothing
+            may_guess = self._is_triggered or self._rig.arm is None
+            t_ns = frame.t_host_ns if instant.t_ns is None and may_guess else instant.t_ns
+            flags = [] if frame.is_complete else ["incomplete"]
+            flags += ["no-time"] if t_ns is None else []
+            is_unknown = instant.lasers is None and self._rig.lasers is not None
+            flags += ["laser-unknown"] if is_unknown else []
+            is_usable = frame.is_complete and t_ns is not None
+            self._add(camera, frame, t_ns if is_usable else None, instant.lasers or (), flags)
+
+    def _add(
+        self,
+        camera: int,
+        frame: Frame,
+        t_ns: int | None,
+        lasers: tuple[str, ...],
+        flags: Sequence[str],
+    ) -> None:
+        last_ns = self._last_ns[camera]
+        if t_ns is not None and t_ns <= last_ns:
+            # a clock that was related anew; by time such a frame belongs nowhere
+            t_ns, flags = (last_ns + 1, flags) if self._is_triggered else (None, [*flags, "back"])
+        self.n_aside += t_ns is None
+        row = ExposureRow(
+            self._index,
+            last_ns if t_ns is None else t_ns,
+            camera,
+            f"images/{self._index:06d}.png",
+            lasers,
+            frame.trigger_id if self._is_triggered else None,
+        )
+        self._writer.add_exposure(row, frame.image, flags)
+        self._index += 1
+        self._last_ns[camera] = max(row.t_ns, last_ns)
+
+    def _write_samples(self) -> None:
+        samples, self._samples = self._samples, []
+        if not samples:
+            return
+        own = [one.sample for one in samples]
+        facts: dict[str, Any] = {
+            "number": [one.number for one in own],
+            "t_device_ns": [one.t_device_ns for one in own],
+            "t_host_ns": [one.t_host_ns for one in own],
+            "buttons": [one.buttons for one in own],
+            "flags": [int(one.flags) for one in own],
+            "status": [one.status.label for one in samples],
+        }
+        self._writer.add_event(own[0].t_host_ns, "samples", facts)
+        track = self._track(samples)
+        if track is not None:
+            self._writer.add_arm_samples(track)
+
+    def _track(self, samples: Sequence[TimedSample]) -> ArmTrack | None:
+        """Samples that have a time, in order; None if none has."""
+        times, kept = [], []
+        for one in samples:
+            t_ns = one.t_ns
+            if self._is_triggered and t_ns is None and one.status not in _REPEATED:
+                t_ns = max(one.sample.t_host_ns, self._last_sample_ns + 1)
+            if t_ns is not None and t_ns > self._last_sample_ns:
+                times.append(t_ns)
+                kept.append(one)
+                self._last_sample_ns = t_ns
+        if not kept:
+            return None
+        n = len(kept)
+        rotations, places = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+        for k, one in enumerate(kept):
+            if one.pose is not None:
+                rotations[k], places[k] = one.pose.rotation, one.pose.translation_mm
+        ids = [one.sample.trigger_id for one in kept] if self._is_triggered else [None] * n
+        return ArmTrack(
+            t_ns=np.array(times, dtype=np.int64),
+            rotations=rotations,
+            translations_mm=places,
+            is_known=np.array([one.pose is not None for one in kept], dtype=np.bool_),
+            trigger_ids=np.array([NO_TRIGGER if one is None else one for one in ids]),
+            joints_rad=self._joints(kept),
+        )
+
+    def _joints(self, samples: Sequence[TimedSample]) -> FloatArray | None:
+        """(N, J) angles of an arm that gives those alone; NaN where they are not valid."""
+        if self._form != "joints":
+            return None
+        given = [one.sample.joints_rad for one in samples]
+        n_joints = max((len(one) for one in given if one is not None), default=1)
+        angles = np.full((len(samples), n_joints), np.nan)
+        for k, (one, own) in enumerate(zip(samples, given, strict=True)):
+            is_known = one.pose is not None or self._rig.arm_model is None
+            if own is not None and is_known:
+                angles[k] = own
+        return angles

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan record`` on the twin with a small window, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from armscan.cli import main
+from armscan.errors import OutputError
+from armscan.jobs.live.record import RecordRequest, record_scan
+from armscan.storage.recording import read_recording
+from armscan.storage.recordings.read_mcap import extract_recording
+from armscan.storage.recordings.write_mcap import RecordingWriter
+
+TWIN = "twin:thesis-single?scene=plate&preset=clean&pause=0&loop=1&ahead=1"
+RIG = f"""cameras = ["{TWIN}"]
+arm = "{TWIN}"
+lasers = "{TWIN}"
+rate_hz = 25.0
+is_common_trigger = true
+windows = [[1500, 900, 64, 32]]
+"""
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    (tmp_path / "rig.toml").write_text(RIG)
+    return tmp_path / "rig.toml"
+
+
+def test_a_rig_is_recorded_whole(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = rig.parent / "scan.mcap"
+    assert main(["record", str(rig), "--exposures", "12", "--json", "-o", str(output)]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["exposures"] >= 12 and told["lost"] == told["late"] == told["aside"] == 0
+    assert not told["interrupted"] and told["megabytes"] == output.stat().st_size / 1e6
+    extract_recording(output, rig.parent / "scan")
+    recorded = read_recording(rig.parent / "scan")
+    assert len(recorded.rows) == told["exposures"]
+    assert {row.lasers for row in recorded.rows} == {("A",)} and recorded.is_simulated
+    window = recorded.session.cameras[0].window
+    assert (window.x_px, window.y_px) == (1500, 900)
+    assert recorded.exposure(0).image.shape == (32, 64)
+    ids = [row.trigger_id for row in recorded.rows]
+    assert set(ids) <= set(recorded.arm.trigger_ids.tolist())
+    assert main(["record", str(rig), "-o", str(output)]) == 2
+    assert "exists" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
+def test_ctrl_c_ends_a_recording_that_is_whole(rig: Path) -> None:
+    output = rig.parent / "scan.mcap"
+    # a shell's background job would ignore the signal
+    code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    code += "from armscan.cli import main; sys.exit(main())"
+    run = subprocess.Popen(
+        [sys.executable, "-c", code, "record", str(rig), "--json", "-o", str(output)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert run.stderr is not None and run.stdout is not None
+    while "exposures" not in (line := run.stderr.readline()):
+        assert line, "it ended by itself"
+    run.send_signal(signal.SIGINT)
+    out = run.communicate(timeout=60)[0]
+    assert run.returncode == 0
+    told = json.loads(out)
+    assert told["interrupted"] and told["exposures"] > 0
+    found = extract_recording(output, rig.parent / "scan")
+    assert found.n_exposures == told["exposures"] and not found.lost
+
+
+def test_a_full_disk_ends_it_and_says_what_is_safe(
+    rig: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real, n_left = RecordingWriter.add_exposure, iter([True] * 5)
+
+    def full(self: RecordingWriter, *given: object, **named: object) -> float:
+        if not next(n_left, False):
+            raise OutputError("the recording stopped (no space): 5 exposures of 6 are safe")
+        return real(self, *given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(RecordingWriter, "add_exposure", full)
+    output = rig.parent / "scan.mcap"
+    told: list[str] = []
+    record_scan(RecordRequest(rig, seconds=60.0), output, told.append)
+    assert any("no space" in line for line in told)
+    assert extract_recording(output, rig.parent / "scan").n_exposures == 5
+
+
+def test_without_an_image_there_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(RIG.replace(f'lasers = "{TWIN}"\n', ""))
+    output = tmp_path / "scan.mcap"
+    start, n_before = time.monotonic(), threading.active_count()
+    # nothing triggers the camera: the laser controller is missing
+    assert main(["record", str(tmp_path / "rig.toml"), "--seconds", "0.3", "-o", str(output)]) == 2
+    assert not output.exists() and time.monotonic() - start < 60.0
+    assert threading.active_count() <= n_before
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["-o", "x.ply"], "no camera is named"),
+        (["--camera", "webcam:0", "-o", "x.ply"], "end it in .mcap"),
+        (["nothing.toml"], "no such file"),
+        (["--camera", "twin:none", "-o", "x.mcap"], "no simulated head"),
+        (["--camera", "webcam:0", "--seconds", "-1"], "negative"),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused(
+    given: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["record", *given]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "windows = [[1, 2, 3]]", "windows = [[1, 2, 3, 0]]", "windows = []\nrate_hz = nan",
+        'schedule = ["A"]\nchooses_lasers = true', '[exposure]\nmode = "auto"',
+        "[exposure]\ntarget = 3.0", "[stripes]\nthreshold = -1.0", 'arm_model = "none.toml"',
+        "rate_hz = 0.0", "colour = 3",
+    ],
+)  # fmt: skip
+def test_a_wrong_description_is_refused(
+    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(f'cameras = ["webcam:0"]\n{line}\n')
+    assert main(["record", str(path), "-o", str(tmp_path / "x.mcap")]) == 2
+    err = capsys.readouterr().err
+    assert str(tmp_path) in err and "Traceback" not in err
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a live recorder writes, read again as a recording."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armscan.devices.clocks import ElementStatus
+from armscan.devices.matching import MatchedInstant, TimedSample
+from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
+from armscan.models.arm import forward, thesis_arm
+from armscan.pipeline.live.acquire import LiveEvent
+from armscan.pipeline.live.recorder import LiveRecorder
+from armscan.pipeline.live.rig import Rig, RigDescription
+from armscan.pipeline.live.session import LiveSession
+from armscan.pipeline.scan import ScanOptions, measure_scan
+from armscan.reconstruction.sync import PoseStatus
+from armscan.records.recording import CameraSetup
+from armscan.storage.recording import read_recording
+from armscan.storage.recordings.read_mcap import ReadBack, extract_recording
+from rigs.scan_fake import scanner
+from unit.live.test_session import ALL, Device, rig_of, triggered_scan, waited
+
+IMAGES = np.random.default_rng(1).integers(0, 255, (6, 12, 16)).astype(np.uint8)
+
+
+def read_back(path: Path) -> tuple[Any, ReadBack, list[dict[str, Any]]]:
+    folder = path.with_suffix("")
+    found = extract_recording(path, folder)
+    lines = (folder / "events.jsonl").read_text().splitlines()
+    return read_recording(folder), found, [json.loads(line) for line in lines]
+
+
+def small_rig(*, is_triggered: bool, form: str = "quaternion", **given: Any) -> Any:
+    camera = Device("camera 0", [], setup=CameraSetup(16, 12))
+    description = RigDescription(("c",), is_common_trigger=is_triggered)
+    return Rig([camera], Device("arm", [], pose_form=form), None, description, **given)  # type: ignore[arg-type, list-item]
+
+
+def instant(k: int, t_ns: int | None, **changes: Any) -> MatchedInstant:
+    frame = replace(
+        Frame(IMAGES[k], k, 10**15 + k, 5_000_000_000 + 10_000_000 * k, trigger_id=k + 3), **changes
+    )
+    return MatchedInstant((frame,), t_ns, ("A",), k + 3, None, PoseStatus.NO_TIME)
+
+
+def test_a_session_that_was_recorded_gives_the_points_that_were_shown(tmp_path: Path) -> None:
+    scan = triggered_scan(8)
+    rig = rig_of(scan)
+    clouds: dict[int, Any] = {}
+    recorder = LiveRecorder(tmp_path / "scan.mcap", rig)
+    session = LiveSession(
+        rig, scanner(), options=ALL, recorder=recorder, keep_cloud=clouds.__setitem__
+    )
+    frames, samples = rig.cameras[0].elements, rig.arm.elements
+    rig.cameras[0].elements, rig.arm.elements = [], []
+    session.open()
+    recorder.begin()
+    session.add_listener(recorder.hear)
+    session.start()
+    rig.cameras[0].elements, rig.arm.elements = frames, samples
+    waited(lambda: sum(session.snapshot().counts.values()) == 8)
+    session.stop()
+    assert recorder.close().n_written == 8 and recorder.n_aside == 0
+    recorded, found, _ = read_back(tmp_path / "scan.mcap")
+    assert found.n_exposures == 8 and found.n_samples == 8
+    cloud = measure_scan(recorded, scanner(), ScanOptions(has_normals=False)).cloud
+    assert len(cloud) == sum(len(one) for one in clouds.values()) > 1000
+    for k, one in clouds.items():
+        # poses pass a table of 17 digits
+        np.testing.assert_allclose(
+            cloud.points_mm[cloud.exposure == k], one.points_mm, rtol=0, atol=1e-9
+        )
+
+
+def test_frames_that_no_table_places_are_kept_and_set_aside(tmp_path: Path) -> None:
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=False))
+    recorder.begin()
+    recorder.add_instant(instant(0, 1_000))
+    recorder.add_instant(instant(1, 2_000, is_complete=False))
+    recorder.add_instant(instant(2, None))
+    recorder.add_frame(0, Frame(IMAGES[3], 3, 10**15, 7), ElementStatus.LATE)
+    recorder.add_frame(0, Frame(IMAGES[0], 0, 10**15, 8), ElementStatus.DUPLICATE)
+    recorder.add_instant(instant(4, 3_000))
+    recorder.hear(LiveEvent("button", "2", "arm"))
+    recorder.add_events((LaserEvent(4, 10**15, 9, ("A", "B")),))
+    assert recorder.close().n_written == 5
+    assert recorder.n_aside == 3
+    recorded, found, events = read_back(tmp_path / "scan.mcap")
+    assert (found.n_exposures, found.n_aside) == (2, 3)
+    assert [row.t_ns for row in recorded.rows] == [1_000, 3_000]
+    for row, image in enumerate((0, 4)):
+        np.testing.assert_array_equal(recorded.exposure(row).image, IMAGES[image])
+    kinds = [one["kind"] for one in events]
+    assert sorted(kinds) == ["button", "frame", "frame", "lasers"]
+    told = {one["kind"]: one["facts"] for one in events}
+    assert told["button"] == {"text": "2", "device": "arm"}
+    assert told["lasers"] == {
+        "trigger_id": 4, "t_device_ns": 10**15, "t_host_ns": 9, "lasers": ["A", "B"],
+    }  # fmt: skip
+
+
+def test_where_ids_decide_a_clock_that_is_not_known_sets_nothing_aside(tmp_path: Path) -> None:
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    # times of arrival, then of a clock that is known: they may go back a little at the change
+    for k, t_ns in enumerate((None, None, 5_009_000_000, 5_030_000_000)):
+        recorder.add_instant(instant(k, t_ns))
+        pose = triggered_scan(4).truth[k]
+        sample = ArmSample(k, 1, 5_000_000_000 + 10**7 * k, pose, trigger_id=k + 3)
+        recorder.add_samples((TimedSample(sample, None, ElementStatus.USABLE, pose),))
+    recorder.close()
+    recorded, found, _ = read_back(tmp_path / "scan.mcap")
+    assert (found.n_exposures, found.n_samples, found.n_aside) == (4, 4, 0)
+    assert [row.trigger_id for row in recorded.rows] == [3, 4, 5, 6]
+    assert recorded.arm.trigger_ids.tolist() == [3, 4, 5, 6]
+    assert (np.diff([row.t_ns for row in recorded.rows]) > 0).all()
+
+
+def test_joints_are_recorded_with_the_arm_s_document(tmp_path: Path) -> None:
+    model = thesis_arm((300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0))
+    rig = small_rig(is_triggered=True, form="joints", arm_model=model)
+    recorder = LiveRecorder(tmp_path / "scan.mcap", rig)
+    recorder.begin()
+    joints = np.random.default_rng(2).uniform(-0.5, 0.5, (3, 7))
+    rotations, places = forward(model, joints)
+    scan = triggered_scan(1)
+    for k in range(3):
+        recorder.add_instant(instant(k, 10**9 * (k + 1)))
+        own = ArmSample(
+            k, 1, 10**9 * (k + 1), joints_rad=joints[k], trigger_id=k + 3,
+            flags=ArmFlag.NONE if k == 1 else ArmFlag.REFERENCED,
+        )  # fmt: skip
+        pose = None if k == 1 else scan.truth[0]
+        recorder.add_samples((TimedSample(own, 10**9 * (k + 1), ElementStatus.USABLE, pose),))
+    recorder.close()
+    recorded, _, _ = read_back(tmp_path / "scan.mcap")
+    assert recorded.session.pose_form == "joints"
+    assert recorded.arm.is_known.tolist() == [True, False, True]
+    np.testing.assert_allclose(recorded.arm.translations_mm[::2], places[::2], atol=1e-9)
+    np.testing.assert_allclose(recorded.arm.rotations[::2], rotations[::2], atol=1e-12)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.options import AsJson, Force, show
+from armscan.cli.options import AsJson, Force, refuse_vain, show
 
 INFO_EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
 CONVERT_EXAMPLE = (
@@ -22,7 +22,11 @@ CONVERT_EXAMPLE = (
 DEVICES_EXAMPLE = "\b\nExample:\n  armscan devices\n  armscan devices --kind camera --json"
 RECOVER_EXAMPLE = "\b\nExample:\n  armscan recover broken.mcap -o scan"
 SUFFIX_OF_RECORDING = ".mcap"
-DOCTOR_EXAMPLE = "\b\nExample:\n  armscan doctor --warm"
+DOCTOR_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan doctor --warm\n"
+    "  armscan doctor --bundle question.zip --with scanner.json --with scan.mcap"
+)
 
 
 def info(
@@ -99,11 +103,31 @@ def doctor(
     warm: Annotated[
         bool, typer.Option("--warm", help="Compile ahead, so that the first scan starts at once.")
     ] = False,
+    bundle: Annotated[
+        Path | None,
+        typer.Option(help="A .zip to send with a question to somebody else.", show_default=False),
+    ] = None,
+    having: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--with",
+            help="What goes into the bundle: scanner.json, rig.toml, a log; of a recording its "
+            "beginning; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Check versions, compiler, folders and optional packages."""
+    """Check versions, compiler, folders, optional packages and drivers of devices."""
     from armscan.jobs.info import examine_installation
 
+    if bundle is not None:
+        from armscan.jobs.live.bundle import pack_bundle
+
+        show(pack_bundle(bundle, having or (), is_overwriting=force), as_json=as_json)
+        return
+    refuse_vain({"--with": having}, "there is no bundle", "give --bundle, or leave out")
     summary = examine_installation(warm=warm)
     show(summary, as_json=as_json)
     if summary.warnings:

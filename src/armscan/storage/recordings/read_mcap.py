@@ -6,7 +6,7 @@ from __future__ import annotations
 import base64
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,7 @@ from armscan.storage.recordings.write_mcap import (
     DOCUMENT_TOPIC,
     EVENT_TOPIC,
     EXPOSURE_TOPIC,
+    NS_PER_S,
     RecordingWriter,
     WriterStatus,
 )
@@ -282,10 +283,26 @@ def _png(shown: RawImage) -> bytes:
     return encoded_png(Exposure(native, "image", bits_used=bits), setup)
 
 
-def record_folder(folder: Path, output: Path) -> WriterStatus:
+def record_folder(
+    folder: Path,
+    output: Path,
+    *,
+    most: int | None = None,
+    edit: Callable[[bytes], bytes] | None = None,
+) -> WriterStatus:
     """Write a folder recording as an MCAP file; image files and cells of tables stay as they are.
 
     An ``output`` that exists is replaced when the new one is whole.
+
+    Parameters
+    ----------
+    folder, output
+        From where to where.
+    most
+        So many exposures, the first ones, and what the arm reported a second before and after
+        them; None for all.
+    edit
+        What becomes of each document; None leaves them.
 
     Raises
     ------
@@ -300,15 +317,34 @@ def record_folder(folder: Path, output: Path) -> WriterStatus:
     documents = {name: read_bytes(folder / name) for name in names if is_file(folder / name)}
     if session.is_simulated != recording.session.is_simulated:
         documents[SESSION_FILE] = session_toml(session)
+    if edit is not None:
+        documents = {name: edit(data) for name, data in documents.items()}
     table = read_csv(folder / EXPOSURES_FILE)
-    by_index = {row.index: row for row in recording.rows}
-    rows = [by_index[index] for index in table.ints("index").tolist()]
-    arm_cells = {} if recording.arm is None else read_csv(folder / ARM_FILE).columns
+    by_index = {row.index: row for row in recording.rows[:most]}
+    kept = [k for k, index in enumerate(table.ints("index").tolist()) if index in by_index]
+    rows = [by_index[int(table.columns["index"][k])] for k in kept]
+    columns = {name: [cells[k] for k in kept] for name, cells in table.columns.items()}
+    arm, arm_cells = recording.arm, {}
+    if arm is not None:
+        span = slice(None) if most is None else _span(arm, rows, session)
+        arm_cells = {
+            name: cells[span] for name, cells in read_csv(folder / ARM_FILE).columns.items()
+        }
+        arm = arm.select(span)
     return _record(
         output,
-        _Content(session, documents, rows, table.columns, recording.arm, arm_cells),
+        _Content(session, documents, rows, columns, arm, arm_cells),
         (read_bytes(folder / row.source) for row in rows),
     )
+
+
+def _span(arm: ArmTrack, rows: Sequence[ExposureRow], session: Session) -> slice:
+    """Samples a second before to a second after exposures; all where the clocks differ."""
+    if session.clock != "shared":
+        return slice(None)
+    times = [row.t_ns for row in rows]
+    low, high = min(times) - NS_PER_S, max(times) + NS_PER_S
+    return slice(*np.searchsorted(arm.t_ns, (low, high)).tolist())
 
 
 def record_source(

@@ -61,6 +61,14 @@ def convert(
             show_default=False,
         ),
     ],
+    stripe_band: Annotated[
+        bool,
+        typer.Option(
+            "--stripe-band",
+            help="Of a recording to .mcap: pixels away from what could be a stripe become zero; "
+            "the points stay the same, the file gets small.",
+        ),
+    ] = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -71,16 +79,18 @@ def convert(
     if SUFFIX_OF_RECORDING in (source.suffix.lower(), output.suffix.lower()):
         from armscan.jobs.live.recordings import convert_recording
 
-        show(convert_recording(source, output, is_overwriting=force), as_json=as_json)
+        done = convert_recording(source, output, is_overwriting=force, is_stripe_band=stripe_band)
+        show(done, as_json=as_json)
         return
-    done = convert_file(source, output, is_overwriting=force)
-    losses = (f"the new file does not hold: {', '.join(done.losses)}",) if done.losses else ()
+    refuse_vain({"--stripe-band": stripe_band}, "this is no recording")
+    told = convert_file(source, output, is_overwriting=force)
+    losses = (f"the new file does not hold: {', '.join(told.losses)}",) if told.losses else ()
     summary = Summary(
-        title=f"Converted: {done.what}.",
-        warnings=(*done.remarks, *losses),
+        title=f"Converted: {told.what}.",
+        warnings=(*told.remarks, *losses),
         written=(output,),
-        forced=done.forced,
-        extra={"kind": "conversion", "what": done.what, "losses": list(done.losses)},
+        forced=told.forced,
+        extra={"kind": "conversion", "what": told.what, "losses": list(told.losses)},
     )
     show(summary, as_json=as_json)
 

@@ -125,6 +125,8 @@ def describe_recording(folder: Path) -> dict[str, Any]:
         **({"lasers": lasers} if lasers else {}),
         "cameras": [_camera_line(setup) for setup in scan.session.cameras],
     }
+    if scan.session.is_stripe_band:
+        content["pixels"] = "stripe band: zero away from what could be a stripe"
     if scan.arm is not None:
         content |= {"pose_form": scan.session.pose_form, "clock": scan.session.clock}
         content |= _track(scan.arm) | _poses(scan, scan.arm)

@@ -6,7 +6,7 @@ return something or raise an `ArmscanError`. Any other exception, more than `LIM
 work or more than `LIMIT_MB` megabytes is a fault. The cases run in other processes, whose memory
 is limited.
 
-    python benchmarks/mutated_inputs.py                                 # 28 readers, 1500 each
+    python benchmarks/mutated_inputs.py                                 # 31 readers, 1500 each
     python benchmarks/mutated_inputs.py --readers ply png --cases 200
     python benchmarks/mutated_inputs.py --readers ply --first 37 --cases 1 --keep case
 """

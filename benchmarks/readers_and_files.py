@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,8 +35,10 @@ from armscan.models.calibration import (
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import StereoCalibration, StereoDiagnostics
+from armscan.pipeline.live.rig import read_rig
 from armscan.records.cloud import PointCloud
 from armscan.records.profile import Profile
+from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from armscan.storage.arm import read_arm_model, read_probe_tip
 from armscan.storage.clouds import ply_bytes, read_cloud
 from armscan.storage.documents import (
@@ -55,6 +58,7 @@ from armscan.storage.documents import (
     sensor_document,
     stereo_document,
 )
+from armscan.storage.files import read_bytes
 from armscan.storage.images import read_exposure
 from armscan.storage.observations import pack_observations, read_observations
 from armscan.storage.points import (
@@ -65,6 +69,9 @@ from armscan.storage.points import (
     read_robot_poses,
 )
 from armscan.storage.recording import read_arm_track, read_recording
+from armscan.storage.recordings import write_mcap
+from armscan.storage.recordings.mcap_folder import folder_in
+from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.vision.targets.target import TargetView
 
 Files = dict[str, bytes]
@@ -467,8 +474,96 @@ def _single(files: Sequence[Files], read: Callable[[Path], object], **options: A
     return Reader(files, lambda folder: read(next(folder.iterdir(), folder / absent)), **options)
 
 
+N_RECORDED = 8
+"""Exposures of the recording in one file, of two cameras in turn."""
+RIG = """cameras = ["webcam:0", "webcam:1"]
+arm = "tcp:127.0.0.1:4000"
+lasers = "laser-serial:/dev/ttyUSB0:115200"
+trigger = "external"
+rate_hz = 40.0
+schedule = ["A", "A+B", ""]
+is_common_trigger = true
+scanner = "scanner.json"
+"""
+
+
+def _mcap() -> bytes:
+    """A recording in one file, of several chunks: raw pixels, image files, samples, events."""
+    setup = CameraSetup(width_px=WIDTH_PX, height_px=HEIGHT_PX)
+    whole, write_mcap.CHUNK_BYTES = write_mcap.CHUNK_BYTES, 2 * WIDTH_PX * HEIGHT_PX
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "scan.mcap"
+            with write_mcap.RecordingWriter(path) as writer:
+                writer.begin(Session(cameras=(setup, setup)), {"arm.toml": ARM_MODEL.encode()})
+                for k in range(N_RECORDED):
+                    pixels = np.roll(_pixels(HEIGHT_PX, WIDTH_PX), k)
+                    row = ExposureRow(
+                        k, k // 2 * 10**7, k % 2, f"images/{k}.png", ("A",), trigger_id=k // 2
+                    )
+                    writer.add_exposure(row, pixels if k % 4 < 2 else _encoded(".png", pixels))
+                track = ArmTrack(
+                    t_ns=np.arange(4) * 10**7,
+                    rotations=np.tile(np.eye(3), (4, 1, 1)),
+                    translations_mm=np.full((4, 3), 300.0),
+                    is_known=np.ones(4, np.bool_),
+                )
+                writer.add_arm_samples(track, {"button": ("0", "1", "0", "0")})
+                writer.add_event(5, "button", {"number": 1})
+            return path.read_bytes()
+    finally:
+        write_mcap.CHUNK_BYTES = whole
+
+
+def _contents(path: Path) -> Files:
+    """All files of a recording in one file, images as their pixels."""
+    names = [one for one in folder_in(path).names if not one.startswith("images/")]
+    files = {name: read_bytes(path / name) for name in names}
+    source = read_recording(path)
+    images = {row.source: source.exposure(k).image for k, row in enumerate(source.rows)}
+    return files | {name: image.tobytes() for name, image in images.items()}
+
+
+def _one_file() -> dict[str, Reader]:
+    """A recording in one file: what is read is what was recorded, whatever was mutated."""
+    data = _mcap()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scan.mcap"
+        path.write_bytes(data)
+        right = _contents(path)
+
+    def whole(path: Path) -> object:
+        found = _contents(path)
+        if found != right:
+            raise AssertionError("another recording was read")
+        return found
+
+    def saved(path: Path) -> object:
+        place = path.parent / "saved"
+        try:
+            found = extract_recording(path, place, is_recovering=True)
+        finally:
+            rest = [one for one in path.parent.iterdir() if one not in (path, place)]
+            if rest:
+                raise AssertionError("something half-written is left")
+        for image in (place / "images").iterdir():
+            if read_exposure(image).image.tobytes() != right[f"images/{image.name}"]:
+                raise AssertionError("other pixels were recovered")
+        listed = (place / "exposures.csv").read_bytes().splitlines()
+        if not set(listed) <= set(right["exposures.csv"].splitlines()):
+            raise AssertionError("other exposures were recovered")
+        if len(listed) - 1 < N_RECORDED and not found.lost:
+            raise AssertionError("a loss is not told")
+        return found
+
+    return {
+        "mcap": _single([{"scan.mcap": data}], whole, is_text=False),
+        "mcap>recover": _single([{"scan.mcap": data}], saved, is_text=False),
+    }
+
+
 def readers() -> dict[str, Reader]:
-    """The 28 readers by their names."""
+    """The 31 readers by their names."""
     joints = _recording(**{"arm.csv": JOINTS, "arm.toml": ARM_MODEL})
     euler = ARM.replace("qw,qx,qy,qz", "a_deg,b_deg,c_deg").replace("1,0,0,0", "1,0,0")
     euler = euler.replace("0.8,0.6,0,0", "0.8,0.6,0").replace("0,0,1,0", "0,0,1")
@@ -532,5 +627,7 @@ def readers() -> dict[str, Reader]:
         "arm.toml": _single([{"arm.toml": ARM_MODEL.encode()}], read_arm_model),
         "probe.toml": _single([{"probe.toml": PROBE.encode()}], read_probe_tip),
         "observations": _single([{"a.npz": _observations()}], read_observations, is_text=False),
+        **_one_file(),
+        "rig.toml": _single([{"rig.toml": RIG.encode()}], read_rig),
         "info(any)": Reader([*anything, scan], _info),
     }

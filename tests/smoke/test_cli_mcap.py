@@ -56,7 +56,14 @@ def folders(calibrated: Bench, tmp_path_factory: pytest.TempPathFactory) -> dict
     words = ["calibrate", "hand-eye", made["postures"], "--sensor", calibrated.sensor]
     made["scanner"] = place / "scanner.json"
     assert main([str(w) for w in (*words, "--plane", PLANE, "-o", made["scanner"])]) == 0
+    made["plane"] = place / "plane.csv"
+    made["plane"].write_text(f"A,B,C,D\n{PLANE}\n")
     return made
+
+
+def given_files(bench: Bench, made: dict[str, Path]) -> dict[str, Path]:
+    own = {name: made[name] for name in ("scanner", "plane")}
+    return {"camera": bench.camera, "sensor": bench.sensor, **own}
 
 
 def as_raw(folder: Path, path: Path) -> None:
@@ -88,13 +95,13 @@ COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "reconstruct in the sensor": ("laser", ("reconstruct", "{scan}", "--sensor", "{sensor}",
                                             "-o", "{out}/cloud.ply")),
     "verify": ("postures", ("verify", "{scan}", "--scanner", "{scanner}",
-                           f"--plate={PLANE}")),
+                           "--plate", "{plane}")),
     "markers": ("camera", ("markers", "{scan}/images/00.png", "-o", "{out}/m.html")),
 }  # fmt: skip
 
 
 def run(
-    words: tuple[str, ...], scan: Path, out: Path, given: dict[str, object],
+    words: tuple[str, ...], scan: Path, out: Path, given: dict[str, Path],
     capsys: pytest.CaptureFixture[str],
 ) -> tuple[int, str]:  # fmt: skip
     """Exit code and what is said, with the recording's and the output's names taken out."""
@@ -121,11 +128,7 @@ def test_a_file_is_measured_as_its_folder(
     packed = folder.with_suffix(".mcap")
     if how == "raw":
         packed = folder.parent / "raw" / packed.name
-    given = {
-        "camera": calibrated.camera,
-        "sensor": calibrated.sensor,
-        "scanner": folders["scanner"],
-    }
+    given = given_files(calibrated, folders)
     there = run(words, folder, tmp_path / "a", given, capsys)
     here = run(words, packed, tmp_path / "b", given, capsys)
     assert here == there
@@ -148,11 +151,7 @@ def test_a_broken_file_costs_one_sentence(
     which, words = COMMANDS[name]
     data = folders[which].with_suffix(".mcap").read_bytes()
     broken = tmp_path / "scan.mcap"
-    given = {
-        "camera": calibrated.camera,
-        "sensor": calibrated.sensor,
-        "scanner": folders["scanner"],
-    }
+    given = given_files(calibrated, folders)
     filled = [word.format(scan=broken, out=tmp_path, **given) for word in words]
     for content, said in ((data[:-30], "armscan recover"), (b"", "empty"), (b"text", "no MCAP")):
         broken.write_bytes(content)

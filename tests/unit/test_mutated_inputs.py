@@ -15,10 +15,10 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "mutated_inputs.py"
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are those of Linux")
 def test_mutated_inputs_are_read_or_refused() -> None:
-    """Fifteen cases of each of the 28 readers, in a process whose memory is limited."""
+    """Fifteen cases of each of the 31 readers, in a process whose memory is limited."""
     command = [sys.executable, str(SCRIPT), "--work", "--cases", "15", "--seed", "7"]
     done = subprocess.run(command, capture_output=True, check=True, timeout=120)
     told = [json.loads(line) for line in done.stdout.splitlines()]
     outcomes = [line for line in told if "outcome" in line]
-    assert len(outcomes) == 420
+    assert len(outcomes) == 465
     assert [line for line in outcomes if line["outcome"] not in ("accepted", "refused")] == []

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.options import AsJson, Force, show
+from armscan.cli.options import AsJson, Force, refuse_vain, show
 
 INFO_EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
 CONVERT_EXAMPLE = (
@@ -22,7 +22,11 @@ CONVERT_EXAMPLE = (
 DEVICES_EXAMPLE = "\b\nExample:\n  armscan devices\n  armscan devices --kind camera --json"
 RECOVER_EXAMPLE = "\b\nExample:\n  armscan recover broken.mcap -o scan"
 SUFFIX_OF_RECORDING = ".mcap"
-DOCTOR_EXAMPLE = "\b\nExample:\n  armscan doctor --warm"
+DOCTOR_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan doctor --warm\n"
+    "  armscan doctor --bundle question.zip --with scanner.json --with scan.mcap"
+)
 
 
 def info(
@@ -57,6 +61,14 @@ def convert(
             show_default=False,
         ),
     ],
+    stripe_band: Annotated[
+        bool,
+        typer.Option(
+            "--stripe-band",
+            help="Of a recording to .mcap: pixels away from what could be a stripe become zero; "
+            "the points stay the same, the file gets small.",
+        ),
+    ] = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -67,16 +79,18 @@ def convert(
     if SUFFIX_OF_RECORDING in (source.suffix.lower(), output.suffix.lower()):
         from armscan.jobs.live.recordings import convert_recording
 
-        show(convert_recording(source, output, is_overwriting=force), as_json=as_json)
+        done = convert_recording(source, output, is_overwriting=force, is_stripe_band=stripe_band)
+        show(done, as_json=as_json)
         return
-    done = convert_file(source, output, is_overwriting=force)
-    losses = (f"the new file does not hold: {', '.join(done.losses)}",) if done.losses else ()
+    refuse_vain({"--stripe-band": stripe_band}, "this is no recording")
+    told = convert_file(source, output, is_overwriting=force)
+    losses = (f"the new file does not hold: {', '.join(told.losses)}",) if told.losses else ()
     summary = Summary(
-        title=f"Converted: {done.what}.",
-        warnings=(*done.remarks, *losses),
+        title=f"Converted: {told.what}.",
+        warnings=(*told.remarks, *losses),
         written=(output,),
-        forced=done.forced,
-        extra={"kind": "conversion", "what": done.what, "losses": list(done.losses)},
+        forced=told.forced,
+        extra={"kind": "conversion", "what": told.what, "losses": list(told.losses)},
     )
     show(summary, as_json=as_json)
 
@@ -99,11 +113,31 @@ def doctor(
     warm: Annotated[
         bool, typer.Option("--warm", help="Compile ahead, so that the first scan starts at once.")
     ] = False,
+    bundle: Annotated[
+        Path | None,
+        typer.Option(help="A .zip to send with a question to somebody else.", show_default=False),
+    ] = None,
+    having: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--with",
+            help="What goes into the bundle: scanner.json, rig.toml, a log; of a recording its "
+            "beginning; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Check versions, compiler, folders and optional packages."""
+    """Check versions, compiler, folders, optional packages and drivers of devices."""
     from armscan.jobs.info import examine_installation
 
+    if bundle is not None:
+        from armscan.jobs.live.bundle import pack_bundle
+
+        show(pack_bundle(bundle, having or (), is_overwriting=force), as_json=as_json)
+        return
+    refuse_vain({"--with": having}, "there is no bundle", "give --bundle, or leave out")
     summary = examine_installation(warm=warm)
     show(summary, as_json=as_json)
     if summary.warnings:

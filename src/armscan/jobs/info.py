@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from armscan import kernels
+from armscan.devices.registry import DriverReport, survey_drivers
 from armscan.devices.sources import driver_names
 from armscan.errors import ArmscanError, FileFormatError
 from armscan.geometry.arrays import IntArray
@@ -124,6 +125,8 @@ def describe_recording(folder: Path) -> dict[str, Any]:
         **({"lasers": lasers} if lasers else {}),
         "cameras": [_camera_line(setup) for setup in scan.session.cameras],
     }
+    if scan.session.is_stripe_band:
+        content["pixels"] = "stripe band: zero away from what could be a stripe"
     if scan.arm is not None:
         content |= {"pose_form": scan.session.pose_form, "clock": scan.session.clock}
         content |= _track(scan.arm) | _poses(scan, scan.arm)
@@ -601,6 +604,7 @@ def examine_installation(*, warm: bool = False) -> Summary:
     for name, use in OPTIONAL.items():
         facts.append((name, _version_of(name) or f"not installed (optional: {use})"))
     facts.append(("drivers", ", ".join(driver_names()) or "none"))
+    facts += [(f"devices by {one.name}", _state(one)) for one in survey_drivers()]
     writable = _temporary_folder_fact(problems)
     facts.append(("temporary files", writable))
     facts.append(("compiler", _compiler_fact(problems)))
@@ -624,6 +628,13 @@ def examine_installation(*, warm: bool = False) -> Summary:
             "compiled_s": compiled,
         },
     )
+
+
+def _state(driver: DriverReport) -> str:
+    """What a driver of devices says of itself; none is needed to measure recordings."""
+    if driver.problem:
+        return f"not usable: {driver.problem}"
+    return f"ready, {len(driver.found)} found" if driver.found else "ready"
 
 
 def _version_of(name: str) -> str:

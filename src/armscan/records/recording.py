@@ -65,6 +65,8 @@ class Session:
         Path of a description of the head beside the recording, or None.
     is_simulated
         True if the recording says that its images were rendered.
+    is_stripe_band
+        True if images with a laser are zero away from what could be a stripe.
     assumed
         What nobody said and the program took for granted, in words.
     """
@@ -76,6 +78,7 @@ class Session:
     rotation: EulerConvention = "intrinsic-xyz"
     head: str | None = None
     is_simulated: bool = False
+    is_stripe_band: bool = False
     assumed: tuple[str, ...] = ()
 
 

@@ -61,6 +61,7 @@ class _SessionKeys:
     kind: SessionKind = Session().kind
     head: str | None = None
     simulated: bool = False
+    stripe_band: bool = False
     pose: _PoseKeys = _PoseKeys()
     time: _TimeKeys = _TimeKeys()
     camera: tuple[CameraSetup, ...] = ()
@@ -68,7 +69,7 @@ class _SessionKeys:
 
 WINDOW_PX = (0, LARGEST_SIZE_PX)
 LAYOUTS: Mapping[type, Layout] = {
-    _SessionKeys: Layout(optional=("simulated",)),
+    _SessionKeys: Layout(optional=("simulated", "stripe_band")),
     CameraSetup: Layout(flat=("window",), limits={"bits_used": (1, 16)}),
     SensorWindow: Layout(
         keys={"x_px": "window_x_px", "y_px": "window_y_px"},
@@ -123,6 +124,7 @@ def read_session_file(path: Path) -> SessionFile:
         rotation=keys.pose.rotation,
         head=keys.head,
         is_simulated=keys.simulated,
+        is_stripe_band=keys.stripe_band,
     )
     odd = tuple(f"{path.name}: the key {fact}" for fact in unknown)
     return SessionFile(session, frozenset(_stated(content)), odd)
@@ -134,6 +136,7 @@ def session_toml(session: Session) -> bytes:
         kind=session.kind,
         head=session.head,
         simulated=session.is_simulated,
+        stripe_band=session.is_stripe_band,
         pose=_PoseKeys(session.pose_form, session.rotation),
         time=_TimeKeys(session.clock),
         camera=session.cameras,

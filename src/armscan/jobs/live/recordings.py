@@ -8,13 +8,25 @@ from pathlib import Path
 from armscan.errors import OptionError
 from armscan.report.quantity import Quantity, Summary
 from armscan.storage.files import check_outputs, is_folder, scratch_folder
+from armscan.storage.recording import is_recording
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording, record_folder
 
 SUFFIX = ".mcap"
 
 
-def convert_recording(source: Path, output: Path, *, is_overwriting: bool = False) -> Summary:
+def convert_recording(
+    source: Path, output: Path, *, is_overwriting: bool = False, is_stripe_band: bool = False
+) -> Summary:
     """Write a folder recording as one file, or the other way.
+
+    Parameters
+    ----------
+    source, output
+        From where to where.
+    is_overwriting
+        Replace a file of that name.
+    is_stripe_band
+        Keep pixels near stripes alone; see `WriterOptions`.
 
     Raises
     ------
@@ -25,16 +37,22 @@ def convert_recording(source: Path, output: Path, *, is_overwriting: bool = Fals
     OutputError
         If the output exists or cannot be written.
     """
+    if is_stripe_band and output.suffix.lower() != SUFFIX:
+        raise OptionError(
+            "a stripe band is for recordings in one file",
+            where="--stripe-band",
+            remedy=f"end the new name in {SUFFIX}, or leave it out",
+        )
     if source.suffix.lower() == SUFFIX and output.suffix.lower() != SUFFIX:
         return _summary("Converted: recording to a folder.", extract_recording(source, output),
                         output)  # fmt: skip
-    if not is_folder(source):
+    if not is_folder(source) and not (is_stripe_band and is_recording(source)):
         raise OptionError(
             f"there is no conversion from {source.name} to {output.name}",
             remedy="convert the folder of a recording to .mcap, or a .mcap to a folder",
         )
     check_outputs((output,), is_overwriting=is_overwriting)
-    status = record_folder(source, output)
+    status = record_folder(source, output, is_stripe_band=is_stripe_band)
     return Summary(
         title="Converted: recording to one file.",
         quantities=(Quantity("exposures", "exposures", status.n_written),),

@@ -10,6 +10,7 @@ import threading
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 
 from armscan.errors import FileFormatError
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE
-from armscan.storage.files import path_text, read_bytes
+from armscan.storage.files import is_file, path_text, read_bytes
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
     MOST_CAMERAS,
@@ -358,11 +359,9 @@ def opened(path: Path) -> BinaryIO:
         If it is none, or cannot be read.
     """
     head = b""
-    try:
-        with path.open("rb") as file:
+    if is_file(path):
+        with suppress(OSError), path.open("rb") as file:
             head = file.read(len(MAGIC))
-    except (OSError, ValueError):
-        read_bytes(path)
     if not head:
         read_bytes(path)
     if head != MAGIC:
@@ -584,11 +583,9 @@ def folder_in(path: Path) -> McapFolder:
     FileFormatError
         As `McapFolder`.
     """
-    try:
-        facts = path.stat()
-    except (OSError, ValueError):
+    if not is_file(path):
         read_bytes(path)
-        raise
+    facts = path.stat()
     return _folder_of(path, facts.st_mtime_ns, facts.st_size)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import base64
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError, FileFormatError, OutputError
+from armscan.geometry.arrays import ImageArray
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, arm_columns
@@ -31,7 +32,9 @@ from armscan.storage.files import (
     scratch_folder,
     write_files,
 )
+from armscan.storage.images import read_exposure
 from armscan.storage.recording import (
+    FolderRecording,
     Report,
     encoded_png,
     image_files,
@@ -67,7 +70,9 @@ from armscan.storage.recordings.write_mcap import (
     DOCUMENT_TOPIC,
     EVENT_TOPIC,
     EXPOSURE_TOPIC,
+    NS_PER_S,
     RecordingWriter,
+    WriterOptions,
     WriterStatus,
 )
 from armscan.storage.tables import read_csv
@@ -282,10 +287,29 @@ def _png(shown: RawImage) -> bytes:
     return encoded_png(Exposure(native, "image", bits_used=bits), setup)
 
 
-def record_folder(folder: Path, output: Path) -> WriterStatus:
+def record_folder(
+    folder: Path,
+    output: Path,
+    *,
+    most: int | None = None,
+    edit: Callable[[bytes], bytes] | None = None,
+    is_stripe_band: bool = False,
+) -> WriterStatus:
     """Write a folder recording as an MCAP file; image files and cells of tables stay as they are.
 
     An ``output`` that exists is replaced when the new one is whole.
+
+    Parameters
+    ----------
+    folder, output
+        From where to where.
+    most
+        So many exposures, the first ones, and what the arm reported a second before and after
+        them; None for all.
+    edit
+        What becomes of each document; None leaves them.
+    is_stripe_band
+        See `WriterOptions`; grey pixels are then written raw, not as their files.
 
     Raises
     ------
@@ -300,15 +324,50 @@ def record_folder(folder: Path, output: Path) -> WriterStatus:
     documents = {name: read_bytes(folder / name) for name in names if is_file(folder / name)}
     if session.is_simulated != recording.session.is_simulated:
         documents[SESSION_FILE] = session_toml(session)
+    if edit is not None:
+        documents = {name: edit(data) for name, data in documents.items()}
     table = read_csv(folder / EXPOSURES_FILE)
-    by_index = {row.index: row for row in recording.rows}
-    rows = [by_index[index] for index in table.ints("index").tolist()]
-    arm_cells = {} if recording.arm is None else read_csv(folder / ARM_FILE).columns
+    by_index = {row.index: row for row in recording.rows[:most]}
+    kept = [k for k, index in enumerate(table.ints("index").tolist()) if index in by_index]
+    rows = [by_index[int(table.columns["index"][k])] for k in kept]
+    columns = {name: [cells[k] for k in kept] for name, cells in table.columns.items()}
+    arm, arm_cells = recording.arm, {}
+    if arm is not None:
+        span = slice(None) if most is None else _span(arm, rows, session)
+        arm_cells = {
+            name: cells[span] for name, cells in read_csv(folder / ARM_FILE).columns.items()
+        }
+        arm = arm.select(span)
     return _record(
         output,
-        _Content(session, documents, rows, table.columns, recording.arm, arm_cells),
-        (read_bytes(folder / row.source) for row in rows),
+        _Content(session, documents, rows, columns, arm, arm_cells),
+        _stored(recording, rows) if is_stripe_band else image_bytes(folder, rows),
+        options=WriterOptions(is_stripe_band=is_stripe_band),
     )
+
+
+def image_bytes(folder: Path, rows: Sequence[ExposureRow]) -> Iterator[bytes]:
+    """The image files of rows as they are."""
+    return (read_bytes(folder / row.source) for row in rows)
+
+
+def _stored(
+    recording: FolderRecording, rows: Sequence[ExposureRow]
+) -> Iterator[ImageArray | bytes]:
+    """Pixels of grey cameras as their files hold them, and files of the others."""
+    for row in rows:
+        setup, path = recording.session.cameras[row.camera], recording.folder / row.source
+        is_grey = setup.colour == "mono"
+        yield read_exposure(path).image if is_grey else read_bytes(path)
+
+
+def _span(arm: ArmTrack, rows: Sequence[ExposureRow], session: Session) -> slice:
+    """Samples a second before to a second after exposures; all where the clocks differ."""
+    if session.clock != "shared":
+        return slice(None)
+    times = [row.t_ns for row in rows]
+    low, high = min(times) - NS_PER_S, max(times) + NS_PER_S
+    return slice(*np.searchsorted(arm.t_ns, (low, high)).tolist())
 
 
 def record_source(
@@ -345,7 +404,7 @@ def record_source(
     of_arm = {} if arm is None else arm_columns(arm, session.pose_form, session.rotation, {})
     content = _Content(session, {SESSION_FILE: session_toml(session)}, rows, columns, arm, of_arm)
     files = image_files(source, session) if encoded is None else encoded
-    return _record(output, content, files, progress, beside)
+    return _record(output, content, files, progress=progress, beside=beside)
 
 
 def check_new_file(output: Path) -> None:
@@ -376,14 +435,16 @@ class _Content:
 def _record(
     output: Path,
     content: _Content,
-    images: Iterable[bytes],
+    images: Iterable[ImageArray | bytes],
+    *,
     progress: Report | None = None,
     beside: Mapping[Path, bytes] | None = None,
+    options: WriterOptions | None = None,
 ) -> WriterStatus:
     with scratch_folder(output) as scratch:
         part = scratch / "recording.mcap"
         try:
-            status = _write_all(part, content, images, progress)
+            status = _write_all(RecordingWriter(part, options), content, images, progress)
             write_files(beside or {})
             _give_name(part, output, beside or {})
         except OutputError as error:
@@ -398,9 +459,12 @@ def _record(
 
 
 def _write_all(
-    part: Path, content: _Content, images: Iterable[bytes], progress: Report | None
+    writer: RecordingWriter,
+    content: _Content,
+    images: Iterable[ImageArray | bytes],
+    progress: Report | None,
 ) -> WriterStatus:
-    with RecordingWriter(part) as writer:
+    with writer:
         writer.begin(content.session, content.documents)
         for k, (row, image) in enumerate(zip(content.rows, images, strict=True)):
             cells = {name: column[k] for name, column in content.columns.items()}

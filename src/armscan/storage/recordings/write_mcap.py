@@ -34,11 +34,12 @@ from scipy.spatial.transform import Rotation
 
 from armscan.errors import InputError, OutputError
 from armscan.geometry.arrays import ImageArray
-from armscan.records.recording import ArmTrack, ExposureRow, Session
+from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from armscan.storage.arm import arm_columns
 from armscan.storage.files import path_text
 from armscan.storage.images import image_format
 from armscan.storage.recording_session import SESSION_FILE, exposure_columns, session_toml
+from armscan.vision.stripe.ridge import near_lines
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_BYTES = 4 << 20
@@ -62,7 +63,7 @@ Compression = Literal["auto", "raw", "zstd"]
 
 @dataclass(frozen=True, slots=True)
 class WriterOptions:
-    """How a recording is written; nothing of it changes a pixel.
+    """How a recording is written; nothing but the stripe band changes a pixel.
 
     Parameters
     ----------
@@ -71,10 +72,14 @@ class WriterOptions:
         on a machine of at least two cores.
     queue_bytes
         Images that may wait; a caller waits when they are that many.
+    is_stripe_band
+        Grey pixels of exposures with a laser and without a view are kept near what could be a
+        stripe, and zero elsewhere; see `near_lines`. What is extracted from them stays the same.
     """
 
     compression: Compression = "auto"
     queue_bytes: int = 256 << 20
+    is_stripe_band: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +154,7 @@ class RecordingWriter:
 
     Exposures, samples of the arm and events may be added from several threads. Times may be in any
     order: what is recorded is what was delivered. A file whose `close` never came has no summary;
-    its chunks are whole and checksummed, and a reader that goes through a file from its beginning
-    finds them. Each chunk of images is followed by the facts of its exposures, and declares itself
-    what it holds.
+    its chunks are whole, checksummed, and declare what they hold; facts follow their images.
 
     Parameters
     ----------
@@ -169,9 +172,8 @@ class RecordingWriter:
         self._is_closing = False
         self._failure: BaseException | None = None
         self._has_summary = False
-        self._n_accepted = self._n_written = self._n_waits = 0
+        self._n_accepted = self._n_written = self._n_waits = self._size = 0
         self._handle = -1
-        self._size = 0
         self._schemas: list[records.Schema] = []
         self._channels: list[records.Channel] = []
         self._attachments: list[records.AttachmentIndex] = []
@@ -205,10 +207,14 @@ class RecordingWriter:
         """
         if self._thread.ident is not None or self._is_closing:
             raise InputError("the recording was begun before", remedy="make a new writer")
+        kept = dict(documents or {})
+        if self._options.is_stripe_band:
+            session = replace(session, is_stripe_band=True)
+            kept[SESSION_FILE] = session_toml(session)
         self._session = session
         try:
             self._handle = os.open(self._path, NEW_FILE, 0o666)
-            self._write_head({SESSION_FILE: session_toml(session), **(documents or {})})
+            self._write_head({SESSION_FILE: session_toml(session), **kept})
             self._thread.start()
         except BaseException as error:
             if self._handle >= 0:
@@ -273,7 +279,11 @@ class RecordingWriter:
         """
         if not 0 <= row.camera < len(self._session.cameras):
             raise InputError(f"camera {row.camera} is not among those of the session")
-        pieces, facts = _image_message(row, image, self._session)
+        banded = None
+        if self._options.is_stripe_band:
+            banded = _banded(row, image, self._session.cameras[row.camera])
+        pieces, facts = _image_message(row, image if banded is None else banded, self._session)
+        facts |= {} if banded is None else {"outside_band": "zero"}
         topic = f"/camera/{row.camera}/" + facts["stored"]
         if cells is None:
             cells = {name: column[0] for name, column in exposure_columns((row,), {}).items()}
@@ -525,8 +535,8 @@ class RecordingWriter:
 
     def _is_packing(self) -> bool:
         chosen = self._options.compression
-        if chosen != "auto":
-            return chosen == "zstd"
+        if chosen != "auto" or self._options.is_stripe_band:
+            return chosen != "raw"
         return (os.cpu_count() or 1) > 1 and 2 * self._queued_bytes < self._options.queue_bytes
 
     def _write(self, pieces: Sequence[bytes]) -> None:
@@ -665,6 +675,15 @@ def _image_message(
     _set_time(shown, row.t_ns)
     facts |= {"crc32": zlib.crc32(data), "bytes": len(data)}
     return (shown.SerializeToString(), bytes([tag]) + _varint(len(data)), data), facts
+
+
+def _banded(row: ExposureRow, image: ImageArray | bytes, setup: CameraSetup) -> ImageArray | None:
+    """Pixels near stripes; None where extraction does not take this image alone, as of a view."""
+    if isinstance(image, bytes) or image.ndim != 2 or not row.lasers or row.view is not None:
+        return None
+    bits = setup.bits_used if setup.align == "low" else 8 * image.dtype.itemsize
+    keep = near_lines(image.astype(np.float32) * np.float32(255.0 / ((1 << bits) - 1)))
+    return np.where(keep, image, image.dtype.type(0))
 
 
 def _encoding(image: ImageArray, colour: str, source: str) -> str:

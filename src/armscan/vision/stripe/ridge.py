@@ -7,10 +7,11 @@ import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
 from armscan.kernels.chains import find_neighbours, place_points, sum_windows, walk_chains
@@ -62,6 +63,32 @@ def measure_level(image: FloatImage, threshold: float | None) -> ImageLevel:
         peak = _brightest(image[::2, ::2]) - float(np.median(background))
         threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
     return ImageLevel(background, noise, clutter, threshold)
+
+
+BAND_PX = 40
+"""The farthest pixel from a run that extraction looks at: sections of lines of sigma 10 px."""
+NEARLY_LIT = 0.98
+"""Of the rise: what rounding could lift is kept."""
+
+
+def near_lines(image: FloatImage) -> BoolArray:
+    """Pixels (H, W) that `extract_stripes` looks at with its defaults; all others may be zero.
+
+    These are a band around all that rises above the background as a line does, and the rows and
+    columns from which background and noise are told.
+
+    ``image``: (H, W) float32, full scale 255.
+    """
+    level = measure_level(image, None)
+    height, width = image.shape
+    rows, columns = level.background.shape
+    ground = cv2.resize(level.background, (columns * CELL_PX, rows * CELL_PX))[:height, :width]
+    lit = (image > ground + np.float32(NEARLY_LIT * level.rise)).astype(np.uint8)
+    side = 2 * BAND_PX + 1
+    keep: BoolArray = cv2.dilate(lit, np.ones((side, side), np.uint8)).astype(np.bool_)
+    keep[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX] = True
+    keep[:: 2 * SAMPLE_STEP_PX] = True
+    return keep
 
 
 def _cell_quantiles(image: FloatImage) -> FloatImage:

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a question to somebody else needs, in one file, without what is nobody else's business."""
+
+from __future__ import annotations
+
+import getpass
+import io
+import json
+import platform
+import re
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from armscan.errors import ArmscanError, OptionError
+from armscan.jobs.info import examine_installation
+from armscan.report.quantity import Quantity, Summary, Table
+from armscan.storage.documents import content_hash
+from armscan.storage.files import check_outputs, holds_files, read_bytes, write_files
+from armscan.storage.recording import is_recording, read_recording, recording_name
+from armscan.storage.recordings.read_mcap import record_folder
+
+SUFFIX = ".zip"
+CUT_EXPOSURES = 40
+"""Of a recording: half a second of one quick camera, or a calibration's postures."""
+MOST_BYTES = 50_000_000
+"""Of one file: what still goes with a message."""
+README, VERSIONS = "README.txt", "versions.json"
+NOTED = "absolute paths are cut to their last names; the user, the computer and secrets are masked"
+QUOTED_PATH = re.compile(r"""(["'])((?:/|~/|[A-Za-z]:[\\/])[^"'\n]*)\1""")
+BARE_PATH = re.compile(
+    r"""(?<![\w/.~])(?:~?/(?!dev/)[\w.~][^\s"'<>|;,:*?()]*|[A-Za-z]:[\\/]+[^\s"'<>|;,*?()]*)"""
+)
+SECRET = re.compile(
+    r"""(?i)((?:token|passw(?:or)?d|secret|api_?key)["']?\s*[=:]\s*["']?)[^\s"'&,}]+"""
+)
+PLAIN_NAMES = {"root", "user", "admin", "localhost"}
+
+
+def without_secrets(text: str) -> str:
+    """Text whose absolute paths keep their last names alone, and that names no user and computer.
+
+    Values behind ``token``, ``password``, ``secret`` and ``key`` of an interface are masked.
+    """
+    text = QUOTED_PATH.sub(lambda found: f"{found[1]}{_last_name(found[2])}{found[1]}", text)
+    text = BARE_PATH.sub(lambda found: _last_name(found[0]), text)
+    text = SECRET.sub(r"\1***", text)
+    for name, mask in ((_user(), "USER"), (platform.node(), "COMPUTER")):
+        if len(name) > 2 and name.lower() not in PLAIN_NAMES:
+            text = re.sub(rf"(?<![\w-]){re.escape(name)}(?![\w-])", mask, text)
+    return text
+
+
+def _last_name(path: str) -> str:
+    parts = [part for part in re.split(r"[\\/]+", path) if part]
+    return f".../{parts[-1]}" if parts else path
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return ""
+
+
+@dataclass
+class _Bundle:
+    """Files of the archive, and a line for each: what it is, and what of it is left out."""
+
+    contents: dict[str, bytes] = field(default_factory=dict)
+    lines: list[tuple[str, str, str]] = field(default_factory=list)
+
+    def add(self, name: str, content: bytes, what: str, lacks: str = "") -> None:
+        stem, dot, suffix = name.rpartition(".")
+        number = 2
+        while name in self.contents:
+            name, number = f"{stem}-{number}{dot}{suffix}", number + 1
+        self.contents[name] = content
+        self.lines.append((name, what, lacks))
+
+    def leave_out(self, path: Path, why: str) -> None:
+        self.lines.append((path.name, "not inside", why))
+
+
+def pack_bundle(
+    output: Path, paths: Sequence[Path] = (), *, is_overwriting: bool = False
+) -> Summary:
+    """Pack versions, documents, logs and a cut of recordings into one archive.
+
+    Parameters
+    ----------
+    output
+        The archive, ``.zip``.
+    paths
+        Documents, logs and recordings that belong to the question.
+    is_overwriting
+        Replace an archive of that name.
+
+    Raises
+    ------
+    OptionError
+        If the name ends in something else.
+    OutputError
+        If the file exists or cannot be written; nothing is left then.
+    """
+    if output.suffix.lower() != SUFFIX:
+        raise OptionError(
+            f"the name ends in '{output.suffix}'", where="--bundle", remedy=f"end it in {SUFFIX}"
+        )
+    check_outputs((output,), is_overwriting=is_overwriting)
+    found, bundle = examine_installation(), _Bundle()
+    versions = json.dumps({**found.extra, "problems": list(found.warnings)}, indent=2)
+    bundle.add(VERSIONS, without_secrets(versions).encode(), "versions, drivers and problems")
+    for path in paths:
+        try:
+            _add_path(bundle, path)
+        except ArmscanError as error:
+            bundle.leave_out(path, without_secrets(error.what))
+    content = _zipped(bundle)
+    write_files({output: content}, is_overwriting=is_overwriting)
+    left_out = [line for line in bundle.lines if line[1] == "not inside"]
+    return Summary(
+        title="Packed. Look at it before you send it.",
+        quantities=(
+            Quantity("files", "files inside", len(bundle.contents) + 1),
+            Quantity("megabytes", "size", len(content) / 1e6, unit="MB"),
+        ),
+        tables=(Table(("file", "what it is", "left out"), tuple(bundle.lines), "", (1, 2)),),
+        warnings=tuple(f"{name} is not inside: {why}" for name, _, why in left_out),
+        written=(output,),
+        extra={"kind": "bundle", "inside": [list(line) for line in bundle.lines]},
+    )
+
+
+def _add_path(bundle: _Bundle, path: Path) -> None:
+    if is_recording(path):
+        _add_recording(bundle, path)
+        return
+    if holds_files(path):
+        bundle.leave_out(path, "a folder that is no recording: name the files that matter")
+        return
+    data = read_bytes(path)
+    if len(data) > MOST_BYTES:
+        bundle.leave_out(path, f"{len(data) / 1e6:.0f} MB, more than {MOST_BYTES / 1e6:.0f}")
+        return
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError:
+        bundle.add(path.name, data, "as it is")
+        return
+    bundle.add(path.name, _cleaned(text).encode(), "text", NOTED)
+
+
+def _cleaned(text: str) -> str:
+    """A document stays one that can be read: its checksum is made anew."""
+    cleaned = without_secrets(text)
+    try:
+        content = json.loads(cleaned)
+        if isinstance(content, dict) and isinstance(content.get("sha256"), str):
+            cleaned = cleaned.replace(content["sha256"], content_hash(content))
+    except (ValueError, RecursionError):
+        pass
+    return cleaned
+
+
+def _add_recording(bundle: _Bundle, path: Path) -> None:
+    n_all = len(read_recording(path).rows)
+    with tempfile.TemporaryDirectory(prefix="armscan-bundle-") as scratch:
+        cut = Path(scratch) / "cut.mcap"
+        record_folder(path, cut, most=CUT_EXPOSURES, edit=_edited)
+        data = read_bytes(cut)
+    if len(data) > MOST_BYTES:
+        bundle.leave_out(path, f"{len(data) / 1e6:.0f} MB, more than {MOST_BYTES / 1e6:.0f}")
+        return
+    n_cut = min(n_all, CUT_EXPOSURES)
+    lacks = f"{n_all - n_cut} later exposures; " if n_cut < n_all else ""
+    what = f"recording, the first {n_cut} of {n_all} exposures; images and tables as recorded"
+    bundle.add(f"{recording_name(path)}.mcap", data, what, f"{lacks}{NOTED} in its documents")
+
+
+def _edited(document: bytes) -> bytes:
+    try:
+        return _cleaned(document.decode("utf-8")).encode()
+    except UnicodeDecodeError:
+        return document
+
+
+def _zipped(bundle: _Bundle) -> bytes:
+    said = [
+        "Packed by `armscan doctor --bundle` for a question to somebody else.",
+        "",
+        f"No environment variable is inside, and in texts {NOTED}.",
+        "Addresses of devices stay. Images, tables and binary files are as they were.",
+        "",
+        f"{README}: this list",
+    ]
+    said += [f"{name}: {what}" + (f" ({lacks})" if lacks else "") for name, what, lacks in
+             bundle.lines]  # fmt: skip
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(README, "\n".join(said) + "\n")
+        for name, content in bundle.contents.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``doctor --bundle``: what is inside is listed, and nothing is that is nobody else's business."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from armscan.cli import main
+from armscan.jobs.live import bundle
+from armscan.jobs.live.bundle import without_secrets
+from armscan.storage.documents import read_camera_calibration
+from armscan.storage.recording import read_recording
+from rigs.drawn_bench import Bench
+from rigs.recording_folders import lab_folder
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ('"path": "/home/anna maria/scans/a b.png",', '"path": ".../a b.png",'),
+        (r'"path": "C:\\Users\\anna\\a.png"', '"path": ".../a.png"'),
+        ("read /home/anna/x/scan.mcap, line 3", "read .../scan.mcap, line 3"),
+        ("replay:/home/anna/scan?rate=2", "replay:.../scan?rate=2"),
+        ("~/scans/one.png", ".../one.png"),
+        ('lasers = "serial:/dev/ttyUSB0:115200"', 'lasers = "serial:/dev/ttyUSB0:115200"'),
+        ("speed in mm/s, +/- 3, and/or http://host/page", "speed in mm/s, +/- 3, and/or http://host/page"),
+        ("token=abc123&x=1 Password: 'secret!'", "token=***&x=1 Password: '***'"),
+    ],
+)  # fmt: skip
+def test_texts_keep_what_matters(text: str, kept: str) -> None:
+    assert without_secrets(text) == kept
+
+
+def test_a_bundle_says_what_is_inside_and_keeps_secrets(
+    calibrated: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setenv("SOME_TOKEN", "hunter2hunter2")
+    monkeypatch.setattr(bundle, "CUT_EXPOSURES", 1)
+    monkeypatch.setattr(bundle, "_user", lambda: "annika")
+    scan, log, place = lab_folder(tmp_path / "scan"), tmp_path / "run.log", tmp_path / "q.zip"
+    log.write_text(f"annika began in {tmp_path}/scan\ntoken=abc\n")
+    words = ["doctor", "--bundle", str(place)]
+    for path in (calibrated.camera, scan, log, tmp_path / "absent.json", tmp_path):
+        words += ["--with", str(path)]
+    assert main([*words, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert len(said["warnings"]) == 2
+    assert "absent.json is not inside: there is no such file" in said["warnings"][0]
+    with zipfile.ZipFile(place) as archive:
+        archive.extractall(tmp_path / "out")
+        names = set(archive.namelist())
+    assert names == {"README.txt", "versions.json", "camera.json", "scan.mcap", "run.log"}
+    listed = (tmp_path / "out/README.txt").read_text()
+    assert all(f"{name}: " in listed for name in (*names, "absent.json", tmp_path.name))
+    assert "the first 1 of 3 exposures" in listed
+    for path in (tmp_path / "out").iterdir():
+        content = path.read_bytes()
+        for secret in (str(tmp_path), str(calibrated.folder), "hunter2", "annika", "token=abc"):
+            assert secret.encode() not in content, path.name
+    assert (tmp_path / "out/run.log").read_text().startswith("USER began in .../scan\ntoken=***")
+    read_camera_calibration(tmp_path / "out/camera.json")
+    cut, whole = read_recording(tmp_path / "out/scan.mcap"), read_recording(scan)
+    assert cut.rows == whole.rows[:1]
+    assert (cut.exposure(0).image == whole.exposure(0).image).all()
+    assert cut.arm is not None
+    assert cut.arm.t_ns.tolist() == [
+        t for t in whole.arm.t_ns.tolist() if abs(t - whole.rows[0].t_ns) <= 1_000_000_000
+    ]
+    assert main(words) == 2
+    assert "the file exists" in capsys.readouterr().err
+    assert main(["doctor", "--with", str(log)]) == 2
+    assert main(["doctor", "--bundle", str(tmp_path / "q.tar")]) == 2
+
+
+def test_doctor_tells_of_drivers(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["found"]
+    assert found["devices by twin"].startswith("ready")

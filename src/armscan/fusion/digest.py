@@ -75,7 +75,8 @@ class CloudDigest:
         for piece in points.pieces():
             chosen = slice(-piece.start % step, None, step)
             clouds.append(piece.cloud.select(chosen))
-            sigmas.append(piece.sigma_mm[chosen])
+            # a view would hold all of the piece's
+            sigmas.append(piece.sigma_mm[chosen].copy())
         shown = replace(
             PointCloud.concat(clouds), is_simulated=marks.is_simulated, forced=marks.forced
         )

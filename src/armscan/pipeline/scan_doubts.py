@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from armscan.devices.sources import ScanSource
@@ -172,21 +173,18 @@ def _thinned(
         return None
     wanted = _compared_rows(points, pose_rows, source)
     low_mm = points.corners_mm[0]
-    parts = []
+    columns: list[list[NDArray[Any]]] = [[] for _ in range(5)]
     for piece in points.pieces():
         cloud, row_of = piece.cloud, pose_rows[piece.cloud.exposure]
         kept = thinned_rows(cloud.points_mm, row_of, low_mm=low_mm)
         kept = kept[np.isin(row_of[kept], wanted)]
-        parts.append(
-            (
-                cloud.points_mm[kept],
-                cloud.covariance_mm2[kept],
-                piece.pixel_px[kept],
-                row_of[kept],
-                cloud.sheet[kept],
-            )
-        )
-    places_mm, covariance, pixels, row_of, sheet = map(np.concatenate, zip(*parts, strict=True))
+        found = (cloud.points_mm, cloud.covariance_mm2, piece.pixel_px, row_of, cloud.sheet)
+        for column, values in zip(columns, found, strict=True):
+            column.append(values[kept])
+    # one after another, so that no more than one is in memory twice
+    places_mm, covariance, pixels, row_of, sheet = (
+        np.concatenate(columns.pop(0)) for _ in range(len(columns))
+    )
     rows, exposure = np.unique(row_of, return_inverse=True)
     hand_eye = scanner.hand_eye.tool_from_sensor
     rotations = poses.rotations[rows] @ hand_eye.rotation

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -95,3 +96,22 @@ def test_a_page_tells_the_same_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(one.shown.points_mm, other.shown.points_mm)
     np.testing.assert_array_equal(one.shown_sigma_mm, other.shown_sigma_mm)
     assert int(other.sigma_counts.sum()) >= 0.99 * other.n_points
+
+
+def test_a_digest_holds_nothing_of_the_points_that_it_does_not_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four times the points must not take more memory: 16 bytes of each once did."""
+    monkeypatch.setattr(point_spool, "PIECE_POINTS", 2_000)
+    monkeypatch.setattr(digest_module, "SHOWN_POINTS", 100)
+    monkeypatch.setattr(digest_module, "MOST_SORTED", 1_000)
+    peaks = []
+    for times in (1, 4):
+        with spool_of(stripes(40) * 10 * times, tmp_path) as spool:
+            marks = spool.without_points()
+            tracemalloc.start()
+            CloudDigest.of_spool(spool, marks)
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+            n_points = len(spool)
+    assert peaks[1] - peaks[0] < 16 * (n_points * 3 / 4) / 4

@@ -12,7 +12,7 @@ import numpy as np
 from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Cad, Part, Pose
-from armscan.inspection.cad.alignment import AlignMethod, align
+from armscan.inspection.cad.alignment import AlignMethod
 from armscan.inspection.cad.comparison import (
     DECISIONS,
     OF_VALIDITY,
@@ -22,6 +22,7 @@ from armscan.inspection.cad.comparison import (
     FaceComparison,
     compare_with_part,
 )
+from armscan.inspection.cad.datums import Datums, align
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cleaning import Cleaning, CleaningOptions, clean_cloud
 from armscan.inspection.conformity import COVERAGE, judge
@@ -67,7 +68,7 @@ class Recipe:
     surface
         Of the part's model; None to measure features alone, in the cloud's own frame.
     align, datums
-        How the cloud is laid on it; three numbers of faces for ``321``.
+        How the cloud is laid on it, and what that rests on.
     options
         Tolerances of the faces.
     cleaning
@@ -79,7 +80,7 @@ class Recipe:
     title: str = ""
     surface: PartSurface | None = None
     align: AlignMethod = "best"
-    datums: tuple[int, ...] = ()
+    datums: Datums = field(default_factory=Datums)
     options: CadOptions = field(default_factory=CadOptions)
     cleaning: CleaningOptions | None = None
     features: tuple[RecipeFeature, ...] = ()

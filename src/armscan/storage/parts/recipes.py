@@ -12,13 +12,18 @@ from typing import Any, Literal
 
 from armscan.errors import ArmscanError, FileFormatError, OptionError
 from armscan.geometry.arrays import Box, FloatArray
+from armscan.geometry.estimate import FitFailure
 from armscan.geometry.features import ShapeKind
+from armscan.inspection.cad.alignment import AlignMethod
 from armscan.inspection.cad.comparison import CadOptions
+from armscan.inspection.cad.datums import Datums
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import PartModel
+from armscan.inspection.cad.reference_points import ReferencePoints
 from armscan.inspection.cleaning import CleaningOptions
 from armscan.inspection.recipe import FollowedRecipe, PartQuantity, PartRow, Recipe, RecipeFeature
 from armscan.inspection.search import WantedFeature
+from armscan.records.cloud import CloudFrame
 from armscan.storage.codec import (
     FieldCodec,
     Layout,
@@ -29,9 +34,17 @@ from armscan.storage.codec import (
     parse_toml,
 )
 from armscan.storage.files import is_file, path_text, read_bytes
+from armscan.storage.parts.datums import (
+    MEASURED,
+    PICKED,
+    datum_faces,
+    datum_features,
+    read_reference_markers,
+    read_reference_points,
+)
 from armscan.storage.parts.meshes import read_part
-from armscan.storage.parts.tables import datum_faces, require_face
-from armscan.storage.tables import csv_bytes, number_text
+from armscan.storage.parts.tables import require_face
+from armscan.storage.tables import csv_bytes, number_text, read_csv
 
 REMEDY = "write it as in the reference of recipes (docs/reference/files.md)"
 POSITIVE_MM = (1e-6, 1e4)
@@ -92,8 +105,9 @@ class _RecipeKeys:
     title: str = ""
     part: str | None = None
     unit: Literal["mm", "cm", "m", "inch"] = "mm"
-    align: Literal["best", "none", "321"] = "best"
+    align: AlignMethod = "best"
     datums: str | None = None
+    points: str | None = None
     tolerance_mm: float | None = None
     uncertainty_mm: float | None = None
     reach_mm: float | None = None
@@ -136,12 +150,42 @@ class RecipeFile:
     part
         The model; None without one.
     inputs
-        The recipe's file, and the model's.
+        The recipe's file, the model's, and that of reference points.
+    measured_beside
+        True if the places of reference points or markers were measured on each part: in a table
+        beside its cloud, ``NAME.points.csv`` or ``NAME.markers.csv``.
     """
 
     recipe: Recipe
     part: PartModel | None
     inputs: tuple[Path, ...]
+    measured_beside: bool = False
+
+    def measured_of(self, cloud: Path) -> Path | None:
+        """The table beside a cloud; None where the recipe needs none."""
+        if not self.measured_beside:
+            return None
+        return cloud.with_name(f"{cloud.stem}.{self.recipe.align}.csv")
+
+    def for_part(self, cloud_path: Path, frame: CloudFrame) -> Recipe | FitFailure:
+        """The recipe with what was measured beside a cloud."""
+        measured = self.measured_of(cloud_path)
+        if measured is None:
+            return self.recipe
+        if not is_file(measured):
+            raise FileFormatError(
+                "there is no table of what was measured on this part",
+                where=path_text(measured),
+                remedy='lay it beside the cloud, or say align = "best" in the recipe',
+            )
+        points = self.inputs[-1]
+        if self.recipe.align == "points":
+            found: ReferencePoints | FitFailure = read_reference_points(points, measured)
+        else:
+            found = read_reference_markers(points, measured, frame)
+        if isinstance(found, FitFailure):
+            return found
+        return replace(self.recipe, datums=Datums(points=found))
 
 
 def read_recipe(path: Path) -> RecipeFile:
@@ -183,19 +227,29 @@ def read_recipe(path: Path) -> RecipeFile:
             remedy="name the model by its place beside the recipe",
         )
     part = read_part(part_path, unit=keys.unit)
+    points = None if keys.points is None else path.parent / keys.points
+    in_one_table = keys.align == "points" and points is not None and _holds_measured(points)
     recipe = replace(
         recipe,
         surface=PartSurface(part),
         align=keys.align,
-        datums=_datums(keys, part, where),
+        datums=_datums(keys, part, where, points if in_one_table else None),
         options=_options(keys, part, where),
     )
-    return RecipeFile(recipe, part, (path, part_path))
+    inputs = (path, part_path) if points is None else (path, part_path, points)
+    return RecipeFile(recipe, part, inputs, points is not None and not in_one_table)
+
+
+def _holds_measured(path: Path) -> bool:
+    table = read_csv(path)
+    return any(name in table for name in (*MEASURED, *PICKED))
 
 
 def _check(keys: _RecipeKeys, content: Mapping[str, Any], where: str) -> None:
     """Refuse what contradicts itself or would have no effect."""
-    of_part = ("unit", "align", "datums", "tolerance_mm", "uncertainty_mm", "reach_mm", "faces")
+    of_part = (
+        "unit", "align", "datums", "points", "tolerance_mm", "uncertainty_mm", "reach_mm", "faces",
+    )  # fmt: skip
     vain = [name for name in of_part if name in content] if keys.part is None else []
     names = [one.name for one in keys.feature]
     twice = [name for name, n in Counter(names).items() if n > 1]
@@ -207,8 +261,12 @@ def _check(keys: _RecipeKeys, content: Mapping[str, Any], where: str) -> None:
          "'feature.face' has no effect without 'part'", "name the model, or leave it out"),
         (keys.part is None and not names, "it names neither a 'part' nor a 'feature'",
          "say what to inspect"),
-        ((keys.align == "321") != bool(keys.datums),
-         "'datums' goes with align = \"321\", and only with it", "give both or none of them"),
+        ((keys.align in ("321", "features")) != bool(keys.datums),
+         "'datums' goes with align = \"321\" or \"features\", and only with these",
+         "give both or none of them"),
+        ((keys.align in ("points", "markers")) != bool(keys.points),
+         "'points' goes with align = \"points\" or \"markers\", and only with these",
+         "give both or none of them"),
         (bool(twice), f"'feature.name' is '{''.join(twice[:1])}' twice",
          "give each feature its own name"),
         (is_unnamed, "'feature.name' is empty or holds a line break", "give each feature a name"),
@@ -263,11 +321,15 @@ def _feature(keys: _FeatureKeys, where: str) -> RecipeFeature:
     )
 
 
-def _datums(keys: _RecipeKeys, part: PartModel, where: str) -> tuple[int, ...]:
+def _datums(keys: _RecipeKeys, part: PartModel, where: str, points: Path | None) -> Datums:
+    if points is not None:
+        return Datums(points=read_reference_points(points))
     if keys.datums is None:
-        return ()
+        return Datums()
     try:
-        return datum_faces(keys.datums, part)
+        if keys.align == "321":
+            return Datums(faces=datum_faces(keys.datums, part))
+        return Datums(features=datum_features(keys.datums, part))
     except ArmscanError as error:
         raise FileFormatError(
             error.what, where=f"{where}: 'datums'", remedy=error.remedy

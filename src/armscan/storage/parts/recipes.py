@@ -21,7 +21,16 @@ from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import PartModel
 from armscan.inspection.cad.reference_points import ReferencePoints
 from armscan.inspection.cleaning import CleaningOptions
-from armscan.inspection.recipe import FollowedRecipe, PartQuantity, PartRow, Recipe, RecipeFeature
+from armscan.inspection.recipe import (
+    FollowedRecipe,
+    PartQuantity,
+    PartRow,
+    Recipe,
+    RecipeFeature,
+    RecipeRelation,
+    RecipeStep,
+    RelationMeasure,
+)
 from armscan.inspection.search import WantedFeature
 from armscan.records.cloud import CloudFrame
 from armscan.storage.codec import (
@@ -96,6 +105,30 @@ class _FeatureKeys:
     tolerance_mm: float | None = None
     nominal_deg: float | None = None
     tolerance_deg: float | None = None
+    form_tolerance_mm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _RelationKeys:
+    """``[[relation]]``."""
+
+    name: str
+    of: tuple[str, ...]
+    measure: RelationMeasure
+    nominal_mm: float | None = None
+    tolerance_mm: float | None = None
+    nominal_deg: float | None = None
+    tolerance_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _StepKeys:
+    """``[[step]]``."""
+
+    name: str
+    height_mm: float
+    tolerance_mm: float | None = None
+    region: Box | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +147,8 @@ class _RecipeKeys:
     faces: Mapping[str, float] | None = None
     clean: CleaningOptions | None = None
     feature: tuple[_FeatureKeys, ...] = ()
+    relation: tuple[_RelationKeys, ...] = ()
+    step: tuple[_StepKeys, ...] = ()
 
 
 BOX = FieldCodec(_same, _read_box)
@@ -133,7 +168,16 @@ LAYOUTS: Mapping[type, Layout] = {
     ),
     _FeatureKeys: Layout(
         codecs={"region": BOX},
+        limits={
+            "tolerance_mm": POSITIVE_MM, "tolerance_deg": (1e-6, 90.0),
+            "form_tolerance_mm": POSITIVE_MM,
+        },
+    ),
+    _RelationKeys: Layout(
         limits={"tolerance_mm": POSITIVE_MM, "tolerance_deg": (1e-6, 90.0)},
+    ),
+    _StepKeys: Layout(
+        codecs={"region": BOX}, limits={"tolerance_mm": POSITIVE_MM, "height_mm": POSITIVE_MM}
     ),
     PartQuantity: Layout(is_evidence=True),
 }  # fmt: skip
@@ -216,7 +260,16 @@ def read_recipe(path: Path) -> RecipeFile:
         ) from error
     _check(keys, content, where)
     features = tuple(_feature(one, where) for one in keys.feature)
-    recipe = Recipe(title=keys.title or path.stem, cleaning=keys.clean, features=features)
+    recipe = Recipe(
+        title=keys.title or path.stem,
+        cleaning=keys.clean,
+        features=features,
+        relations=tuple(_relation(one, keys, where) for one in keys.relation),
+        steps=tuple(
+            RecipeStep(one.name, one.height_mm, _or_nan(one.tolerance_mm), one.region)
+            for one in keys.step
+        ),
+    )
     if keys.part is None:
         return RecipeFile(recipe, None, (path,))
     part_path = path.parent / keys.part
@@ -252,6 +305,8 @@ def _check(keys: _RecipeKeys, content: Mapping[str, Any], where: str) -> None:
     )  # fmt: skip
     vain = [name for name in of_part if name in content] if keys.part is None else []
     names = [one.name for one in keys.feature]
+    names += [f"{one.name} form" for one in keys.feature if one.form_tolerance_mm is not None]
+    names += [one.name for one in keys.relation] + [one.name for one in keys.step]
     twice = [name for name, n in Counter(names).items() if n > 1]
     is_unnamed = any(not name.strip() or not name.isprintable() for name in names)
     faults = (
@@ -259,7 +314,7 @@ def _check(keys: _RecipeKeys, content: Mapping[str, Any], where: str) -> None:
          "name the model, or leave it out"),
         (keys.part is None and any(one.face is not None for one in keys.feature),
          "'feature.face' has no effect without 'part'", "name the model, or leave it out"),
-        (keys.part is None and not names, "it names neither a 'part' nor a 'feature'",
+        (keys.part is None and not names, "it names neither a 'part' nor a 'feature' or 'step'",
          "say what to inspect"),
         ((keys.align in ("321", "features")) != bool(keys.datums),
          "'datums' goes with align = \"321\" or \"features\", and only with these",
@@ -267,9 +322,9 @@ def _check(keys: _RecipeKeys, content: Mapping[str, Any], where: str) -> None:
         ((keys.align in ("points", "markers")) != bool(keys.points),
          "'points' goes with align = \"points\" or \"markers\", and only with these",
          "give both or none of them"),
-        (bool(twice), f"'feature.name' is '{''.join(twice[:1])}' twice",
-         "give each feature its own name"),
-        (is_unnamed, "'feature.name' is empty or holds a line break", "give each feature a name"),
+        (bool(twice), f"the name '{''.join(twice[:1])}' is there twice",
+         "give each feature, relation and step its own name"),
+        (is_unnamed, "a name is empty or holds a line break", "give each feature a name"),
     )  # fmt: skip
     for is_wrong, what, remedy in faults:
         if is_wrong:
@@ -315,9 +370,47 @@ def _feature(keys: _FeatureKeys, where: str) -> RecipeFeature:
     return RecipeFeature(
         name=keys.name,
         wanted=wanted,
-        nominal=math.nan if nominal is None else nominal,
-        tolerance=math.nan if tolerance is None else tolerance,
+        nominal=_or_nan(nominal),
+        tolerance=_or_nan(tolerance),
         face=keys.face or "",
+        form_tolerance=_or_nan(keys.form_tolerance_mm),
+    )
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _relation(keys: _RelationKeys, recipe: _RecipeKeys, where: str) -> RecipeRelation:
+    """A relation; zones of parallel and square features have the nominal width 0."""
+    place = f"{where}: relation '{keys.name}'"
+    known = [one.name for one in recipe.feature]
+    in_mm, in_deg = (keys.nominal_mm, keys.tolerance_mm), (keys.nominal_deg, keys.tolerance_deg)
+    own, foreign = (in_deg, in_mm) if keys.measure == "angle" else (in_mm, in_deg)
+    nominal, tolerance = own
+    is_zone = keys.measure in ("parallelism", "perpendicularity")
+    unknown = [name for name in keys.of if name not in known]
+    faults = (
+        (len(keys.of) != 2 or len(set(keys.of)) != 2, "'of' names no two features",
+         'write of = ["bore", "base"]'),
+        (bool(unknown), f"there is no feature '{''.join(unknown[:1])}'",
+         f"name two of {', '.join(known) or 'the features, which are missing'}"),
+        (any(one is not None for one in foreign), "an angle is in degrees, all else in mm",
+         "give nominal_deg and tolerance_deg of an angle, nominal_mm and tolerance_mm of others"),
+        (is_zone and nominal is not None, f"{keys.measure} has no nominal value but 0",
+         "leave nominal_mm out"),
+        (tolerance is not None and nominal is None and not is_zone,
+         "it has a tolerance and no nominal value", "give both"),
+    )  # fmt: skip
+    for is_wrong, what, remedy in faults:
+        if is_wrong:
+            raise FileFormatError(what, where=place, remedy=remedy)
+    return RecipeRelation(
+        name=keys.name,
+        of=keys.of,
+        measure=keys.measure,
+        nominal=0.0 if is_zone else _or_nan(nominal),
+        tolerance=_or_nan(tolerance),
     )
 
 

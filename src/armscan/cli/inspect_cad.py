@@ -52,6 +52,9 @@ class AlignOption(StrEnum):
     BEST = "best"
     NONE = "none"
     DATUMS = "321"
+    FEATURES = "features"
+    POINTS = "points"
+    MARKERS = "markers"
 
 
 class UnitOption(StrEnum):
@@ -63,28 +66,49 @@ class UnitOption(StrEnum):
     INCH = "inch"
 
 
+AlignChoice = Annotated[
+    AlignOption | None,
+    typer.Option(
+        help="best fit without a guess; none: the cloud is in the model's frame; 321: by three "
+        "faces, features: by fitted features, one after the other (--datums); points, "
+        "markers: by points of known places (--points).",
+        show_default=DefaultOf(PART + "align"),
+    ),
+]
+Datums = Annotated[
+    str,
+    typer.Option(
+        help="Faces for 321 and features, 'FACE|FACE|FACE' in their order; for features also "
+        "nominal ones, as 'plane 1|cylinder:at=1,2,3:axis=0,0,1:diameter=8'.",
+        show_default=False,
+    ),
+]
+Points = Annotated[
+    str,
+    typer.Option(help="Table of reference points or markers in Cad.", show_default=False),
+]
+Measured = Annotated[
+    str,
+    typer.Option(help="Table of the same as measured, in the cloud's frame.", show_default=False),
+]
+Tolerance = Annotated[
+    str,
+    typer.Option(
+        help="Largest deviation either way, mm; or a .toml or .csv file of tolerances by face.",
+        show_default=False,
+    ),
+]
+
+
 def cad(
     cloud: CloudArgument,
     part: PartArgument,
     *,
-    align: Annotated[
-        AlignOption | None,
-        typer.Option(
-            help="best fit without a guess; none: the cloud is in the model's frame; 321: by "
-            "--datums.",
-            show_default=DefaultOf(PART + "align"),
-        ),
-    ] = None,
-    datums: Annotated[
-        str, typer.Option(help="Three faces for 321, FACE,FACE,FACE.", show_default=False)
-    ] = "",
-    tolerance: Annotated[
-        str,
-        typer.Option(
-            help="Largest deviation either way, mm; or a .toml or .csv file of tolerances by face.",
-            show_default=False,
-        ),
-    ] = "",
+    align: AlignChoice = None,
+    datums: Datums = "",
+    points: Points = "",
+    measured: Measured = "",
+    tolerance: Tolerance = "",
     uncertainty_mm: Annotated[
         float | None,
         typer.Option(
@@ -128,6 +152,8 @@ def cad(
         align=None if align is None else align.value,
         unit=None if unit is None else unit.value,
         datums=datums,
+        points=points,
+        measured=measured,
     )
     chord = None if chord_mm is None else ChordError(chord_mm=chord_mm)
     summary = run(

@@ -9,6 +9,7 @@ from typing import Annotated, cast
 
 import typer
 
+from armscan.cli.inspect_cad import UnitOption
 from armscan.cli.options import AsJson, DefaultOf, given, progress_bar, show
 
 DEMO_EXAMPLE = "\b\nExample:\n  armscan demo single -o demo"
@@ -16,7 +17,8 @@ SIMULATE_EXAMPLE = (
     "\b\nExamples:\n"
     "  armscan simulate thesis-single camera -o board\n"
     "  armscan simulate thesis-single ball -o ball --preset harsh --seed 3\n"
-    "  armscan simulate thesis-multi markers -o markers"
+    "  armscan simulate thesis-multi markers -o markers\n"
+    "  armscan simulate thesis-single workpiece --part my.stl -o part"
 )
 TWIN = "armscan.pipeline.simulate:SimulateOptions."
 
@@ -143,6 +145,16 @@ def simulate(
             show_default=DefaultOf(TWIN + "processes"),
         ),
     ] = None,
+    part: Annotated[
+        str,
+        typer.Option(
+            help="Scene workpiece: scan this .stl, .ply or .obj instead.", show_default=False
+        ),
+    ] = "",
+    unit: Annotated[
+        UnitOption | None,
+        typer.Option(help="Unit of its numbers.", show_default=DefaultOf(TWIN + "unit")),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Render a recording of the digital twin; NAME.truth.json beside it says what it was made from.
@@ -152,14 +164,21 @@ def simulate(
     one exposure of the steps, and still-part one of the part, with the same view without laser;
     markers is a part with ring markers, place by place, and markers-moved the same
     part after the arm was put down elsewhere; probing is the plate touched with a tip; workpiece is
-    a part with two faults, whose CAD model comes with armscan; latency is the plate with the head
-    moved nearer and away, and an arm with a clock of its own.
+    a part with two faults, whose CAD model comes with armscan, or --part; latency is the plate with
+    the head moved nearer and away, and an arm with a clock of its own.
     """
     from armscan.jobs.simulate import SimulateRequest, run_simulation
     from armscan.pipeline.simulate import SimulateOptions
 
     quality = None if preset is None else preset.value
-    options = given(SimulateOptions, preset=quality, seed=seed, processes=processes)
+    options = given(
+        SimulateOptions,
+        preset=quality,
+        seed=seed,
+        processes=processes,
+        part=part,
+        unit=None if unit is None else unit.value,
+    )
     with progress_bar() as progress:
         summary = run_simulation(SimulateRequest(head, scene.value, output, options), progress)
     show(summary, as_json=as_json)

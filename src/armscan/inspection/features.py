@@ -122,6 +122,13 @@ class FeatureInspection(ArrayRecord):
     length_mm: float
 
     @property
+    def form_mm(self) -> float:
+        """Range of its deviations, outliers included; of a line the diameter of the tube."""
+        if self.shape.kind == "line":
+            return 2.0 * float(self.fitted.deviations_mm.max())
+        return self.fitted.value("range_mm")
+
+    @property
     def form_name(self) -> str:
         """What the range of its deviations is called."""
         return FORMS[self.shape.kind]
@@ -484,6 +491,10 @@ class Relation:
         Between their directions, or of a line to a plane; None where one has none.
     distance_text, angle_text
         What was measured, in words.
+    parallelism, perpendicularity
+        Width of the zone, parallel or square to the second feature, that holds the first one's
+        fitted plane or axis as far as its points reach (ISO 1101 orientation; its form is not in
+        it); None where they stand otherwise, or one has no direction.
     """
 
     first: FeatureInspection
@@ -492,6 +503,8 @@ class Relation:
     angle: MeasuredAngle | None
     distance_text: str
     angle_text: str
+    parallelism: MeasuredLength | None = None
+    perpendicularity: MeasuredLength | None = None
 
 
 PARALLEL = math.radians(10.0)
@@ -528,7 +541,28 @@ def relate(cloud: PointCloud, first: FeatureInspection, second: FeatureInspectio
             angle_text = "of the line or axis to the plane"
     measure, distance_text = _distance(first.shape, second.shape)
     distance = None if measure is None else together(fits, measure)
-    return Relation(first, second, distance, angle, distance_text, angle_text)
+    leaning: list[MeasuredLength | None] = [None, None]
+    for k, square in enumerate((0.0, math.pi / 2.0)):
+        if angle is not None and abs(angle.value_rad - square) < PARALLEL:
+            reach = _reach(cloud, first, second.shape)
+            leaning[k] = together(fits, partial(_leaning, square=square, reach=reach))
+    return Relation(first, second, distance, angle, distance_text, angle_text, *leaning)
+
+
+def _reach(cloud: PointCloud, first: FeatureInspection, second: Shape) -> float:
+    """How far a feature's points reach: along its axis, or where its plane rises steepest."""
+    if not _is_flat(first.shape):
+        return float(np.ptp(first.shape.local_mm(cloud.points_mm[first.rows])[:, 2]))
+    normal = first.shape.direction
+    rise = second.direction - float(second.direction @ normal) * normal
+    if np.linalg.norm(rise) < np.finfo(np.float64).eps:
+        rise = first.shape.axes[0]
+    rise = rise / np.linalg.norm(rise)
+    return float(np.ptp(cloud.points_mm[first.rows] @ rise))
+
+
+def _leaning(shapes: tuple[Shape, ...], square: float, reach: float) -> float:
+    return reach * math.tan(abs(_angle(shapes) - square))
 
 
 def _is_flat(shape: Shape) -> bool:

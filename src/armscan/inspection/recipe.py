@@ -9,10 +9,11 @@ from typing import Literal
 
 import numpy as np
 
-from armscan.errors import InputError
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import Box
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Cad, Part, Pose
-from armscan.inspection.cad.alignment import AlignMethod, align
+from armscan.inspection.cad.alignment import AlignMethod
 from armscan.inspection.cad.comparison import (
     DECISIONS,
     OF_VALIDITY,
@@ -22,11 +23,18 @@ from armscan.inspection.cad.comparison import (
     FaceComparison,
     compare_with_part,
 )
+from armscan.inspection.cad.datums import Datums, align
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cleaning import Cleaning, CleaningOptions, clean_cloud
 from armscan.inspection.conformity import COVERAGE, judge
-from armscan.inspection.features import FeatureInspection, inspect_feature, inspect_points
+from armscan.inspection.features import (
+    FeatureInspection,
+    inspect_feature,
+    inspect_points,
+    relate,
+)
 from armscan.inspection.search import WantedFeature
+from armscan.inspection.step import inspect_step
 from armscan.records.cloud import PointCloud
 
 QuantityKind = Literal["feature", "mean", "spot"]
@@ -47,6 +55,8 @@ class RecipeFeature:
         Of its diameter in mm, or a cone's half angle in degrees; NaN for none.
     face
         Name of the model's face that it is, whose points are its own; empty to look for it.
+    form_tolerance
+        Of its form error in mm; NaN for none.
     """
 
     name: str
@@ -54,6 +64,60 @@ class RecipeFeature:
     nominal: float = math.nan
     tolerance: float = math.nan
     face: str = ""
+    form_tolerance: float = math.nan
+
+
+RelationMeasure = Literal["distance", "angle", "parallelism", "perpendicularity"]
+
+
+@dataclass(frozen=True, slots=True)
+class RecipeRelation:
+    """How two features of the recipe stand to each other, as `armscan.inspection.features.relate`.
+
+    Parameters
+    ----------
+    name
+        Of the relation.
+    of
+        Names of both features.
+    measure
+        What is measured.
+    nominal, tolerance
+        In mm, of an angle in degrees; NaN for none.
+    """
+
+    name: str
+    of: tuple[str, ...]
+    measure: RelationMeasure
+    nominal: float = math.nan
+    tolerance: float = math.nan
+
+    @property
+    def unit(self) -> Literal["mm", "degrees"]:
+        """Of its value."""
+        return "degrees" if self.measure == "angle" else "mm"
+
+
+@dataclass(frozen=True, slots=True)
+class RecipeStep:
+    """A step between parallel faces, as `armscan.inspection.step.inspect_step` measures it.
+
+    Parameters
+    ----------
+    name
+        Of the step.
+    height_mm
+        Nominal height.
+    tolerance_mm
+        Of the height; NaN for none.
+    region
+        In the model's frame; None for the whole cloud.
+    """
+
+    name: str
+    height_mm: float
+    tolerance_mm: float = math.nan
+    region: Box | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,22 +131,24 @@ class Recipe:
     surface
         Of the part's model; None to measure features alone, in the cloud's own frame.
     align, datums
-        How the cloud is laid on it; three numbers of faces for ``321``.
+        How the cloud is laid on it, and what that rests on.
     options
         Tolerances of the faces.
     cleaning
         Filters before all else; None for none.
-    features
+    features, relations, steps
         What is measured after the alignment.
     """
 
     title: str = ""
     surface: PartSurface | None = None
     align: AlignMethod = "best"
-    datums: tuple[int, ...] = ()
+    datums: Datums = field(default_factory=Datums)
     options: CadOptions = field(default_factory=CadOptions)
     cleaning: CleaningOptions | None = None
     features: tuple[RecipeFeature, ...] = ()
+    relations: tuple[RecipeRelation, ...] = ()
+    steps: tuple[RecipeStep, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +160,8 @@ class PartQuantity:
     name
         Of the feature or face.
     kind
-        ``feature``: its diameter or half angle; ``mean``, ``spot``: of a face, its mean deviation
-        and that of the spot that deviates most.
+        ``feature``: its diameter or half angle, a form error, relation or step; ``mean``, ``spot``:
+        of a face, its mean deviation and that of the spot that deviates most.
     unit
         mm or degrees.
     value, u_value
@@ -145,9 +211,10 @@ class FollowedRecipe:
     features
         Those that were found, by name.
     quantities
-        Each value: features as in the recipe, then the faces that have a tolerance.
+        Each value: features, relations and steps as in the recipe, then the faces that have a
+        tolerance.
     notes
-        Features that were not found, and why.
+        What was not found, and why.
     """
 
     cloud: PointCloud
@@ -203,6 +270,18 @@ def follow_recipe(recipe: Recipe, cloud: PointCloud) -> FollowedRecipe | FitFail
         else:
             features[one.name] = feature
         quantities.append(feature_value(one, features.get(one.name)))
+        if math.isfinite(one.form_tolerance):
+            quantities.append(_form_value(one, features.get(one.name), placed))
+    for relation in recipe.relations:
+        found_value = _relation_value(placed, relation, features)
+        if isinstance(found_value, FitFailure):
+            notes.append(f"{relation.name}: {found_value.reason}")
+        quantities.append(_judged(relation, found_value))
+    for step in recipe.steps:
+        height = _step_value(placed, step)
+        if isinstance(height, FitFailure):
+            notes.append(f"{step.name}: {height.reason}")
+        quantities.append(_judged_step(step, height))
     faces = () if comparison is None else comparison.faces
     return FollowedRecipe(
         cloud=cleaned,
@@ -237,8 +316,10 @@ def _feature(
             return inspect_feature(cloud, one.wanted)
         number = [face.name for face in comparison.faces].index(one.face)
         own = (comparison.face == number) & ~comparison.is_beside_edge
-        points = cloud.select(comparison.rows[own])
-        return inspect_points(points, one.wanted, f"nearest to the face {one.face} of the model")
+        rows = comparison.rows[own]
+        rule = f"nearest to the face {one.face} of the model"
+        found = inspect_points(cloud.select(rows), one.wanted, rule)
+        return found if isinstance(found, FitFailure) else replace(found, rows=rows[found.rows])
     except InputError as error:
         return FitFailure(error.what, error.remedy)
 
@@ -252,20 +333,100 @@ def feature_value(one: RecipeFeature, found: FeatureInspection | None) -> PartQu
         sigma = math.degrees(found.half_angle.sigma_rad)
     elif found is not None and found.diameter is not None:
         value, sigma = found.diameter.value_mm, found.diameter.sigma_mm
+    return _quantity(
+        one.name, "degrees" if is_cone else "mm", (value, COVERAGE * sigma),
+        (one.nominal, one.tolerance), is_seen=found is not None,
+    )  # fmt: skip
+
+
+def _quantity(
+    name: str,
+    unit: Literal["mm", "degrees"],
+    measured: tuple[float, float],
+    limits: tuple[float, float],
+    *,
+    is_seen: bool,
+) -> PartQuantity:
+    """A value and its U against its nominal value and tolerance."""
+    (value, u), (nominal, tolerance) = measured, limits
     decision: PartDecision = ""
-    if math.isfinite(one.tolerance):
-        verdict = judge(value - one.nominal, one.tolerance, COVERAGE * sigma)
-        decision = "not seen" if found is None else OF_VALIDITY[verdict]
+    if math.isfinite(tolerance):
+        verdict = judge(value - nominal, tolerance, u)
+        decision = OF_VALIDITY[verdict] if is_seen else "not seen"
     return PartQuantity(
-        name=one.name,
+        name=name,
         kind="feature",
-        unit="degrees" if is_cone else "mm",
+        unit=unit,
         value=value,
-        u_value=COVERAGE * sigma,
-        nominal=one.nominal,
-        tolerance=one.tolerance,
+        u_value=u,
+        nominal=nominal,
+        tolerance=tolerance,
         decision=decision,
     )
+
+
+def _form_value(
+    one: RecipeFeature, found: FeatureInspection | None, cloud: PointCloud
+) -> PartQuantity:
+    """Form error of a feature: it holds the scatter of its points, and so does its U.
+
+    U is the range that as many points would show that err by their own sigmas alone.
+    """
+    value = u = math.nan
+    if found is not None:
+        value = found.form_mm
+        sigma = float(np.median(cloud.sigma_mm[found.rows]))
+        if sigma > 0.0:
+            u = 2.0 * sigma * math.sqrt(2.0 * math.log(len(found.rows)))
+    return _quantity(
+        f"{one.name} form", "mm", (value, u), (0.0, one.form_tolerance), is_seen=found is not None
+    )
+
+
+def _relation_value(
+    cloud: PointCloud, one: RecipeRelation, features: dict[str, FeatureInspection]
+) -> tuple[float, float] | FitFailure:
+    """Value and U of a relation."""
+    lost = [name for name in one.of if name not in features]
+    if lost:
+        return FitFailure(f"{lost[0]} was not found", "look at its own note")
+    first, second = (features[name] for name in one.of)
+    try:
+        found = relate(cloud, first, second)
+    except OptionError as error:
+        return FitFailure(error.what, error.remedy)
+    if one.measure == "angle" and found.angle is not None:
+        degrees = math.degrees(found.angle.value_rad), math.degrees(found.angle.sigma_rad)
+        return degrees[0], COVERAGE * degrees[1]
+    length = getattr(found, one.measure)
+    if length is None or one.measure == "angle":
+        return FitFailure(
+            f"{one.of[0]} and {one.of[1]} have no {one.measure} as they stand", "ask for another"
+        )
+    return length.value_mm, COVERAGE * length.sigma_mm
+
+
+def _judged(one: RecipeRelation, found: tuple[float, float] | FitFailure) -> PartQuantity:
+    is_seen = not isinstance(found, FitFailure)
+    measured = (math.nan, math.nan) if isinstance(found, FitFailure) else found
+    limits = (one.nominal, one.tolerance)
+    return _quantity(one.name, one.unit, measured, limits, is_seen=is_seen)
+
+
+def _step_value(cloud: PointCloud, one: RecipeStep) -> tuple[float, float] | FitFailure:
+    try:
+        found = inspect_step(cloud, one.height_mm, region=one.region)
+    except InputError as error:
+        return FitFailure(error.what, error.remedy)
+    if isinstance(found, FitFailure):
+        return found
+    return found.height.value_mm, COVERAGE * found.height.sigma_mm
+
+
+def _judged_step(one: RecipeStep, found: tuple[float, float] | FitFailure) -> PartQuantity:
+    is_seen = not isinstance(found, FitFailure)
+    measured = (math.nan, math.nan) if isinstance(found, FitFailure) else found
+    return _quantity(one.name, "mm", measured, (one.height_mm, one.tolerance_mm), is_seen=is_seen)
 
 
 def face_values(face: FaceComparison) -> tuple[PartQuantity, ...]:

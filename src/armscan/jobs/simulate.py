@@ -9,7 +9,7 @@ from pathlib import Path
 from armscan.devices.sources import TwinScene
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.simulate import SimulatedScene, SimulateOptions, simulate_scene
-from armscan.report.quantity import Summary, fact
+from armscan.report.quantity import Summary, fact, sentences
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +47,7 @@ def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Sum
         title=f"Simulated: head {request.head}, scene {request.scene}, preset "
         f"{request.options.preset}, seed {request.options.seed}",
         quantities=(*counts, fact("target", found.target)),
+        warnings=sentences(found.notes),
         written=(found.folder, found.truth),
         next_step=_next_step(request.scene, found),
         extra={

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
@@ -12,7 +13,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -31,13 +32,17 @@ from armscan.devices.sources import (
     TwinScene,
     load_driver,
 )
-from armscan.errors import EstimationError, OptionError, OutputError
+from armscan.errors import EstimationError, InputError, OptionError, OutputError
 from armscan.geometry.poses import Base, Pose, Sensor
+from armscan.inspection.cad.part import PartModel
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from armscan.storage.arm import ProbeTip, write_probing
+from armscan.storage.codec import json_bytes
+from armscan.storage.documents import fingerprint
 from armscan.storage.files import RECORDING_SUFFIX, check_new_folder, check_outputs, path_text
+from armscan.storage.parts.meshes import MESH_SUFFIXES, UNITS_MM, read_part
 from armscan.storage.recording import encoded_png, write_recording, written_session
 from armscan.storage.recordings.read_mcap import check_new_file, record_source
 
@@ -148,6 +153,8 @@ class TwinName:
     head: str
     preset: Preset
     seed: int
+    part: Path | None = None
+    unit: str = "mm"
 
     def build(self) -> Twin:
         """Build it; the simulator is found by its name.
@@ -156,9 +163,49 @@ class TwinName:
         ------
         OptionError
             If there is no such head or preset.
+        ArmscanError
+            If there is a part, and it cannot be read or is not of a size to be scanned.
         """
         driver = load_driver("twin")
-        return cast(Twin, driver(head=self.head, preset=self.preset, seed=self.seed))
+        given: dict[str, Any] = {"head": self.head, "preset": self.preset, "seed": self.seed}
+        if self.part is not None:
+            given["part_mm"] = scannable_part(self.part, self.unit).corners_mm
+        return cast(Twin, driver(**given))
+
+
+SMALLEST_PART_MM, LARGEST_PART_MM = 5.0, 500.0
+"""Of the diagonal of a part that the twin scans: a smaller one shows less than a stripe of it, and
+the simulated arm does not reach round a larger one."""
+
+
+def scannable_part(path: Path, unit: str) -> PartModel:
+    """A mesh for the twin to scan, in its own frame.
+
+    Raises
+    ------
+    ArmscanError
+        If it is no mesh, or so small or large that it seems to be in another unit.
+    """
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise OptionError(
+            "the twin scans parts made of triangles",
+            where="--part",
+            remedy=f"give one of {', '.join(MESH_SUFFIXES)}",
+        )
+    part = read_part(path, unit=unit)
+    if SMALLEST_PART_MM <= part.diagonal_mm <= LARGEST_PART_MM:
+        return part
+    others = [
+        other
+        for other, size in UNITS_MM.items()
+        if SMALLEST_PART_MM <= part.diagonal_mm * size / UNITS_MM[unit] <= LARGEST_PART_MM
+    ]
+    raise InputError(
+        f"the part measures {part.diagonal_mm:.4g} mm across in {unit}; the twin scans parts of "
+        f"{SMALLEST_PART_MM:g} to {LARGEST_PART_MM:g} mm",
+        where=str(path),
+        remedy=f"give its unit, --unit {' or '.join(others)}" if others else "scale the part",
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -317,11 +364,15 @@ class SimulateOptions:
     processes
         Processes that render; 1 renders in this one. A script that asks for more needs the usual
         ``if __name__ == "__main__"``.
+    part, unit
+        A mesh in place of the workpiece, and the unit of its numbers; empty for the workpiece.
     """
 
     preset: Preset = "thesis"
     seed: int = 1
     processes: int = 2
+    part: str = ""
+    unit: str = "mm"
 
     def __post_init__(self) -> None:
         if self.preset not in get_args(Preset):
@@ -353,6 +404,8 @@ class SimulatedScene:
         Cameras that took the images.
     sources
         Laser sources that were on in any of them.
+    notes
+        What is odd about the part, in words.
     """
 
     folder: Path
@@ -362,6 +415,7 @@ class SimulatedScene:
     target: str
     n_cameras: int = 0
     sources: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def truth_path(folder: Path) -> Path:
@@ -411,11 +465,19 @@ def simulate_scene(
     OutputError
         If a result exists or cannot be written.
     OptionError
-        If there is no such head.
+        If there is no such head, or a part for another scene.
+    InputError
+        If the part is empty, or seems to be in another unit.
     EstimationError
         If a process that renders came to an end.
     """
     settings = SimulateOptions() if options is None else options
+    if settings.part and scene != "workpiece":
+        raise OptionError(
+            f"a part goes with the scene workpiece, not {scene}",
+            where="--part",
+            remedy="leave it out, or simulate the scene workpiece",
+        )
     truth = truth_path(folder)
     if _is_one_file(folder) and scene == "probing":
         raise OptionError(
@@ -431,9 +493,10 @@ def simulate_scene(
             remedy="remove it, or name another folder",
         )
     check_outputs((truth,))
-    name = TwinName(head, settings.preset, settings.seed)
+    part = Path(settings.part) if settings.part else None
+    name = TwinName(head, settings.preset, settings.seed, part, settings.unit)
     twin = name.build()
-    beside = {truth: twin.truth.document()}
+    beside = {truth: _truth_of(twin, part, settings.unit)}
     if scene == "probing":
         n_touches = record_touches(folder, twin, beside)
         return SimulatedScene(folder, truth, 0, n_touches, twin.target)
@@ -448,7 +511,20 @@ def simulate_scene(
         target=twin.target,
         n_cameras=len({row.camera for row in source.rows}),
         sources=tuple(dict.fromkeys(name for row in source.rows for name in row.lasers)),
+        notes=() if part is None else scannable_part(part, settings.unit).notes,
     )
+
+
+def _truth_of(twin: Twin, part: Path | None, unit: str) -> bytes:
+    """The truth's document; of a part that was given also which file it is, and its unit.
+
+    Its place is ``base_from_workpiece``.
+    """
+    if part is None:
+        return twin.truth.document()
+    content = json.loads(twin.truth.document())
+    content["part"] = {**asdict(fingerprint(part)), "unit": unit}
+    return json_bytes(content)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,15 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
+from armscan.errors import FileFormatError
 from armscan.geometry.poses import Cad, Part, Pose
 from armscan.inspection.cad.comparison import FaceComparison, deviation_statistics
+from armscan.inspection.cad.part import part_of
+from armscan.inspection.features import relate
 from armscan.inspection.recipe import (
+    FollowedRecipe,
     PartDecision,
     PartQuantity,
     PartRow,
     QuantityKind,
+    Recipe,
     face_values,
+    follow_recipe,
     placed_cloud,
 )
 from armscan.storage.parts.recipes import (
@@ -29,6 +36,7 @@ from armscan.storage.parts.recipes import (
     read_recipe,
 )
 from rigs.inspection_clouds import cloud_of, random_motion
+from rigs.parts import box_corners
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "repeat-an-inspection.md"
 
@@ -146,3 +154,160 @@ def test_the_recipe_of_the_page_is_one(tmp_path: Path) -> None:
     assert recipe.options.tolerance_of("cylinder 19") == 0.02
     assert recipe.options.tolerance_of("plane 3") == 0.05
     assert (recipe.features[0].nominal, recipe.features[0].tolerance) == (20.0, 0.05)
+
+
+BLOCK = part_of(
+    np.concatenate([box_corners([0, 0, 0], [70, 40, 20]), box_corners([5, 6, 20], [30, 34, 26])]),
+    source="block",
+)
+RELATIONS = """
+part = "part.stl"
+align = "none"
+[[feature]]
+name = "top"
+kind = "plane"
+face = "{top}"
+form_tolerance_mm = 0.1
+[[feature]]
+name = "base"
+kind = "plane"
+face = "{base}"
+[[feature]]
+name = "side"
+kind = "plane"
+face = "{side}"
+[[relation]]
+name = "height"
+of = ["base", "top"]
+measure = "distance"
+nominal_mm = 6
+tolerance_mm = 0.02
+[[relation]]
+name = "square"
+of = ["side", "base"]
+measure = "angle"
+nominal_deg = 90
+tolerance_deg = 0.1
+[[relation]]
+name = "squareness"
+of = ["side", "base"]
+measure = "perpendicularity"
+tolerance_mm = 0.02
+[[relation]]
+name = "parallel"
+of = ["top", "base"]
+measure = "parallelism"
+tolerance_mm = 0.02
+[[step]]
+name = "step"
+height_mm = 6
+tolerance_mm = 0.02
+region = [0, 70, 0, 40, 15, 30]
+"""
+
+
+def block_face(point: list[float]) -> str:
+    middles = BLOCK.vertices_mm[BLOCK.triangles].mean(axis=1)
+    return BLOCK.face_names[int(BLOCK.face[int(np.linalg.norm(middles - point, axis=1).argmin())])]
+
+
+FACES = {
+    "top": block_face([17.0, 20.0, 26.0]),
+    "base": block_face([46.0, 13.0, 20.0]),
+    "side": block_face([35.0, 0.0, 10.0]),
+}
+
+
+def relations_file(folder: Path, text: str = RELATIONS) -> Path:
+    mesh = trimesh.Trimesh(BLOCK.vertices_mm, BLOCK.triangles, process=False)
+    (folder / "part.stl").write_bytes(mesh.export(file_type="stl"))
+    (folder / "recipe.toml").write_text(text.format(**FACES))
+    return folder / "recipe.toml"
+
+
+def test_relations_steps_and_form_stand_beside_features(tmp_path: Path) -> None:
+    """A pad 0.03 mm too high that rises by 0.001, a side that leans by 0.002: told so, with U."""
+    recipe = read_recipe(relations_file(tmp_path)).recipe
+    noise, n = 0.004, 40_000
+    points, triangle = BLOCK.surface_points(n, 2)
+    hidden = (np.abs(points - [17.5, 20.0, 20.0]) < [12.5, 14.0, 1e-6]).all(axis=1)
+    points, triangle = points[~hidden], triangle[~hidden]
+    normals, face, n = BLOCK.normals[triangle], BLOCK.face[triangle], len(points)
+    top, side = (face == BLOCK.face_names.index(FACES[name]) for name in ("top", "side"))
+    points[top, 2] += 0.03 + 0.001 * (points[top, 0] - 17.5)
+    points[side, 1] += 0.002 * (points[side, 2] - 10.0)
+    random = np.random.default_rng(1)
+    points += normals * random.normal(0.0, noise, n)[:, None]
+    exposure = random.integers(0, 30, n)
+    cloud = cloud_of(points, exposure, sigma_mm=1e-4, noise_mm=noise, noise_along=normals)
+    found = follow_recipe(recipe, cloud)
+    assert isinstance(found, FollowedRecipe)
+    assert found.notes == (), found.notes
+    told = {one.name: one for one in found.quantities if one.kind == "feature"}
+    truth = {
+        "height": 6.03, "square": 90.0 - np.degrees(0.002), "squareness": 0.002 * 20.0,
+        "parallel": 0.001 * 25.0, "step": 6.03,
+    }  # fmt: skip
+    for name, value in truth.items():
+        assert abs(told[name].value - value) <= 1.5 * told[name].u_value + 1e-4, name
+        assert told[name].u_value < 0.3 * told[name].tolerance, name
+    decisions = {name: told[name].decision for name in truth}
+    assert decisions == {
+        "height": "fail", "square": "fail", "squareness": "fail", "parallel": "fail",
+        "step": "fail",
+    }  # fmt: skip
+    # many points of 4 um: a range of some 7 sigma, and U allows for that
+    assert told["top form"].value == pytest.approx(7.5 * noise, rel=0.25)
+    assert told["top form"].decision == "pass"
+    alone = relate(found.placed, found.features["base"], found.features["top"])
+    assert alone.distance is not None
+    assert alone.distance.value_mm == told["height"].value
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ('of = ["base", "top"]', 'of = ["base", "foot"]', "foot"),
+        ('of = ["base", "top"]', 'of = ["top", "top"]', "two features"),
+        ('measure = "distance"', 'measure = "distant"', "measure"),
+        ("nominal_deg = 90", "nominal_mm = 90", "degrees"),
+        ("nominal_mm = 6\n", "", "no nominal value"),
+        ('name = "height"', 'name = "top form"', "twice"),
+        ("height_mm = 6", "height_mm = -6", "height_mm"),
+        (
+            'measure = "parallelism"',
+            'measure = "parallelism"\nnominal_mm = 1',
+            "value but 0",
+        ),
+    ],
+)
+def test_relations_and_steps_that_are_none_are_refused(
+    tmp_path: Path, old: str, new: str, word: str
+) -> None:
+    path = relations_file(tmp_path, RELATIONS.replace(old, new, 1))
+    with pytest.raises(FileFormatError) as caught:
+        read_recipe(path)
+    assert word in str(caught.value)
+
+
+def test_what_was_measured_on_a_part_lies_beside_its_cloud(tmp_path: Path) -> None:
+    head = 'part = "part.stl"\nalign = "points"\npoints = "nominal.csv"\ntolerance_mm = 0.1\n'
+    path = relations_file(tmp_path, head)
+    corners = BLOCK.vertices_mm[:6]
+    pose: Pose[Part, Cad] = Pose(*random_motion(3))
+    rows = [f"P{k},{x},{y},{z}" for k, (x, y, z) in enumerate(corners)]
+    (tmp_path / "nominal.csv").write_text("name,x_mm,y_mm,z_mm\n" + "\n".join(rows) + "\n")
+    file = read_recipe(path)
+    assert file.measured_beside
+    with pytest.raises(FileFormatError, match=r"one\.points\.csv"):
+        file.for_part(tmp_path / "one.ply", "Base")
+    seen = pose.apply(corners)
+    rows = [f"P{k},{x},{y},{z}" for k, (x, y, z) in enumerate(seen)][::-1]
+    (tmp_path / "one.points.csv").write_text("name,x_mm,y_mm,z_mm\n" + "\n".join(rows) + "\n")
+    recipe = file.for_part(tmp_path / "one.ply", "Base")
+    assert isinstance(recipe, Recipe)
+    cloud = cloud_of(pose.apply(BLOCK.surface_points(2_000, 1)[0]))
+    found = follow_recipe(recipe, cloud)
+    assert isinstance(found, FollowedRecipe)
+    assert found.comparison is not None
+    assert np.abs(found.comparison.deviation_mm).max() < 1e-9

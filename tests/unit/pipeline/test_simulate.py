@@ -13,10 +13,11 @@ from typing import get_args
 
 import numpy as np
 import pytest
+import trimesh
 
 from armscan.cli.twin import PresetName, Scene
 from armscan.devices.sources import Preset, TwinScene
-from armscan.errors import OptionError, OutputError
+from armscan.errors import ArmscanError, InputError, OptionError, OutputError
 from armscan.jobs import simulate as simulate_job_simulate
 from armscan.jobs.simulate import SimulateRequest, run_simulation
 from armscan.pipeline import simulate
@@ -24,7 +25,9 @@ from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.simulate import (
     SimulatedScene,
     SimulateOptions,
+    TwinName,
     fewer_views,
+    scannable_part,
     simulate_scene,
     truth_path,
 )
@@ -185,3 +188,46 @@ def test_views_of_two_cameras_stay_together() -> None:
     )
     kept = fewer_views(replace(whole, rows=rows), 2).rows
     assert [(row.t_ns, row.camera) for row in kept] == [(0, 0), (0, 1), (2000, 0), (2000, 1)]
+
+
+def block(folder: Path, name: str, scale: float = 1.0, *, is_open: bool = False) -> Path:
+    """A block of 60 x 40 x 15 mm that stands on its origin."""
+    mesh = trimesh.creation.box((60.0, 40.0, 15.0))
+    mesh.apply_translation([0.0, 0.0, 7.5])
+    mesh.apply_scale(scale)
+    if is_open:
+        mesh.update_faces(np.arange(len(mesh.faces)) > 1)
+    mesh.export(folder / name)
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "scale"),
+    [("a.stl", "mm", 1.0), ("a.obj", "m", 1e-3), ("a.ply", "inch", 1 / 25.4)],
+)
+def test_a_part_of_ones_own_stands_before_the_scanner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, unit: str, scale: float
+) -> None:
+    """The truth's surface is that of the file: distances by hand."""
+    monkeypatch.undo()
+    part = block(tmp_path, name, scale)
+    truth = TwinName(HEAD, "clean", 1, part, unit).build().truth
+    inside = np.array([[0.0, 0.0, 10.0], [28.0, 0.0, 7.5], [0.0, 0.0, 18.0], [33.0, 24.0, 7.0]])
+    away = truth.workpiece_distance_mm(truth.base_from_workpiece.apply(inside))
+    assert away == pytest.approx([5.0, 2.0, 3.0, 5.0], abs=1e-4)
+
+
+def test_a_part_in_another_unit_or_for_another_scene_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--unit m"):
+        scannable_part(block(tmp_path, "metres.stl", 1e-3), "mm")
+    with pytest.raises(InputError, match="5 to 500"):
+        scannable_part(block(tmp_path, "large.stl", 100.0), "mm")
+    (tmp_path / "none.stl").write_bytes(b"")
+    with pytest.raises(ArmscanError, match="empty"):
+        scannable_part(tmp_path / "none.stl", "mm")
+    whole = block(tmp_path, "whole.stl")
+    assert scannable_part(whole, "mm").notes == ()
+    assert "open" in scannable_part(block(tmp_path, "open.stl", is_open=True), "mm").notes[0]
+    with pytest.raises(OptionError, match="scene workpiece"):
+        simulate_scene(tmp_path / "scan", HEAD, "ball", SimulateOptions(part=str(whole)))
+    assert not (tmp_path / "scan").exists()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud laid on the model of its part: best fit, or by three datum faces."""
+"""A cloud laid on the model of its part: the best fit, and what is known of an alignment."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from armscan.inspection.cad.search import (
 from armscan.inspection.cad.units import across_mm, scale_mismatch, unit_mismatch
 from armscan.records.cloud import PointCloud
 
-AlignMethod = Literal["best", "none", "321"]
+AlignMethod = Literal["best", "none", "321", "features", "points", "markers"]
 
 MOST_POINTS = 50_000
 """Points that the last fit uses, spread evenly: more than a surface has independent places."""
@@ -44,8 +44,6 @@ TRIED = (0.03, -0.03)
 """How far it is moved, over the diagonal."""
 STAYED = 0.5
 """And the part of that way at which it must stay when it is fitted again."""
-DATUM_HOLDS = 0.02
-"""A datum face holds a motion that moves its points by this part along their normals (rms)."""
 FITTING = 0.6
 """Part of the points that must lie near the surface for a cloud to be of this part."""
 NEAR = 0.01
@@ -57,6 +55,8 @@ TYPICAL = 0.01
 part: what a face of a part made badly may have, and far more than points scatter."""
 HOPELESS = 0.2
 """Below this part not even that: another part."""
+SPANNED = math.cos(math.radians(0.5)) ** 2
+"""Ways that leave a coordinate axis by less than half a degree are called after it."""
 MIRRORED = 0.5
 """A mirrored cloud of which fewer than this part of the points lie off is the mirrored part's."""
 
@@ -89,6 +89,33 @@ class FreeMotion:
         return f"a turn about {way} through ({place}) mm"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DatumUse:
+    """What one datum did for an alignment.
+
+    Parameters
+    ----------
+    name
+        Of the datum.
+    n_points
+        By which it was measured.
+    held
+        Motions that it took; of a reference point none, as all hold together.
+    left_mm
+        How far it stays off its nominal place after the alignment: rms over its points, along
+        their normals; of a reference point its distance.
+    sigma_mm
+        Standard deviation of that before the alignment: how well the datum itself is known; NaN
+        where it is not.
+    """
+
+    name: str
+    n_points: int
+    held: tuple[FreeMotion, ...]
+    left_mm: float
+    sigma_mm: float
+
+
 class Alignment(ArrayRecord):
     """Where a cloud lies on its part.
 
@@ -106,15 +133,25 @@ class Alignment(ArrayRecord):
     covariance
         (6, 6) the same about the origin of Cad, as `armscan.geometry.registration` orders it.
     rows, influence
-        (M,) points that the fit used, and (6, M) by how much a step follows each one's distance.
+        (M,) points that the fit used, and (6, M) by how much a step follows each one's distance;
+        none where the alignment does not rest on points of the cloud one by one.
+    normals
+        (M, 3) directions in Cad along which these points' errors count, towards the outside.
+    n_used
+        How many points it rests on: of the cloud, or reference points.
     rms_mm
-        Alignment rms: root mean square distance of the points that the fit used, outliers not.
+        Alignment rms: root mean square distance of these points, outliers not: from the model, of
+        features from the fitted ones, of reference points from their nominal places.
     sigma_rule
         Where the covariance comes from, in words.
     free
         Motions that the points do not hold.
     rivals
         Other poses that fit as well or nearly as well.
+    datums
+        What it rests on, if not the whole surface.
+    notes
+        What else a person should know of it, in words.
     """
 
     method: AlignMethod
@@ -124,15 +161,19 @@ class Alignment(ArrayRecord):
     covariance: FloatArray = floats(6, 6)
     rows: IntArray = ints("M")
     influence: FloatArray = floats(6, "M")
+    normals: FloatArray = floats("M", 3)
+    n_used: int
     rms_mm: float
     sigma_rule: str
     free: tuple[FreeMotion, ...] = ()
     rivals: tuple[PoseCandidate, ...] = ()
+    datums: tuple[DatumUse, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a person should know of it, in words."""
-        found = []
+        found = list(self.notes)
         if self.free:
             found.append(
                 "the points do not hold "
@@ -154,40 +195,31 @@ class Alignment(ArrayRecord):
         return tuple(found)
 
 
-def free_text(free: Sequence[FreeMotion]) -> str:
-    """Free motions in words; three turns are every turn about a point."""
+def free_text(free: Sequence[FreeMotion], joint: str = " nor ") -> str:
+    """Motions in words; three turns are every turn about a point."""
     turns = [motion for motion in free if motion.kind == "turn"]
     texts = [motion.text for motion in free]
     if len(turns) == 3:
         place = ", ".join(f"{value + 0.0:.1f}" for value in turns[0].point_mm)
         texts = [f"any turn about ({place}) mm"]
         texts += [motion.text for motion in free if motion.kind == "shift"]
-    return " nor ".join(texts)
+    return joint.join(texts)
 
 
-def align(
-    surface: PartSurface,
-    cloud: PointCloud,
-    method: AlignMethod,
-    datums: Sequence[int],
-    errors_known: bool,
-) -> Alignment | FitFailure:
-    """Lay a cloud on its part by `align_best`, `align_none` or, from the best fit, `align_datums`.
-
-    Parameters
-    ----------
-    surface, cloud, datums, errors_known
-        As of these.
-    method
-        Which of them.
-    """
-    if method == "none":
-        mismatch = scale_mismatch(surface, cloud.points_mm)
-        return align_none(cloud) if mismatch is None else mismatch
-    best = align_best(surface, cloud, errors_known)
-    if method == "best" or isinstance(best, FitFailure):
-        return best
-    return align_datums(surface, cloud, datums, best)
+def held_text(held: Sequence[FreeMotion]) -> str:
+    """Ways of motions in few words, as "turns about X, Y; shift along Z"; empty for none."""
+    texts = []
+    for kind, word in (("turn", "about"), ("shift", "along")):
+        ways = np.array([one.direction for one in held if one.kind == kind]).reshape(-1, 3)
+        if len(ways) == 0:
+            continue
+        span = np.linalg.pinv(ways) @ ways
+        names = [name for k, name in enumerate("XYZ") if span[k, k] > SPANNED]
+        if len(names) != len(ways):
+            names = [_direction_text(one) for one in ways]
+        plural = "s" if len(ways) > 1 else ""
+        texts.append(f"{kind}{plural} {word} {', '.join(names)}")
+    return "; ".join(texts)
 
 
 def align_best(
@@ -238,42 +270,11 @@ def align_none(cloud: PointCloud) -> Alignment:
         covariance=np.zeros((6, 6)),
         rows=np.zeros(0, dtype=np.int64),
         influence=np.zeros((6, 0)),
+        normals=np.zeros((0, 3)),
+        n_used=0,
         rms_mm=math.nan,
         sigma_rule="none: the cloud's frame is taken for that of the part, without error",
     )
-
-
-def align_datums(
-    surface: PartSurface, cloud: PointCloud, datums: Sequence[int], start: Alignment
-) -> Alignment | FitFailure:
-    """Lay a cloud on three faces, one after the other (3-2-1).
-
-    The first face takes as many motions as it holds, three for a plane; the second and the third
-    what the ones before left.
-
-    Parameters
-    ----------
-    surface
-        The part.
-    cloud
-        Points of it.
-    datums
-        Numbers of the part's faces.
-    start
-        A best fit.
-    """
-    pose = start.cad_from_part
-    rows = spread_rows(cloud.points_mm, MOST_POINTS)
-    result = start
-    for _ in range(ROUNDS):
-        fitted = _datum_step(surface, cloud, rows, datums, pose)
-        if isinstance(fitted, FitFailure):
-            return fitted
-        step, result = fitted
-        pose = moved(pose, step, result.centre_mm)
-        if np.abs(step[3:]).max() < SETTLED_MM:
-            break
-    return replace(result, cad_from_part=pose, rivals=start.rivals)
 
 
 def measured(
@@ -353,7 +354,7 @@ def fit_to_part(
     for _ in range(ROUNDS):
         found = measured(surface, cloud, pose, rows)
         placed, d = pose.apply(cloud.points_mm[rows]), found.signed_mm
-        centre, radius = _middle(placed)
+        centre, radius = middle_and_radius(placed)
         sigma = _fit_sigma(cloud, rows, pose, found)
         weights = tukey_weights(d / sigma, 1.0) / sigma**2
         jacobian, normal = fit_step(placed, found.normals, weights, centre)
@@ -366,15 +367,17 @@ def fit_to_part(
     used = weights > 0.0
     held = 6 - len(motions)
     errors = PointErrors.of(cloud, pose, found.normals, rows) if errors_known else None
-    covariance, rule = _stated_covariance(errors, influence, placed, d, held)
+    covariance, rule = stated_covariance(errors, influence, placed, d, held)
     return Alignment(
         method="best",
         cad_from_part=pose,
         centre_mm=centre,
         step_covariance=covariance,
-        covariance=_about_origin(covariance, centre),
+        covariance=about_origin(covariance, centre),
         rows=rows[used],
         influence=influence[:, used],
+        normals=found.normals[used],
+        n_used=int(used.sum()),
         rms_mm=float(np.sqrt(np.mean(d[used] ** 2))),
         sigma_rule=rule,
         free=motions,
@@ -392,7 +395,8 @@ def _fit_sigma(
     return np.asarray(np.sqrt(np.maximum(own + rest, (0.1 * scale) ** 2)))
 
 
-def _middle(placed: FloatArray) -> tuple[FloatArray, float]:
+def middle_and_radius(placed: FloatArray) -> tuple[FloatArray, float]:
+    """(3,) mean of points (N, 3), and their root mean square distance from it."""
     centre = placed.mean(axis=0)
     return centre, float(np.sqrt(np.mean(np.sum((placed - centre) ** 2, axis=1))))
 
@@ -405,14 +409,14 @@ def _inverse(normal: FloatArray, radius: float, basis: FloatArray) -> FloatArray
     return np.asarray(inside * np.outer(unit, unit))
 
 
-def _about_origin(covariance: FloatArray, centre: FloatArray) -> FloatArray:
+def about_origin(covariance: FloatArray, centre: FloatArray) -> FloatArray:
     """A step about a centre turned into one about the origin: the shift gains ``centre x turn``."""
     change = np.eye(6)
     change[3:, :3] = skew(centre[None])[0]
     return np.asarray(change @ covariance @ change.T)
 
 
-def _stated_covariance(
+def stated_covariance(
     errors: PointErrors | None,
     influence: FloatArray,
     placed: FloatArray,
@@ -458,7 +462,7 @@ def _free_motions(
     normals = None if cloud.normals is None else cloud.normals[rows]
     found = measured(surface, cloud, pose, rows)
     placed = pose.apply(points)
-    centre, radius = _middle(placed)
+    centre, radius = middle_and_radius(placed)
     scale = max(robust_scale(found.signed_mm), 1e-7 * surface.diagonal_mm)
     weights = tukey_weights(found.signed_mm, scale)
     normal = fit_step(placed, found.normals, weights, centre)[1]
@@ -554,64 +558,3 @@ def _along_free(
             spanned += [np.concatenate([np.zeros(3), v]) for v in (arm, across) if v.any()]
     q = np.linalg.qr(np.array(spanned).T)[0]
     return float(np.linalg.norm(rows - q @ (q.T @ rows))) < APART * surface.diagonal_mm
-
-
-def _datum_step(
-    surface: PartSurface,
-    cloud: PointCloud,
-    rows: IntArray,
-    datums: Sequence[int],
-    pose: Pose[Cad, Part],
-) -> tuple[FloatArray, Alignment] | FitFailure:
-    """One step of the 3-2-1 alignment, and what is known of it."""
-    found = measured(surface, cloud, pose, rows)
-    placed = pose.apply(cloud.points_mm[rows])
-    centre, radius = _middle(placed)
-    unit = np.repeat([1.0 / radius, 1.0], 3)
-    left, influence = np.eye(6), np.zeros((6, len(rows)))
-    used = np.zeros(len(rows), dtype=np.bool_)
-    part = surface.part
-    for number in datums:
-        at = np.flatnonzero((found.triangle >= 0) & (part.face[found.triangle] == number))
-        if len(at) < 3:
-            return FitFailure(
-                f"only {len(at)} points lie on the datum face {part.face_names[number]}",
-                "give a face that was scanned",
-            )
-        weights = tukey_weights(
-            found.signed_mm[at] - np.median(found.signed_mm[at]),
-            max(robust_scale(found.signed_mm[at] - np.median(found.signed_mm[at])), SETTLED_MM),
-        )
-        jacobian = fit_step(placed[at], part.normals[found.triangle[at]], weights, centre)[0]
-        scaled = jacobian * unit @ left
-        normal = scaled.T @ (scaled * weights[:, None]) / weights.sum()
-        values, vectors = np.linalg.eigh(normal)
-        taken = values > DATUM_HOLDS**2
-        if not taken.any():
-            continue
-        ways = left @ vectors[:, taken] * unit[:, None]
-        gain = (vectors[:, taken].T @ (scaled * weights[:, None]).T) / (
-            values[taken][:, None] * weights.sum()
-        )
-        own = -gain @ jacobian @ influence
-        own[:, at] += gain
-        influence = influence + ways @ own
-        left = left @ vectors[:, ~taken]
-        used[at] = weights > 0.0
-    d = np.where(np.isfinite(found.signed_mm), found.signed_mm, 0.0)
-    is_known = bool(cloud.covariance_mm2.any())
-    errors = PointErrors.of(cloud, pose, found.normals, rows) if is_known else None
-    covariance, rule = _stated_covariance(errors, influence, placed, d, 6 - left.shape[1])
-    result = Alignment(
-        method="321",
-        cad_from_part=pose,
-        centre_mm=centre,
-        step_covariance=covariance,
-        covariance=_about_origin(covariance, centre),
-        rows=rows[used],
-        influence=influence[:, used],
-        rms_mm=float(np.sqrt(np.mean(d[used] ** 2))) if used.any() else math.nan,
-        sigma_rule=rule,
-        free=named_motions(left * unit[:, None], centre, radius),
-    )
-    return -influence @ d, result

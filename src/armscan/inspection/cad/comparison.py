@@ -442,14 +442,20 @@ def _uncertainties(
     found = [COVERAGE * np.sqrt(np.maximum(own + by_pose, 0.0))]
     influence = np.zeros((6, len(cloud)))
     influence[:, alignment.rows] = alignment.influence
-    errors = PointErrors.of(cloud, pose, normals)
+    along = normals.copy()
+    along[alignment.rows] = alignment.normals
+    errors = PointErrors.of(cloud, pose, along)
+    # an alignment that does not rest on points one by one errs apart from them
+    apart = alignment.step_covariance if len(alignment.rows) == 0 else np.zeros((6, 6))
     for label, count in groups:
         inside = label >= 0
         n = np.maximum(np.bincount(label[inside], minlength=count), 1)
         mean = np.stack(
             [np.bincount(label[inside], jacobian[inside, k], count) / n for k in range(6)], axis=1
         )
-        found.append(COVERAGE * np.sqrt(errors.group_variances(label, count, mean, influence)))
+        variance = errors.group_variances(label, count, mean, influence)
+        variance = variance + np.einsum("fk,kl,fl->f", mean, apart, mean)
+        found.append(COVERAGE * np.sqrt(variance))
     return found
 
 

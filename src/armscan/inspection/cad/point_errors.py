@@ -46,6 +46,7 @@ class PointErrors(RowRecord):
         pose: Pose[Cad, Part],
         normals: FloatArray,
         rows: IntArray | None = None,
+        kept_share: float | None = None,
     ) -> PointErrors:
         """Errors of a cloud's points, or of some of its rows.
 
@@ -59,6 +60,9 @@ class PointErrors(RowRecord):
             (M, 3) of the part at each of the rows, in Cad.
         rows
             (M,) rows; None for all.
+        kept_share
+            Part of the cloud's points, where they are, that was kept when it was thinned; None for
+            that of all rows.
         """
         chosen = np.arange(len(cloud)) if rows is None else rows
         covariance, axis, share = without_noise(cloud, chosen)
@@ -66,7 +70,7 @@ class PointErrors(RowRecord):
         shared = np.ones(len(chosen))
         if cloud.noise_length is not None:
             # of neighbours that share their noise, a thinned cloud keeps so many
-            thinned = len(chosen) / max(len(cloud), 1)
+            thinned = len(chosen) / max(len(cloud), 1) if kept_share is None else kept_share
             shared = 1.0 + np.maximum(cloud.noise_length[chosen] - 1.0, 0.0) * thinned
         return PointErrors(
             normals=normals,

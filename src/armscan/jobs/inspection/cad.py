@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.inspection.cad.alignment import Alignment, AlignMethod, align
+from armscan.inspection.cad.alignment import AlignMethod
 from armscan.inspection.cad.comparison import CadOptions, compare_with_part
+from armscan.inspection.cad.datums import Datums, align
 from armscan.inspection.cad.distance import PartSurface
+from armscan.inspection.cad.part import PartModel
 from armscan.jobs.inspection.shapes import region_of
 from armscan.jobs.job import Job, solved
 from armscan.pipeline.progress import ProgressEvent
@@ -22,20 +24,22 @@ from armscan.report.inspection.cad import (
     cad_page,
     cad_quantities,
     cad_warnings,
+    datum_table,
     statistics_table,
     verdict_table,
 )
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import read_cloud
 from armscan.storage.image_paths import are_simulated
+from armscan.storage.parts.datums import (
+    datum_faces,
+    datum_features,
+    read_reference_markers,
+    read_reference_points,
+)
 from armscan.storage.parts.meshes import UNITS_MM, read_part
 from armscan.storage.parts.step import ChordError
-from armscan.storage.parts.tables import (
-    datum_faces,
-    deviation_ply_bytes,
-    face_table_bytes,
-    read_tolerances,
-)
+from armscan.storage.parts.tables import deviation_ply_bytes, face_table_bytes, read_tolerances
 
 STAGES = ("model", "cloud", "alignment", "deviations")
 
@@ -48,16 +52,23 @@ class PartOptions:
     ----------
     align
         ``best``: wherever the cloud fits best; ``none``: it is in the part's frame; ``321``: by
-        three faces.
+        three faces; ``features``: by fitted features one after the other; ``points``,
+        ``markers``: by points whose places on the part are known.
     datums
-        Names of the three faces, between commas.
+        Of ``321`` and ``features``, as of `armscan.storage.parts.datums`.
     unit
         Unit of a mesh: mm, cm, m or inch.
+    points
+        Table of the nominal places of reference points or markers.
+    measured
+        Table of their measured places; empty if ``points`` holds them.
     """
 
     align: AlignMethod = "best"
     datums: str = ""
     unit: str = "mm"
+    points: str = ""
+    measured: str = ""
 
 
 def inspect_cad(
@@ -105,15 +116,19 @@ def inspect_cad(
     part = read_part(part_path, unit=how.unit, chord=chord)
     limit, by_face = read_tolerances(tolerance, part)
     options = replace(options, tolerance_mm=limit, face_tolerances_mm=by_face)
-    datums = datum_faces(how.datums, part) if how.align == "321" else ()
     _tell(job, 1, cloud_path.name)
     cloud = read_cloud(cloud_path)
     if box is not None:
         cloud = cloud.select(box.holds(cloud.points_mm))
+    if len(cloud) == 0:
+        raise InputError(
+            "no point is left of the cloud", where=str(cloud_path), remedy="give another --region"
+        )
     errors_known = bool(cloud.covariance_mm2.any()) and not np.isfinite(options.uncertainty_mm)
     surface = PartSurface(part)
     _tell(job, 2, how.align)
-    alignment = _aligned(surface, cloud, how, datums, errors_known, where=cloud_path)
+    datums = _datums(how, part, cloud)
+    alignment = solved(align(surface, cloud, how.align, datums, errors_known), cloud_path)
     _tell(job, 3)
     found = solved(compare_with_part(surface, cloud, alignment, options, errors_known), cloud_path)
     _tell(job, 4)
@@ -122,7 +137,7 @@ def inspect_cad(
     told = cad_quantities(found, part)
     written: tuple[Path, ...] = ()
     if job.output is not None:
-        inputs = (cloud_path, part_path)
+        inputs = [cloud_path, part_path, *(Path(one) for one in (how.points, how.measured) if one)]
         shown: Sequence[Any] = (how, options, *(() if chord is None else (chord,)))
         provenance = job.provenance(inputs, shown, warnings=warnings, forced=cloud.forced)
         page = cad_page(found, part, cloud, provenance, warnings, is_simulated=is_simulated)
@@ -137,7 +152,7 @@ def inspect_cad(
         title=f"{cloud_path.name} against {part_path.name}"
         + (" (simulated data)." if is_simulated else "."),
         quantities=told,
-        tables=(verdict_table(found), statistics_table(found)),
+        tables=(verdict_table(found), statistics_table(found), *datum_table(alignment)),
         warnings=sentences(warnings),
         written=written,
         next_step=f"open {job.output}" if job.output else "",
@@ -153,28 +168,36 @@ def _check_options(how: PartOptions) -> None:
             where="--unit",
             remedy=f"give one of {', '.join(UNITS_MM)}",
         )
-    if (how.align == "321") != bool(how.datums):
-        raise OptionError(
-            "three datum faces go with --align 321, and only with it",
-            where="--datums",
-            remedy="give both or none of them",
-        )
+    by_datums, by_points = how.align in ("321", "features"), how.align in ("points", "markers")
+    faults = (
+        (by_datums != bool(how.datums), "--datums",
+         "datums go with --align 321 or features, and only with these"),
+        (by_points != bool(how.points), "--points",
+         "a table of points goes with --align points or markers, and only with these"),
+        (bool(how.measured) and not by_points, "--measured",
+         "measured places go with --align points or markers only"),
+        (how.align == "markers" and not how.measured, "--measured",
+         "--align markers needs the list of measured markers"),
+    )  # fmt: skip
+    for is_wrong, where, what in faults:
+        if is_wrong:
+            raise OptionError(what, where=where, remedy="give both or none of them")
 
 
-def _aligned(
-    surface: PartSurface,
-    cloud: PointCloud,
-    how: PartOptions,
-    datums: Sequence[int],
-    errors_known: bool,
-    *,
-    where: Path,
-) -> Alignment:
-    if len(cloud) == 0:
-        raise InputError(
-            "no point is left of the cloud", where=str(where), remedy="give another --region"
-        )
-    return solved(align(surface, cloud, how.align, datums, errors_known), where)
+def _datums(how: PartOptions, part: PartModel, cloud: PointCloud) -> Datums:
+    """What the alignment rests on."""
+    if how.align == "321":
+        return Datums(faces=datum_faces(how.datums, part))
+    if how.align == "features":
+        return Datums(features=datum_features(how.datums, part))
+    if not how.points:
+        return Datums()
+    path, measured = Path(how.points), Path(how.measured) if how.measured else None
+    if how.align == "points":
+        return Datums(points=read_reference_points(path, measured))
+    return Datums(
+        points=solved(read_reference_markers(path, Path(how.measured), cloud.frame), path)
+    )
 
 
 def _tell(job: Job, done: int, item: str = "") -> None:

@@ -57,6 +57,9 @@ class _Run:
         folder = self.folder / name
         try:
             cloud_hash = fingerprint(path).sha256
+            measured = self.file.measured_of(path)
+            if measured is not None and measured.is_file():
+                cloud_hash += f" {fingerprint(measured).sha256}"
             done = self._done(folder, cloud_hash)
             if done is not None:
                 return replace(done, name=name, cloud=path_text(path))
@@ -89,7 +92,8 @@ class _Run:
 
     def _inspected(self, name: str, path: Path, cloud_hash: str) -> PartRow:
         cloud = read_cloud(path)
-        found = solved(follow_recipe(self.file.recipe, cloud), path)
+        recipe = solved(self.file.for_part(path, cloud.frame), path)
+        found = solved(follow_recipe(recipe, cloud), path)
         simulated = cloud.is_simulated or are_simulated((path, *self.file.inputs))
         comparison = found.comparison
         warned = () if comparison is None else cad_warnings(comparison, found.errors_known)
@@ -173,7 +177,8 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
     file = read_recipe(recipe_path)
     hashes = [fingerprint(path).sha256 for path in file.inputs]
     own = replace(job, is_overwriting=True)
-    run = _Run(own, job.output, file, (hashes[0], hashes[1] if len(hashes) > 1 else ""))
+    recipe_hash = " ".join((hashes[0], *hashes[2:]))
+    run = _Run(own, job.output, file, (recipe_hash, hashes[1] if len(hashes) > 1 else ""))
     rows: list[PartRow] = []
     _make_folder(job.output)
     write_files({job.output / TABLE: part_table_bytes(rows)}, is_overwriting=True)
@@ -226,7 +231,11 @@ def _clouds_in(folder: Path) -> list[Path]:
     paths = [
         path
         for path in folder.iterdir()
-        if path.suffix.lower() in CLOUD_SUFFIXES and path.is_file() and path.name[0] != "."
+        if path.suffix.lower() in CLOUD_SUFFIXES
+        and path.is_file()
+        and path.name[0] != "."
+        # what was measured beside a cloud
+        and not path.name.endswith((".points.csv", ".markers.csv"))
     ]
     if not paths:
         raise OptionError(

@@ -14,6 +14,7 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import FloatArray
+from armscan.inspection.cad.alignment import Alignment, DatumUse, held_text
 from armscan.inspection.cad.comparison import (
     DEFINITIONS,
     RULE,
@@ -85,9 +86,9 @@ def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...
         Quantity("alignment.method", "Alignment", a.method, shown=ALIGNMENTS[a.method]),
         Quantity(
             "alignment.rms_mm", "Alignment rms", a.rms_mm, unit="mm",
-            meaning=f"of the {len(a.rows):,} points that it used",
+            meaning=f"of the {a.n_used:,} points that it used",
         ),
-        Quantity("alignment.n_used", "", len(a.rows)),
+        Quantity("alignment.n_used", "", a.n_used),
         Quantity("alignment.cad_from_part", "", a.cad_from_part.matrix.tolist()),
         Quantity("alignment.covariance", "", a.covariance.tolist()),
         Quantity("alignment.sigma_turn_rad", "", sigma[:3].tolist()),
@@ -96,6 +97,8 @@ def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...
         Quantity("alignment.sigma_rule", "", a.sigma_rule),
         Quantity("alignment.not_held", "", [one.text for one in a.free]),
         Quantity("alignment.n_other_poses", "", len(a.rivals)),
+        *((Quantity("alignment.datums", "", [_datum_data(one) for one in a.datums]),)
+          if a.datums else ()),
         *_overall_quantities(found),
     ]  # fmt: skip
     if a.method != "none":
@@ -119,6 +122,9 @@ ALIGNMENTS = {
     "best": "best fit of the whole cloud, found without a guess",
     "none": "none: the cloud's frame is taken for that of the part",
     "321": "3-2-1, by three datum faces",
+    "features": "by fitted features, one after the other",
+    "points": "by reference points, all together",
+    "markers": "by markers, all together",
 }
 
 
@@ -187,6 +193,30 @@ def _face_data(one: FaceComparison) -> dict[str, object]:
         "decision": one.decision,
         "is_seen_once": one.is_seen_once,
     }
+
+
+def _datum_data(one: DatumUse) -> dict[str, object]:
+    return {
+        "datum": one.name,
+        "n_points": one.n_points,
+        "holds": [motion.text for motion in one.held],
+        "residual_mm": one.left_mm,
+        "sigma_mm": one.sigma_mm,
+    }
+
+
+def datum_table(alignment: Alignment) -> tuple[Table, ...]:
+    """A row a datum: what it holds, how far it stays off, how well it is known; none without."""
+    if not alignment.datums:
+        return ()
+    in_order = alignment.method in ("321", "features")
+    rows = []
+    for one in alignment.datums:
+        holds = held_text(one.held) or "nothing" if in_order else "together with the others"
+        off, sigma = (_length(value, sign="") for value in (one.left_mm, one.sigma_mm))
+        rows.append((one.name, f"{one.n_points:,}", holds, off, sigma))
+    heads = ("datum", "points", "holds", "residual", "sigma")
+    return (Table(heads, tuple(rows), "Datums of the alignment, mm", (2,)),)
 
 
 def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
@@ -308,7 +338,8 @@ def cad_page(
                 tuple(section_chart(found, part, axis, limit) for axis in range(3))))),
             Section("What the numbers mean", (
                 Table(("statistic", "definition"), (*definitions, *spot), "", (1,)),)),
-            Section("Alignment", (Facts(_alignment_facts(found, told)),)),
+            Section("Alignment", (
+                Facts(_alignment_facts(found, told)), *datum_table(found.alignment))),
         ),
         cards=_cards(told),
         warnings=warnings,

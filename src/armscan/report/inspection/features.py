@@ -98,12 +98,11 @@ def feature_quantities(found: FeatureInspection) -> tuple[Quantity, ...]:
         )
     if found.length_mm:
         told.append(Quantity("fitted.length_mm", "Extent along it", found.length_mm, unit="mm"))
-    extent = found.fitted.value("range_mm")
     told.append(
         Quantity(
             "fitted.form_mm",
             found.form_name.capitalize(),
-            _width(found, extent),
+            found.form_mm,
             unit="mm",
             meaning=f"{_form_meaning(kind)}, of all points, outliers included",
         )
@@ -114,13 +113,6 @@ def feature_quantities(found: FeatureInspection) -> tuple[Quantity, ...]:
     if found.nominal is not None:
         told += deviation_quantities("nominal", found.nominal)
     return tuple(told)
-
-
-def _width(found: FeatureInspection, extent_mm: float) -> float:
-    """Width of the zone that holds all points; distances to a line have no sign."""
-    if found.shape.kind != "line":
-        return extent_mm
-    return 2.0 * float(found.fitted.deviations_mm.max())
 
 
 def _form_meaning(kind: str) -> str:
@@ -209,6 +201,9 @@ def _counts(first: PointCounts, second: PointCounts) -> PointCounts:
     )
 
 
+ZONE = "width of the zone about the second feature that holds the first one's fit"
+
+
 def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
     """Report of how two features stand to each other."""
     names = f"{found.first.wanted} and {found.second.wanted}"
@@ -226,6 +221,10 @@ def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
             angle_quantity("angle", "Angle", found.angle, f"{found.angle_text}; {ANGLE_NOTE}"),
             _expanded("angle_u_deg", "angle", COVERAGE * sigma, "degrees"),
         ]
+    for key in ("parallelism", "perpendicularity"):
+        zone = getattr(found, key)
+        if zone is not None:
+            told.append(length_quantity(key, key.capitalize(), zone, ZONE))
     for place, one in (("first", found.first), ("second", found.second)):
         for item in feature_quantities(one):
             key = f"{place}.{item.key}" if item.key else ""

@@ -81,7 +81,7 @@ def feature_table(values: Sequence[PartQuantity]) -> Table:
         )
         for one in values
     )
-    heads = ("feature", "decision", "diameter or half angle", "U", "nominal", "tolerance", "unit")
+    heads = ("feature", "decision", "value", "U", "nominal", "tolerance", "unit")
     return Table(heads, rows, "", (1, 6))
 
 

@@ -12,13 +12,27 @@ from typing import Any, Literal
 
 from armscan.errors import ArmscanError, FileFormatError, OptionError
 from armscan.geometry.arrays import Box, FloatArray
+from armscan.geometry.estimate import FitFailure
 from armscan.geometry.features import ShapeKind
+from armscan.inspection.cad.alignment import AlignMethod
 from armscan.inspection.cad.comparison import CadOptions
+from armscan.inspection.cad.datums import Datums
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import PartModel
+from armscan.inspection.cad.reference_points import ReferencePoints
 from armscan.inspection.cleaning import CleaningOptions
-from armscan.inspection.recipe import FollowedRecipe, PartQuantity, PartRow, Recipe, RecipeFeature
+from armscan.inspection.recipe import (
+    FollowedRecipe,
+    PartQuantity,
+    PartRow,
+    Recipe,
+    RecipeFeature,
+    RecipeRelation,
+    RecipeStep,
+    RelationMeasure,
+)
 from armscan.inspection.search import WantedFeature
+from armscan.records.cloud import CloudFrame
 from armscan.storage.codec import (
     FieldCodec,
     Layout,
@@ -29,9 +43,17 @@ from armscan.storage.codec import (
     parse_toml,
 )
 from armscan.storage.files import is_file, path_text, read_bytes
+from armscan.storage.parts.datums import (
+    MEASURED,
+    PICKED,
+    datum_faces,
+    datum_features,
+    read_reference_markers,
+    read_reference_points,
+)
 from armscan.storage.parts.meshes import read_part
-from armscan.storage.parts.tables import datum_faces, require_face
-from armscan.storage.tables import csv_bytes, number_text
+from armscan.storage.parts.tables import require_face
+from armscan.storage.tables import csv_bytes, number_text, read_csv
 
 REMEDY = "write it as in the reference of recipes (docs/reference/files.md)"
 POSITIVE_MM = (1e-6, 1e4)
@@ -83,6 +105,30 @@ class _FeatureKeys:
     tolerance_mm: float | None = None
     nominal_deg: float | None = None
     tolerance_deg: float | None = None
+    form_tolerance_mm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _RelationKeys:
+    """``[[relation]]``."""
+
+    name: str
+    of: tuple[str, ...]
+    measure: RelationMeasure
+    nominal_mm: float | None = None
+    tolerance_mm: float | None = None
+    nominal_deg: float | None = None
+    tolerance_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _StepKeys:
+    """``[[step]]``."""
+
+    name: str
+    height_mm: float
+    tolerance_mm: float | None = None
+    region: Box | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,14 +138,17 @@ class _RecipeKeys:
     title: str = ""
     part: str | None = None
     unit: Literal["mm", "cm", "m", "inch"] = "mm"
-    align: Literal["best", "none", "321"] = "best"
+    align: AlignMethod = "best"
     datums: str | None = None
+    points: str | None = None
     tolerance_mm: float | None = None
     uncertainty_mm: float | None = None
     reach_mm: float | None = None
     faces: Mapping[str, float] | None = None
     clean: CleaningOptions | None = None
     feature: tuple[_FeatureKeys, ...] = ()
+    relation: tuple[_RelationKeys, ...] = ()
+    step: tuple[_StepKeys, ...] = ()
 
 
 BOX = FieldCodec(_same, _read_box)
@@ -119,7 +168,16 @@ LAYOUTS: Mapping[type, Layout] = {
     ),
     _FeatureKeys: Layout(
         codecs={"region": BOX},
+        limits={
+            "tolerance_mm": POSITIVE_MM, "tolerance_deg": (1e-6, 90.0),
+            "form_tolerance_mm": POSITIVE_MM,
+        },
+    ),
+    _RelationKeys: Layout(
         limits={"tolerance_mm": POSITIVE_MM, "tolerance_deg": (1e-6, 90.0)},
+    ),
+    _StepKeys: Layout(
+        codecs={"region": BOX}, limits={"tolerance_mm": POSITIVE_MM, "height_mm": POSITIVE_MM}
     ),
     PartQuantity: Layout(is_evidence=True),
 }  # fmt: skip
@@ -136,12 +194,42 @@ class RecipeFile:
     part
         The model; None without one.
     inputs
-        The recipe's file, and the model's.
+        The recipe's file, the model's, and that of reference points.
+    measured_beside
+        True if the places of reference points or markers were measured on each part: in a table
+        beside its cloud, ``NAME.points.csv`` or ``NAME.markers.csv``.
     """
 
     recipe: Recipe
     part: PartModel | None
     inputs: tuple[Path, ...]
+    measured_beside: bool = False
+
+    def measured_of(self, cloud: Path) -> Path | None:
+        """The table beside a cloud; None where the recipe needs none."""
+        if not self.measured_beside:
+            return None
+        return cloud.with_name(f"{cloud.stem}.{self.recipe.align}.csv")
+
+    def for_part(self, cloud_path: Path, frame: CloudFrame) -> Recipe | FitFailure:
+        """The recipe with what was measured beside a cloud."""
+        measured = self.measured_of(cloud_path)
+        if measured is None:
+            return self.recipe
+        if not is_file(measured):
+            raise FileFormatError(
+                "there is no table of what was measured on this part",
+                where=path_text(measured),
+                remedy='lay it beside the cloud, or say align = "best" in the recipe',
+            )
+        points = self.inputs[-1]
+        if self.recipe.align == "points":
+            found: ReferencePoints | FitFailure = read_reference_points(points, measured)
+        else:
+            found = read_reference_markers(points, measured, frame)
+        if isinstance(found, FitFailure):
+            return found
+        return replace(self.recipe, datums=Datums(points=found))
 
 
 def read_recipe(path: Path) -> RecipeFile:
@@ -172,7 +260,16 @@ def read_recipe(path: Path) -> RecipeFile:
         ) from error
     _check(keys, content, where)
     features = tuple(_feature(one, where) for one in keys.feature)
-    recipe = Recipe(title=keys.title or path.stem, cleaning=keys.clean, features=features)
+    recipe = Recipe(
+        title=keys.title or path.stem,
+        cleaning=keys.clean,
+        features=features,
+        relations=tuple(_relation(one, keys, where) for one in keys.relation),
+        steps=tuple(
+            RecipeStep(one.name, one.height_mm, _or_nan(one.tolerance_mm), one.region)
+            for one in keys.step
+        ),
+    )
     if keys.part is None:
         return RecipeFile(recipe, None, (path,))
     part_path = path.parent / keys.part
@@ -183,21 +280,33 @@ def read_recipe(path: Path) -> RecipeFile:
             remedy="name the model by its place beside the recipe",
         )
     part = read_part(part_path, unit=keys.unit)
+    points = None if keys.points is None else path.parent / keys.points
+    in_one_table = keys.align == "points" and points is not None and _holds_measured(points)
     recipe = replace(
         recipe,
         surface=PartSurface(part),
         align=keys.align,
-        datums=_datums(keys, part, where),
+        datums=_datums(keys, part, where, points if in_one_table else None),
         options=_options(keys, part, where),
     )
-    return RecipeFile(recipe, part, (path, part_path))
+    inputs = (path, part_path) if points is None else (path, part_path, points)
+    return RecipeFile(recipe, part, inputs, points is not None and not in_one_table)
+
+
+def _holds_measured(path: Path) -> bool:
+    table = read_csv(path)
+    return any(name in table for name in (*MEASURED, *PICKED))
 
 
 def _check(keys: _RecipeKeys, content: Mapping[str, Any], where: str) -> None:
     """Refuse what contradicts itself or would have no effect."""
-    of_part = ("unit", "align", "datums", "tolerance_mm", "uncertainty_mm", "reach_mm", "faces")
+    of_part = (
+        "unit", "align", "datums", "points", "tolerance_mm", "uncertainty_mm", "reach_mm", "faces",
+    )  # fmt: skip
     vain = [name for name in of_part if name in content] if keys.part is None else []
     names = [one.name for one in keys.feature]
+    names += [f"{one.name} form" for one in keys.feature if one.form_tolerance_mm is not None]
+    names += [one.name for one in keys.relation] + [one.name for one in keys.step]
     twice = [name for name, n in Counter(names).items() if n > 1]
     is_unnamed = any(not name.strip() or not name.isprintable() for name in names)
     faults = (
@@ -205,13 +314,17 @@ def _check(keys: _RecipeKeys, content: Mapping[str, Any], where: str) -> None:
          "name the model, or leave it out"),
         (keys.part is None and any(one.face is not None for one in keys.feature),
          "'feature.face' has no effect without 'part'", "name the model, or leave it out"),
-        (keys.part is None and not names, "it names neither a 'part' nor a 'feature'",
+        (keys.part is None and not names, "it names neither a 'part' nor a 'feature' or 'step'",
          "say what to inspect"),
-        ((keys.align == "321") != bool(keys.datums),
-         "'datums' goes with align = \"321\", and only with it", "give both or none of them"),
-        (bool(twice), f"'feature.name' is '{''.join(twice[:1])}' twice",
-         "give each feature its own name"),
-        (is_unnamed, "'feature.name' is empty or holds a line break", "give each feature a name"),
+        ((keys.align in ("321", "features")) != bool(keys.datums),
+         "'datums' goes with align = \"321\" or \"features\", and only with these",
+         "give both or none of them"),
+        ((keys.align in ("points", "markers")) != bool(keys.points),
+         "'points' goes with align = \"points\" or \"markers\", and only with these",
+         "give both or none of them"),
+        (bool(twice), f"the name '{''.join(twice[:1])}' is there twice",
+         "give each feature, relation and step its own name"),
+        (is_unnamed, "a name is empty or holds a line break", "give each feature a name"),
     )  # fmt: skip
     for is_wrong, what, remedy in faults:
         if is_wrong:
@@ -257,17 +370,59 @@ def _feature(keys: _FeatureKeys, where: str) -> RecipeFeature:
     return RecipeFeature(
         name=keys.name,
         wanted=wanted,
-        nominal=math.nan if nominal is None else nominal,
-        tolerance=math.nan if tolerance is None else tolerance,
+        nominal=_or_nan(nominal),
+        tolerance=_or_nan(tolerance),
         face=keys.face or "",
+        form_tolerance=_or_nan(keys.form_tolerance_mm),
     )
 
 
-def _datums(keys: _RecipeKeys, part: PartModel, where: str) -> tuple[int, ...]:
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _relation(keys: _RelationKeys, recipe: _RecipeKeys, where: str) -> RecipeRelation:
+    """A relation; zones of parallel and square features have the nominal width 0."""
+    place = f"{where}: relation '{keys.name}'"
+    known = [one.name for one in recipe.feature]
+    in_mm, in_deg = (keys.nominal_mm, keys.tolerance_mm), (keys.nominal_deg, keys.tolerance_deg)
+    own, foreign = (in_deg, in_mm) if keys.measure == "angle" else (in_mm, in_deg)
+    nominal, tolerance = own
+    is_zone = keys.measure in ("parallelism", "perpendicularity")
+    unknown = [name for name in keys.of if name not in known]
+    faults = (
+        (len(keys.of) != 2 or len(set(keys.of)) != 2, "'of' names no two features",
+         'write of = ["bore", "base"]'),
+        (bool(unknown), f"there is no feature '{''.join(unknown[:1])}'",
+         f"name two of {', '.join(known) or 'the features, which are missing'}"),
+        (any(one is not None for one in foreign), "an angle is in degrees, all else in mm",
+         "give nominal_deg and tolerance_deg of an angle, nominal_mm and tolerance_mm of others"),
+        (is_zone and nominal is not None, f"{keys.measure} has no nominal value but 0",
+         "leave nominal_mm out"),
+        (tolerance is not None and nominal is None and not is_zone,
+         "it has a tolerance and no nominal value", "give both"),
+    )  # fmt: skip
+    for is_wrong, what, remedy in faults:
+        if is_wrong:
+            raise FileFormatError(what, where=place, remedy=remedy)
+    return RecipeRelation(
+        name=keys.name,
+        of=keys.of,
+        measure=keys.measure,
+        nominal=0.0 if is_zone else _or_nan(nominal),
+        tolerance=_or_nan(tolerance),
+    )
+
+
+def _datums(keys: _RecipeKeys, part: PartModel, where: str, points: Path | None) -> Datums:
+    if points is not None:
+        return Datums(points=read_reference_points(points))
     if keys.datums is None:
-        return ()
+        return Datums()
     try:
-        return datum_faces(keys.datums, part)
+        if keys.align == "321":
+            return Datums(faces=datum_faces(keys.datums, part))
+        return Datums(features=datum_features(keys.datums, part))
     except ArmscanError as error:
         raise FileFormatError(
             error.what, where=f"{where}: 'datums'", remedy=error.remedy

@@ -78,26 +78,6 @@ def read_tolerances(text: str, part: PartModel) -> tuple[float, dict[str, float]
     return default, faces
 
 
-def datum_faces(names: str, part: PartModel) -> tuple[int, ...]:
-    """Numbers of three faces named between commas.
-
-    Raises
-    ------
-    OptionError
-        If they are not three different faces of the part.
-    """
-    words = [word.strip() for word in names.split(",") if word.strip()]
-    if len(words) != 3 or len(set(words)) != 3:
-        raise OptionError(
-            f"{len(set(words))} different datum faces where 3 are needed",
-            where="--datums",
-            remedy=f"name three of the faces, such as {', '.join(part.face_names[:3])}",
-        )
-    for word in words:
-        require_face(word, part, "--datums")
-    return tuple(part.face_names.index(word) for word in words)
-
-
 def _toml_tolerances(content: dict[str, Any], where: str) -> tuple[float, dict[str, float]]:
     default, faces = content.get("default_mm", math.nan), content.get("faces", {})
     unknown = sorted(set(content) - {"default_mm", "faces"})

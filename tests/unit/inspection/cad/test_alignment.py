@@ -14,12 +14,12 @@ from armscan.geometry.poses import Cad, Part, Pose
 from armscan.inspection.cad.alignment import (
     Alignment,
     align_best,
-    align_datums,
     align_none,
     fit_to_part,
     free_text,
 )
 from armscan.inspection.cad.comparison import CadComparison, CadOptions, compare_with_part
+from armscan.inspection.cad.datums import align_datums
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import PartModel, part_of
 from armscan.inspection.cad.search import even_turns, spread_rows

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 import trimesh
 
 from armscan.cli import main
@@ -61,6 +62,11 @@ def test_a_high_face_is_found_and_no_other(
     table = parse_ply((tmp_path / "report.ply").read_bytes(), "report.ply").table
     assert len(table) == told["points"]["n"] == 30_000
     high = table["deviation_mm"][table["face"] == 3]
+    within = told["faces"]["each"][3]["fraction_within_tolerance"]
+    assert within == pytest.approx(scipy.stats.norm.cdf(-3.0), abs=0.004)
+    assert told["points"]["fraction_within_tolerance"] == pytest.approx(
+        np.mean(np.abs(table["deviation_mm"]) <= 0.05), abs=1e-12
+    )
     assert high.mean() == pytest.approx(told["faces"]["each"][3]["mean_mm"], abs=1e-9)
     text = page.read_text()
     assert "https://" not in text

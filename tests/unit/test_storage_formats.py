@@ -17,7 +17,7 @@ import trimesh
 from armscan.cli import main
 from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.jobs.info import describe_files
-from armscan.records.cloud import PointCloud, largest_eigenvalue
+from armscan.records.cloud import CalibrationMark, PointCloud, largest_eigenvalue
 from armscan.storage.clouds import (
     CLOUD_SUFFIXES,
     CloudPiece,
@@ -58,6 +58,7 @@ def cloud(n: int = 60, has_normals: bool = True) -> PointCloud:
         seen_from_mm=rng.normal(size=(3, 3)) * 100 if has_normals else None,
         is_simulated=True,
         forced=("rms 9 px", "f unknown"),
+        calibrations=(CalibrationMark("a1", "2026-05-01T10:00:00+00:00"), CalibrationMark("b")),
     )
 
 

@@ -22,6 +22,7 @@ from armscan.cli import (
     twin,
 )
 from armscan.cli import reconstruct as reconstruct_command
+from armscan.cli.delivery import delivered
 from armscan.cli.live.console import CONSOLE_EXAMPLE, console
 from armscan.cli.live.record import RECORD_EXAMPLE, record
 
@@ -82,19 +83,25 @@ inspect_group = typer.Typer(
     callback=_help_unless_a_command_follows,
     rich_markup_mode=None,
 )
-inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(inspect.plane)
-inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
-inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
-inspect_group.command("cad", epilog=inspect_cad.CAD_EXAMPLE)(inspect_cad.cad)
+inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(delivered(inspect.plane))
+inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(delivered(inspect.sphere))
+inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(delivered(inspect.step))
+inspect_group.command("cad", epilog=inspect_cad.CAD_EXAMPLE)(delivered(inspect_cad.cad))
 inspect_group.command("recipe", epilog=inspect_cad.RECIPE_EXAMPLE)(inspect_cad.recipe)
-inspect_group.command("line", epilog=inspect_features.LINE_EXAMPLE)(inspect_features.line)
-inspect_group.command("circle", epilog=inspect_features.CIRCLE_EXAMPLE)(inspect_features.circle)
-inspect_group.command("cylinder", epilog=inspect_features.CYLINDER_EXAMPLE)(
-    inspect_features.cylinder
+inspect_group.command("line", epilog=inspect_features.LINE_EXAMPLE)(
+    delivered(inspect_features.line)
 )
-inspect_group.command("cone", epilog=inspect_features.CONE_EXAMPLE)(inspect_features.cone)
+inspect_group.command("circle", epilog=inspect_features.CIRCLE_EXAMPLE)(
+    delivered(inspect_features.circle)
+)
+inspect_group.command("cylinder", epilog=inspect_features.CYLINDER_EXAMPLE)(
+    delivered(inspect_features.cylinder)
+)
+inspect_group.command("cone", epilog=inspect_features.CONE_EXAMPLE)(
+    delivered(inspect_features.cone)
+)
 inspect_group.command("relation", epilog=inspect_features.RELATION_EXAMPLE)(
-    inspect_features.relation
+    delivered(inspect_features.relation)
 )
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect_group, name="inspect")

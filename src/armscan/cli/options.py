@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from armscan.cli.delivery import with_delivery
+
 if TYPE_CHECKING:
     from armscan.jobs.job import Job
     from armscan.pipeline.progress import Progress, ProgressEvent
@@ -242,13 +244,10 @@ def run(
 
     with progress_bar() as progress:
         job = Job(
-            output=output,
-            is_overwriting=force,
-            is_forced=force_bad,
-            is_caching=cache,
-            command=("armscan", *sys.argv[1:]),
-            progress=progress,
-        )
+            output=output, is_overwriting=force, is_forced=force_bad, is_caching=cache,
+            command=("armscan", *sys.argv[1:]), progress=progress,
+        )  # fmt: skip
+        job = with_delivery(job)
         try:
             summary = work(job)
         except KeyboardInterrupt:

@@ -23,7 +23,7 @@ from armscan.errors import InputError, OptionError
 from armscan.fusion.cell_sums import MOST_BYTES, CellSums
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.kernels.voxels import BLOCK_BITS, MIDDLE, N_VALUES, PART_BITS, voxel_values
-from armscan.records.cloud import FUSED, CloudFrame, PointCloud
+from armscan.records.cloud import FUSED, CalibrationMark, CloudFrame, PointCloud
 
 AT_ONCE = 50_000
 """Points whose rows are made at a time: 11 MB."""
@@ -80,6 +80,7 @@ class VoxelMap:
     has_noise_length: bool = True
     is_simulated: bool = False
     forced: tuple[str, ...] = ()
+    calibrations: tuple[CalibrationMark, ...] = ()
     _has_covariance: bool | None = None
     _sums: CellSums = field(init=False)
 
@@ -130,6 +131,7 @@ class VoxelMap:
         self.has_noise_length &= cloud.noise_length is not None
         self.is_simulated |= cloud.is_simulated
         self.forced = tuple(dict.fromkeys((*self.forced, *cloud.forced)))
+        self.calibrations = tuple(dict.fromkeys((*self.calibrations, *cloud.calibrations)))
         for first in range(0, len(cloud), AT_ONCE):
             self._add(cloud.select(slice(first, first + AT_ONCE)))
         self.n_points += len(cloud)
@@ -190,6 +192,7 @@ class VoxelMap:
             else None,
             is_simulated=self.is_simulated,
             forced=self.forced,
+            calibrations=self.calibrations,
         )
         return FusedPoints(cloud, np.rint(sums[:, 26]).astype(np.int64), common)
 

@@ -96,6 +96,7 @@ def _written(
             noise_length=np.zeros(0) if voxels.has_noise_length else None,
             is_simulated=voxels.is_simulated,
             forced=voxels.forced,
+            calibrations=voxels.calibrations,
         )
         digest = CloudDigest.of_spool(points, marks)
         n_points = len(points)

@@ -10,14 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from armscan.errors import EstimationError, OptionError, OutputError
 from armscan.geometry.estimate import FitFailure
+from armscan.inspection.title_block import TitleBlock, calibration_state
 from armscan.models.calibration import Provenance
 from armscan.pipeline.progress import Progress, silent
+from armscan.records.cloud import PointCloud
+from armscan.report.delivery import Delivery, delivery_of, pdf_bytes, require_pdf
 from armscan.report.page import Page, render_page
 from armscan.report.quantity import sentences
 from armscan.storage.detection_cache import DetectionCache
@@ -45,6 +49,10 @@ class Job:
         Write a result that makes no sense, marked as such.
     is_caching
         Keep the points found in images beside the document, and take those kept there.
+    pdf
+        Where the page goes as PDF too; None for nowhere.
+    title_block
+        At the head of an inspection's page.
     command
         The command line, for the record.
     progress
@@ -55,6 +63,8 @@ class Job:
     is_overwriting: bool = False
     is_forced: bool = False
     is_caching: bool = False
+    pdf: Path | None = None
+    title_block: TitleBlock = field(default_factory=TitleBlock)
     command: tuple[str, ...] = ()
     progress: Progress = silent
 
@@ -93,8 +103,17 @@ class Job:
                 remedy=f"end it in {' or '.join(suffixes)}{hint}",
             )
         files = [self.output, *(self.output.with_suffix(suffix) for suffix in beside)]
-        check_outputs(files, is_overwriting=self.is_overwriting)
+        check_outputs(
+            (*files, *(() if self.pdf is None else (self.pdf,))), is_overwriting=self.is_overwriting
+        )
+        if self.pdf is not None:
+            require_pdf()
         return files
+
+    def delivery(self, cloud: PointCloud, source: Path) -> Delivery:
+        """What the report of a cloud from a file says beside its results."""
+        state = calibration_state(self.title_block, cloud.calibrations, datetime.now(UTC))
+        return delivery_of(self.title_block, state, cloud, source.name)
 
     def provenance(
         self,
@@ -116,11 +135,17 @@ class Job:
         )
 
     def write(self, contents: Mapping[Path, Content | Page]) -> tuple[Path, ...]:
-        """Write all files or none, and remove the page of an earlier refusal."""
-        files = {
-            path: render_page(content) if isinstance(content, Page) else content
-            for path, content in contents.items()
-        }
+        """Write all files or none, and remove the page of an earlier refusal.
+
+        The first page is written as PDF too, where one is wanted.
+        """
+        files: dict[Path, Content] = {}
+        pdf = self.pdf
+        for path, content in contents.items():
+            rendered = render_page(content) if isinstance(content, Page) else content
+            files[path] = rendered
+            if pdf is not None and isinstance(content, Page) and isinstance(rendered, bytes):
+                files[pdf], pdf = pdf_bytes(rendered), None
         write_files(files, is_overwriting=self.is_overwriting)
         if self.output is not None:
             self.output.with_suffix(".refused.html").unlink(missing_ok=True)

@@ -240,7 +240,12 @@ def _stills(
     is_simulated = are_simulated(read.paths)
     by_source = {exposure.source: exposure for exposure in read.exposures}
     page = cloud_page(result, sensor, by_source, provenance, is_simulated=is_simulated)
-    measured = replace(result.cloud, is_simulated=is_simulated, forced=provenance.forced)
+    measured = replace(
+        result.cloud,
+        is_simulated=is_simulated,
+        forced=provenance.forced,
+        calibrations=(sensor.provenance.mark,),
+    )
     written, losses = _write(
         job,
         places,

@@ -15,6 +15,7 @@ from armscan.geometry.shapes import Plane
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES, LightSheet
+from armscan.records.cloud import CalibrationMark
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +202,11 @@ class Provenance:
     options: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
     forced: tuple[str, ...] = ()
+
+    @property
+    def mark(self) -> CalibrationMark:
+        """What points carry of the calibration that they were measured with."""
+        return CalibrationMark(self.document_id, self.created_utc)
 
 
 class CameraCalibration(ArrayRecord):

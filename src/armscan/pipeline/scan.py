@@ -260,7 +260,12 @@ def measure_scan(
         )
         cloud = points.cloud()
     marks = scan.cloud
-    cloud = replace(cloud, is_simulated=marks.is_simulated, forced=marks.forced)
+    cloud = replace(
+        cloud,
+        is_simulated=marks.is_simulated,
+        forced=marks.forced,
+        calibrations=marks.calibrations,
+    )
     return replace(scan, cloud=cloud)
 
 
@@ -361,6 +366,7 @@ def measure_long_scan(
             points.without_points(),
             is_simulated=source.is_simulated,
             forced=scanner.provenance.forced,
+            calibrations=(scanner.provenance.mark,),
         ),
         images=tuple(found.images[row] for row in image_rows),
         image_rows=image_rows,
@@ -639,7 +645,11 @@ def place_profiles(
         )
     extra = _add_normals(points, kept, found, transform, silent)
     return ScanReconstruction(
-        cloud=replace(points.cloud(), forced=scanner.provenance.forced),
+        cloud=replace(
+            points.cloud(),
+            forced=scanner.provenance.forced,
+            calibrations=(scanner.provenance.mark,),
+        ),
         images=(),
         image_rows=tuple(kept),
         exposures=tuple(exposures),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,22 @@ FUSED = "fused"
 SMALLEST_EXTENT_MM = 2.0
 """Points that all lie this near to each other are taken for metres: nothing that small is measured,
 probed to place a scanner or carries markers, and a plate in metres is not larger."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationMark:
+    """The calibration that points were measured with: its document's id, and when it was made.
+
+    Parameters
+    ----------
+    document_id
+        Of the scanner's or sensor's document.
+    created_utc
+        ISO 8601 time as in the document; empty where it has none.
+    """
+
+    document_id: str
+    created_utc: str = ""
 
 
 class PointCloud(RowRecord):
@@ -62,6 +79,8 @@ class PointCloud(RowRecord):
     forced
         Why the calibration that they were measured with was refused, if it was and was used all
         the same.
+    calibrations
+        The calibrations that they were measured with; empty where it is not known.
     """
 
     frame: CloudFrame
@@ -79,6 +98,7 @@ class PointCloud(RowRecord):
     seen_from_mm: FloatArray | None = floats(None, 3, default=None)
     is_simulated: bool = False
     forced: tuple[str, ...] = ()
+    calibrations: tuple[CalibrationMark, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()

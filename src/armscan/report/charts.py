@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.camera import CameraModel
-from armscan.report.drawing import ACCENT, INK, chart_markup, new_figure, styled
+from armscan.report.drawing import ACCENT, INK, chart_markup, new_figure, round_below, styled
 from armscan.report.page import Picture
 
 DIVERGING = "RdBu_r"
@@ -180,12 +179,6 @@ def magnification(camera: CameraModel, rms_px: float) -> float:
     """How much residual arrows are enlarged: a round number, the same in all pictures."""
     longest = max(camera.width_px, camera.height_px)
     return round_below(ARROW_SHARE * longest / max(3.0 * rms_px, 1e-6))
-
-
-def round_below(value: float) -> float:
-    """The power of ten times 1, 2 or 5 next below a value."""
-    power = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-12))
 
 
 def symmetric_edges(values: FloatArray, least: float = 0.0) -> FloatArray:

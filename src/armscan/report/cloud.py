@@ -323,8 +323,8 @@ def digest_view(digest: CloudDigest) -> Picture:
         ramp_markup(f"sigma {significant(low)} µm", f"{significant(high)} µm") + scene,
         title=f"Points in space ({cloud.frame} frame)",
         caption="Colour is each point's standard deviation along its worst direction, "
-        f"{'stripe noise, arm' if is_z_up else 'stripe noise'} and calibration together. "
-        "Drag to turn; click, then scroll to zoom." + shown,
+        f"{'stripe noise, arm' if is_z_up else 'stripe noise'} and calibration together."
+        f"{shown}",
     )
 
 

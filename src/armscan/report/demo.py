@@ -567,4 +567,4 @@ def _by_sheet(cloud: PointCloud, chosen: BoolArray, title: str) -> Picture:
     dots = [uniform_dots(points[sheet == k], sheet_colour(k)) for k in np.unique(sheet)]
     every = f" One point in {step} is shown." if step > 1 else ""
     markup = scene_markup(dots, [], [], title, is_z_up=True)
-    return Picture(markup, f"Colour is the light sheet. Drag to turn.{every}", title)
+    return Picture(markup, f"Colour is the light sheet.{every}", title)

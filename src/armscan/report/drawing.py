@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -15,6 +16,8 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -234,6 +237,14 @@ def _img(uri: str, alt: str) -> str:
 
 RAMP = "viridis"
 RAMP_STOPS = 11
+STILL_PX, STILL_DPI = (1100, 560), 130.0
+"""Of the picture of a scene, for paper and where scripts do not run; in the canvas's shape."""
+STILL_DOT = 1.6
+"""Area of a dot in square points."""
+TURN_HINT = "Drag to turn; click, then scroll to zoom"
+VALUE_HINT = "; a click on a point tells its values."
+YAW, PITCH = -0.65, 0.42
+"""From where a scene is seen before a person turns it, in rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -341,9 +352,82 @@ def scene_markup(
         f'data-points="{_packed(points)}" data-colours="{_encoded(colours)}" '
         f'data-lines="{_packed(segments)}" data-line-colours="{_encoded(line_colours)}" '
         f'data-centre="{_packed((low + high) / 2)}" '
-        f'data-labels="{escape(texts)}" data-yaw="-0.65" data-pitch="0.42" '
+        f'data-labels="{escape(texts)}" data-yaw="{YAW}" data-pitch="{PITCH}" '
         f'data-up="{"z" if is_z_up else "-y"}"{_values_markup(values)}></canvas>'
+        f'<p class="hint">{TURN_HINT}{"." if values is None else VALUE_HINT}</p>'
+        f"<noscript>{_still(dots, lines, labels, alt, is_z_up=is_z_up)}</noscript>"
     )
+
+
+def _turned(points_mm: FloatArray, *, is_z_up: bool) -> FloatArray:
+    """(N, 3) right, down and away as a scene is first seen; the same turn as in ``scene.js``."""
+    x, y, z = points_mm.T
+    if is_z_up:
+        y, z = -z, y
+    cos_yaw, sin_yaw = math.cos(YAW), math.sin(YAW)
+    ahead = cos_yaw * z - sin_yaw * x
+    down = math.cos(PITCH) * y - math.sin(PITCH) * ahead
+    away = math.cos(PITCH) * ahead + math.sin(PITCH) * y
+    return np.stack([cos_yaw * x + sin_yaw * z, down, away], axis=1)
+
+
+def _still(
+    dots: Sequence[SceneDots],
+    lines: Sequence[SceneLines],
+    labels: Sequence[tuple[str, tuple[float, float, float]]],
+    alt: str,
+    *,
+    is_z_up: bool,
+) -> str:
+    """``<img>`` of a scene as it is first seen, with a bar of its scale."""
+    points = np.concatenate([item.points_mm for item in dots])
+    everything = np.concatenate([points, *(item.points_mm for item in lines)])
+    centre = (everything.min(axis=0) + everything.max(axis=0)) / 2.0
+    wide, high = STILL_PX
+    reach = np.abs(_turned(everything - centre, is_z_up=is_z_up)).max(axis=0)
+    scale = 0.44 * min(wide / max(reach[0], 1e-6), high / max(reach[1], 1e-6))
+
+    def place(places_mm: FloatArray) -> FloatArray:
+        seen = _turned(places_mm - centre, is_z_up=is_z_up)
+        return np.asarray(seen * scale + [wide / 2.0, high / 2.0, 0.0])
+
+    with styled():
+        figure = Figure(figsize=(wide / STILL_DPI, high / STILL_DPI))
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_axis_off()
+        axes.set_xlim(0.0, wide)
+        axes.set_ylim(high, 0.0)
+        for item in lines:
+            pairs = place(item.points_mm)[:, :2].reshape(-1, 2, 2)
+            axes.add_collection(LineCollection(list(pairs), colors=item.colour, linewidths=0.7))
+        seen = place(points)
+        order = np.argsort(-seen[:, 2], kind="stable")
+        colours = np.concatenate([item.colours for item in dots])[order] / 255.0
+        right, down, _ = seen[order].T
+        axes.scatter(right, down, c=colours, s=STILL_DOT, marker="s", linewidths=0)
+        for text, position in labels:
+            x, y, _ = place(np.array([position]))[0]
+            axes.text(x, y, text, color=MUTED)
+        bar_mm = round_below(0.15 * wide / scale)
+        axes.plot([wide - 18.0 - scale * bar_mm, wide - 18.0], [high - 16.0] * 2, color=MUTED)
+        axes.text(wide - 18.0, high - 24.0, f"{bar_mm:g} mm", ha="right", color=MUTED)
+        _draw_triad(axes, is_z_up=is_z_up)
+    return raster_markup(figure, alt, dpi=round(STILL_DPI))
+
+
+def _draw_triad(axes: Axes, *, is_z_up: bool) -> None:
+    """The frame's axes in the lower left corner."""
+    corner = np.array([52.0, STILL_PX[1] - 52.0])
+    for name, tip in zip("XYZ", _turned(np.eye(3), is_z_up=is_z_up)[:, :2], strict=True):
+        axes.plot(*np.stack([corner, corner + 34.0 * tip]).T, color=MUTED, linewidth=1.0)
+        x, y = (corner + 46.0 * tip).tolist()
+        axes.text(x, y, name, ha="center", va="center", color=MUTED)
+
+
+def round_below(value: float) -> float:
+    """The power of ten times 1, 2 or 5 next below a value."""
+    power = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-12))
 
 
 def _values_markup(values: SceneValues | None) -> str:

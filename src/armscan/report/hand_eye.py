@@ -560,7 +560,7 @@ def posture_scene(fit: HandEyeFit, stripes: Sequence[PosedStripe]) -> Picture:
         title="Postures and stripes (Base frame)",
         caption="Each pyramid is the sensor as the arm held it, with its axes X (orange), Y "
         "(green) and Z (blue, the view); the dots are the stripes placed with the result, "
-        "coloured by their distance from the reference. Drag to turn; click, then scroll to zoom.",
+        "coloured by their distance from the reference.",
     )
 
 

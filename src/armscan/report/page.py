@@ -104,6 +104,8 @@ class Page:
         Why what is shown, or what it rests on, was refused and made all the same.
     refused
         Why the run ended without a document, and what to do; empty if it did not.
+    heading
+        The title block: what the report is about, for whom, by whom.
     """
 
     title: str
@@ -115,6 +117,7 @@ class Page:
     footer: str
     forced: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
+    heading: tuple[Quantity, ...] = ()
 
 
 def page_of(

@@ -12,7 +12,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.models.calibration import Provenance
 from armscan.pipeline.register import MarkerResiduals
 from armscan.records.cloud import PointCloud
-from armscan.report.charts import named_columns, round_below
+from armscan.report.charts import named_columns
 from armscan.report.drawing import (
     ACCENT,
     ALERT,
@@ -22,6 +22,7 @@ from armscan.report.drawing import (
     SceneLines,
     chart_markup,
     new_figure,
+    round_below,
     scene_markup,
     styled,
     uniform_dots,
@@ -221,7 +222,7 @@ def _marker_view(scene: MarkerScene) -> Picture:
         title="Markers in the common frame",
         caption=f"Blue: common markers, with their residuals drawn {factor:g} times as long. "
         "Orange: markers that moved. Grey: markers without partner, and the clouds. Violet: "
-        "where the measurements were made from. Drag to turn; click, then scroll to zoom.",
+        "where the measurements were made from.",
     )
 
 

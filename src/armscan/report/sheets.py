@@ -447,8 +447,7 @@ def _scene(fit: LaserFit) -> Picture:
         scene_markup(dots, lines, labels, "Camera, boards and light sheets in space"),
         title="In space (Sensor frame)",
         caption="The pyramid is the camera and what it sees, grey outlines are the boards, dots "
-        "the stripes on them, coloured outlines the calibrated part of each sheet. Drag to turn; "
-        "click, then scroll to zoom.",
+        "the stripes on them, coloured outlines the calibrated part of each sheet.",
     )
 
 

@@ -214,7 +214,12 @@ def cloud_parts(
         yield from text.xyz_parts(marks, pieces)
     else:
         whole = CloudPiece.joined(list(pieces))
-        marked = replace(whole.cloud, is_simulated=marks.is_simulated, forced=marks.forced)
+        marked = replace(
+            whole.cloud,
+            is_simulated=marks.is_simulated,
+            forced=marks.forced,
+            calibrations=marks.calibrations,
+        )
         yield cloud_bytes(replace(whole, cloud=marked), path)
 
 

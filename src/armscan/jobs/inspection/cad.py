@@ -135,20 +135,23 @@ def inspect_cad(
     is_simulated = cloud.is_simulated or are_simulated((cloud_path, part_path))
     warnings = (*part.notes, *cad_warnings(found, errors_known))
     told = cad_quantities(found, part)
+    delivery = job.delivery(cloud, cloud_path)
     written: tuple[Path, ...] = ()
     if job.output is not None:
         inputs = [cloud_path, part_path, *(Path(one) for one in (how.points, how.measured) if one)]
         shown: Sequence[Any] = (how, options, *(() if chord is None else (chord,)))
-        provenance = job.provenance(inputs, shown, warnings=warnings, forced=cloud.forced)
+        provenance = job.provenance(
+            inputs, shown, warnings=(*delivery.warnings, *warnings), forced=cloud.forced
+        )
         page = cad_page(found, part, cloud, provenance, warnings, is_simulated=is_simulated)
         written = job.write(
             {
-                job.output: page,
+                job.output: delivery.on_page(page),
                 job.output.with_suffix(".csv"): face_table_bytes(found),
                 job.output.with_suffix(".ply"): deviation_ply_bytes(found, cloud, part),
             }
         )
-    return Summary(
+    summary = Summary(
         title=f"{cloud_path.name} against {part_path.name}"
         + (" (simulated data)." if is_simulated else "."),
         quantities=told,
@@ -159,6 +162,7 @@ def inspect_cad(
         forced=cloud.forced,
         extra={"kind": "cad inspection", "simulated": is_simulated},
     )
+    return delivery.in_summary(summary)
 
 
 def _check_options(how: PartOptions) -> None:

@@ -14,6 +14,7 @@ from armscan.errors import ArmscanError, OptionError, OutputError
 from armscan.inspection.recipe import FollowedRecipe, PartRow, follow_recipe
 from armscan.jobs.job import Job, solved
 from armscan.pipeline.progress import ProgressEvent
+from armscan.report.delivery import require_pdf
 from armscan.report.inspection.cad import cad_page, cad_warnings
 from armscan.report.inspection.recipe import (
     part_page,
@@ -40,7 +41,9 @@ from armscan.storage.parts.recipes import (
 from armscan.storage.parts.tables import deviation_ply_bytes, face_table_bytes
 
 TABLE, INDEX, RESULT = "table.csv", "index.html", "features.json"
+INDEX_PDF = "index.pdf"
 PART_FILES = (RESULT, "part.html", "part.csv", "part.ply")
+PART_PDF = "part.pdf"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +71,7 @@ class _Run:
             raise
         except (ArmscanError, MemoryError) as error:
             # what an older scan of this name left would be taken for this one's
-            for file in PART_FILES:
+            for file in (*PART_FILES, PART_PDF):
                 (folder / file).unlink(missing_ok=True)
             with suppress(OSError):
                 folder.rmdir()
@@ -88,7 +91,8 @@ class _Run:
         return found.row if own == theirs and is_whole else None
 
     def _names(self) -> tuple[str, ...]:
-        return PART_FILES if self.file.part is not None else PART_FILES[:2]
+        names = PART_FILES if self.file.part is not None else PART_FILES[:2]
+        return (*names, PART_PDF) if self.file.has_pdf else names
 
     def _inspected(self, name: str, path: Path, cloud_hash: str) -> PartRow:
         cloud = read_cloud(path)
@@ -99,11 +103,12 @@ class _Run:
         warned = () if comparison is None else cad_warnings(comparison, found.errors_known)
         model = () if self.file.part is None else self.file.part.notes
         cleaned = () if found.cleaning is None else found.cleaning.warnings
+        delivery = self.job.delivery(cloud, path)
         row = PartRow(
             name=name,
             cloud=path_text(path),
             quantities=found.quantities,
-            notes=sentences((*found.notes, *cleaned, *model, *warned)),
+            notes=sentences((*delivery.warnings, *found.notes, *cleaned, *model, *warned)),
             n_points=len(found.cloud),
             is_simulated=simulated,
             forced=cloud.forced,
@@ -119,8 +124,9 @@ class _Run:
             contents[folder / "part.ply"] = deviation_ply_bytes(
                 comparison, found.cloud, self.file.part
             )
-        contents[folder / "part.html"] = self._page(found, row, path)
-        self.job.write(contents)
+        page = self._page(found, row, path)
+        contents[folder / "part.html"] = delivery.on_page(page)
+        self._writer(folder / PART_PDF).write(contents)
         return row
 
     def _page(self, found: FollowedRecipe, row: PartRow, path: Path) -> Page:
@@ -148,7 +154,13 @@ class _Run:
         provenance = self.job.provenance(self.file.inputs, (), forced=forced)
         page = recipe_page(self.file.recipe.title, rows, provenance)
         table = part_table_bytes(rows)
-        return self.job.write({self.folder / TABLE: table, self.folder / INDEX: page})
+        return self._writer(self.folder / INDEX_PDF).write(
+            {self.folder / TABLE: table, self.folder / INDEX: page}
+        )
+
+    def _writer(self, pdf: Path) -> Job:
+        """The job, which writes its page as PDF too where the recipe wants that."""
+        return replace(self.job, pdf=pdf if self.file.has_pdf else None)
 
 
 def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summary:
@@ -176,7 +188,9 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
     _check_folder(job.output, is_overwriting=job.is_overwriting)
     file = read_recipe(recipe_path)
     hashes = [fingerprint(path).sha256 for path in file.inputs]
-    own = replace(job, is_overwriting=True)
+    if file.has_pdf:
+        require_pdf()
+    own = replace(job, is_overwriting=True, title_block=file.title_block)
     recipe_hash = " ".join((hashes[0], *hashes[2:]))
     run = _Run(own, job.output, file, (recipe_hash, hashes[1] if len(hashes) > 1 else ""))
     rows: list[PartRow] = []
@@ -198,7 +212,7 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
         tables=(parts_table(rows),),
         warnings=sentences(f"{row.name}: {note}" for row in rows for note in row.notes),
         written=written,
-        next_step=f"open {written[-1]}",
+        next_step=f"open {job.output / INDEX}",
         forced=forced,
         extra={"kind": "recipe inspection", "simulated": simulated},
     )

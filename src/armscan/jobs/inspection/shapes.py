@@ -226,11 +226,13 @@ def finished_inspection(
         )
         report = replace(report, warnings=(*report.warnings, assumed))
     written: tuple[Path, ...] = ()
+    delivery = job.delivery(cloud, inputs[0])
     if job.output is not None:
-        provenance = job.provenance(inputs, options, warnings=report.warnings, forced=cloud.forced)
+        warnings = (*delivery.warnings, *report.warnings)
+        provenance = job.provenance(inputs, options, warnings=warnings, forced=cloud.forced)
         page = inspection_page(report, provenance, is_simulated=is_simulated)
-        written = job.write({job.output: page})
-    return Summary(
+        written = job.write({job.output: delivery.on_page(page)})
+    summary = Summary(
         title=report.title + (" (simulated data)." if is_simulated else "."),
         quantities=report.quantities,
         tables=(report.brief_table,),
@@ -240,3 +242,4 @@ def finished_inspection(
         forced=cloud.forced,
         extra={"kind": "inspection", "simulated": is_simulated, "frame": cloud.frame},
     )
+    return delivery.in_summary(summary)

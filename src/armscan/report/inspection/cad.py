@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import FloatArray
@@ -36,15 +37,19 @@ from armscan.report.drawing import (
     chart_markup,
     new_figure,
     raster_markup,
+    round_below,
     scene_markup,
     styled,
 )
+from armscan.report.inspection.shapes import share_text
 from armscan.report.page import Facts, Gallery, Legend, Page, Picture, Section, Text, page_of
 from armscan.report.quantity import Quantity, Table, fact, only, significant
 
 MAX_SHOWN = 30_000
 MAX_EDGES = 6_000
 MAX_IN_SECTION = 4_000
+MOST_FACES = 12
+"""Whose distributions are drawn: two pages of paper; the tables tell of all."""
 BANDS = 8
 """Of colour: six within the tolerance, one beyond it on either side."""
 RAMP = "cividis"
@@ -109,10 +114,15 @@ def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...
         told.append(fact("Sigma of the alignment", shown, a.sigma_rule))
     if found.options.has_tolerance:
         told += _verdict_quantities(found)
-    told.append(Quantity("faces.each", "", [_face_data(one) for one in found.faces]))
+    told.append(Quantity("faces.each", "", [_face_data(found, k) for k in range(len(found.faces))]))
     return tuple(told)
 
 
+DISTRIBUTION = (
+    "Each bar counts the points whose deviation lies in its class. Of a face those points count "
+    "that are certainly its own; points beyond an edge, which may be of either face, are in the "
+    "picture of all faces alone."
+)
 URGENCY = {"fail": 0, "undecided": 1, "pass": 2}
 """Order of rows; faces not seen come last."""
 MARKS = {"fail": "! ", "undecided": "? "}
@@ -178,10 +188,12 @@ def _verdict_quantities(found: CadComparison) -> list[Quantity]:
             "points.percent_pass_undecided_fail", "Points", shares.tolist(),
             shown=f"{shares[0]:.2f} % pass, {shares[1]:.2f} % undecided, {shares[2]:.2f} % fail",
         ),
+        Quantity("points.fraction_within_tolerance", "", share_within(found)),
     ]  # fmt: skip
 
 
-def _face_data(one: FaceComparison) -> dict[str, object]:
+def _face_data(found: CadComparison, face: int) -> dict[str, object]:
+    one = found.faces[face]
     return {
         "face": one.name,
         **{key: getattr(one.statistics, key) for key in DEFINITIONS},
@@ -190,6 +202,7 @@ def _face_data(one: FaceComparison) -> dict[str, object]:
         "u_spot_mm": one.u_spot_mm,
         "spot_place_mm": one.spot_place_mm.tolist(),
         "tolerance_mm": one.tolerance_mm,
+        "fraction_within_tolerance": share_within(found, face),
         "decision": one.decision,
         "is_seen_once": one.is_seen_once,
     }
@@ -256,14 +269,16 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
 def verdict_table(found: CadComparison) -> Table:
     """A row a face, failing ones first: decision, tolerance, mean and worst spot, with U."""
     has_limit = found.options.has_tolerance
-    decided = ("decision", "tolerance") if has_limit else ()
+    decided = ("decision", "tolerance", "points within") if has_limit else ()
     heads = ("face", *decided, "points", "mean", "U of mean", "spot", "U of spot")
     rows = []
-    for one in sorted(found.faces, key=lambda face: URGENCY.get(face.decision, len(URGENCY))):
+    for k, one in _urgent(found):
         pairs = ((one.statistics.mean_mm, one.u_mean_mm), (one.spot_mm, one.u_spot_mm))
         cells = [text for value, u in pairs for text in (_length(value), _length(u, sign=""))]
         word = MARKS.get(one.decision, "") + one.decision
-        limit = (word, _length(one.tolerance_mm, sign="")) if has_limit else ()
+        share = share_within(found, k)
+        within = share_text(100.0 * share) if math.isfinite(share) else "-"
+        limit = (word, _length(one.tolerance_mm, sign=""), within) if has_limit else ()
         rows.append((one.name, *limit, f"{one.statistics.n:,}", *cells))
     title = "Decision by face, mm" if has_limit else "Faces, mm"
     return Table(heads, tuple(rows), title, (1,) if has_limit else ())
@@ -333,7 +348,8 @@ def cad_page(
                 (deviation_scene(found, part, cloud, limit),), 560))),
             Section("Face by face", (
                 Text(STATEMENT + _rule(found)), verdict_table(found), statistics_table(found))),
-            Section("Distribution", (Gallery((deviation_chart(found),)),)),
+            Section("Distribution", (Text(DISTRIBUTION), Gallery((deviation_chart(found),)))),
+            Section("Distribution by face", _face_blocks(found)),
             Section("Sections", (Text(_section_text(found, limit, part)), Gallery(
                 tuple(section_chart(found, part, axis, limit) for axis in range(3))))),
             Section("What the numbers mean", (
@@ -438,8 +454,7 @@ def deviation_scene(
     return Picture(
         scene,
         title="Cad frame",
-        caption="Dark is inside the material or too low, light is outside or too high. Drag to "
-        f"turn; click, then scroll to zoom; a click on a point tells its values.{thinned}",
+        caption=f"Dark is inside the material or too low, light is outside or too high.{thinned}",
     )
 
 
@@ -460,38 +475,112 @@ def model_edges(part: PartModel) -> FloatArray:
 def deviation_chart(found: CadComparison) -> Picture:
     """Histogram of the deviations with the tolerance, if all faces have one."""
     d = found.deviation_mm
-    limits = {one.tolerance_mm for one in found.faces if math.isfinite(one.tolerance_mm)}
+    limits = [one.tolerance_mm for one in found.faces if math.isfinite(one.tolerance_mm)]
+    return _histogram(
+        d,
+        sorted(set(limits)),
+        "all faces",
+        share=share_within(found),
+        size=(7.0, 3.4),
+        caption=f"{len(d):,} points within {found.options.reach_mm:g} mm of the model.",
+    )
+
+
+def face_charts(found: CadComparison) -> tuple[Picture, ...]:
+    """Histograms of faces: those that did not pass, then those of most points."""
+    seen = [item for item in _urgent(found) if item[1].statistics.n]
+    seen.sort(key=lambda item: (URGENCY.get(item[1].decision, 0), -item[1].statistics.n))
+    charts = []
+    for k, one in seen[:MOST_FACES]:
+        rows = np.flatnonzero((found.face == k) & ~found.is_beside_edge)
+        d, limit = found.deviation_mm[rows], one.tolerance_mm
+        has_limit = math.isfinite(limit)
+        word = f", {one.decision}" if found.options.has_tolerance else ""
+        caption = f"mean {_length(one.statistics.mean_mm)} mm, {len(d):,} points{word}."
+        charts.append(
+            _histogram(
+                d, [limit] if has_limit else [], one.name, share=share_within(found, k),
+                size=(4.2, 2.6), caption=caption,
+            )
+        )  # fmt: skip
+    return tuple(charts)
+
+
+def _face_blocks(found: CadComparison) -> tuple[Gallery | Text, ...]:
+    n = sum(one.statistics.n > 0 for one in found.faces)
+    shown = Gallery(face_charts(found), 320)
+    if n <= MOST_FACES:
+        return (shown,)
+    text = (
+        f"{MOST_FACES} of the {n} faces that were seen: those that did not pass, then the largest."
+    )
+    return (Text(text), shown)
+
+
+def _histogram(
+    d: FloatArray,
+    limits: Sequence[float],
+    name: str,
+    *,
+    share: float,
+    size: tuple[float, float],
+    caption: str,
+) -> Picture:
+    """Numbers of points by deviation, as the thesis's figures 5.12, 5.14, 5.28 and 5.41."""
     reach = max(1.15 * float(np.percentile(np.abs(d), 99.5)), *(1.3 * t for t in limits), 1e-3)
     counted = histogram(d, reach)
     with styled():
-        figure = new_figure(7.0, 3.4)
+        figure = new_figure(*size)
         axes = figure.add_subplot()
         axes.stairs(counted.counts, counted.edges_mm, fill=True, color=ACCENT)
         axes.axvline(0.0, color=INK, linewidth=0.7)
-        for limit in sorted(limits):
+        for limit in limits:
             for edge in (-limit, limit):
                 axes.axvline(edge, color=INK, linewidth=0.9, linestyle="--")
         axes.set_xlim(-reach, reach)
         axes.set_xlabel("deviation from the model, mm")
         axes.set_ylabel("points")
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
         axes.grid(axis="y")
+        if math.isfinite(share):
+            text = f"{share_text(100.0 * share)} within the limits"
+            axes.set_title(text, loc="left")
     beyond = counted.n_below + counted.n_above
     outside = f" {beyond:,} lie outside the picture." if beyond else ""
-    dashed = " Dashed: tolerances." if limits else ""
+    dashed = " Dashed: limits." if limits else ""
+    width = float(counted.edges_mm[1] - counted.edges_mm[0])
     return Picture(
-        chart_markup(figure, "Histogram of deviations"),
-        title="Deviations of all points",
-        caption=f"{len(d):,} points within {found.options.reach_mm:g} mm of the model."
-        f"{outside}{dashed}",
+        chart_markup(figure, f"Histogram of deviations: {name}"),
+        title=name,
+        caption=f"{caption} Classes of {significant(width, 'mm', 2)}.{outside}{dashed}",
     )
+
+
+def _urgent(found: CadComparison) -> list[tuple[int, FaceComparison]]:
+    """Faces with their numbers, failing ones first."""
+    each = list(enumerate(found.faces))
+    return sorted(each, key=lambda item: URGENCY.get(item[1].decision, len(URGENCY)))
+
+
+def share_within(found: CadComparison, face: int | None = None) -> float:
+    """Share of the points within their faces' tolerances; of one face of its points alone.
+
+    NaN where a point has no tolerance, or where there is none.
+    """
+    limits = np.array([one.tolerance_mm for one in found.faces])[found.face]
+    counted = np.ones(len(found), dtype=bool)
+    if face is not None:
+        counted = (found.face == face) & ~found.is_beside_edge
+    if not counted.any() or not np.isfinite(limits[counted]).all():
+        return math.nan
+    return float(np.mean(np.abs(found.deviation_mm[counted]) <= limits[counted]))
 
 
 def _magnification(found: CadComparison, limit: float, part: PartModel) -> float:
     """How much deviations are enlarged in sections: a round number."""
     largest = max(limit, float(np.percentile(np.abs(found.deviation_mm), 99.0)))
-    wanted = DRAWN_SHARE * part.diagonal_mm / largest
-    power = 10.0 ** math.floor(math.log10(max(wanted, 1.0)))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= max(wanted, 1.0))
+    return round_below(max(DRAWN_SHARE * part.diagonal_mm / largest, 1.0))
 
 
 def _section_text(found: CadComparison, limit: float, part: PartModel) -> str:

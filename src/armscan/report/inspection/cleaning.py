@@ -89,9 +89,7 @@ def _view(found: Cleaning, points_mm: FloatArray, colours: list[str]) -> Picture
             name = "left" if k < 0 else found.steps[k].name
             thinned.append(f"one point in {step} of '{name}'")
         dots.append(_dots(points_mm, rows[::step], LEFT_COLOUR if k < 0 else colours[k]))
-    caption = "Drag to turn; click, then scroll to zoom."
-    if thinned:
-        caption = f"Shown is {', '.join(thinned)}. {caption}"
+    caption = f"Shown is {', '.join(thinned)}." if thinned else ""
     title = "Points by the filter that took them"
     scene = scene_markup(dots, [], [], title, is_z_up=found.cloud.frame != "Sensor")
     return Picture(scene, caption, f"{title} ({found.cloud.frame} frame)")

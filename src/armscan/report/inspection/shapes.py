@@ -627,5 +627,5 @@ def deviation_view(
         ramp_markup(f"−{text}", f"+{text}", RAMP) + scene,
         title=f"{title} ({frame} frame)",
         caption=f"Colour is the deviation from {reference}; points beyond the ramp have its end's "
-        f"colour. Drag to turn; click, then scroll to zoom.{every}",
+        f"colour.{every}",
     )

@@ -40,7 +40,9 @@ function drawScenes() {
       const ratio = window.devicePixelRatio || 1;
       const width = (canvas.width = Math.round(canvas.clientWidth * ratio));
       const height = (canvas.height = Math.round(canvas.clientHeight * ratio));
-      const context = canvas.getContext("2d");
+      // not laid out yet, or in a part that is folded
+      if (!width || !height) return;
+      const context = canvas.getContext("2d", { willReadFrequently: true });
       const turn = turned();
       reach = reach || reachOf(turn);
       const scale = zoom * 0.44 * Math.min(width / reach[0], height / reach[1]);

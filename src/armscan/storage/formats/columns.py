@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.records.cloud import CloudFrame, PointCloud
+from armscan.records.cloud import CalibrationMark, CloudFrame, PointCloud
 from armscan.storage.files import path_text, told_of
 from armscan.storage.tables import refuse_beyond_reach
 
@@ -44,11 +44,14 @@ SIMULATED = "simulated"
 """Note of a cloud that was measured on rendered images."""
 FORCED = "forced"
 """Note with a reason for which the cloud's calibration was refused, and used all the same."""
+CALIBRATION = "calibration"
+"""Note of the calibration that points were measured with: its document's id and its time."""
 SEEN_FROM = "seen_from_mm"
 """Note of where the sensor stood at an exposure."""
 FOREIGN_FRAME: CloudFrame = "Part"
 """Frame of points about which a file says nothing."""
 
+TINY = float(np.finfo(np.float64).tiny)
 DAMAGED = "copy the file again; it may be cut or damaged"
 MOST_HEADER_BYTES = 512 * 2**20
 """Of a PLY or PCD file: two notes for each of four million exposures."""
@@ -147,6 +150,10 @@ def cloud_notes(cloud: PointCloud) -> tuple[str, ...]:
         (FORCED, cloud.forced),
     ):
         notes += [f"{word} {k} {json.dumps(name)}" for k, name in enumerate(names)]
+    notes += [
+        f"{CALIBRATION} {k} {json.dumps([mark.document_id, mark.created_utc])}"
+        for k, mark in enumerate(cloud.calibrations)
+    ]
     if cloud.seen_from_mm is not None:
         places = cloud.seen_from_mm.tolist()
         notes += [f"{SEEN_FROM} {k} {json.dumps(place)}" for k, place in enumerate(places)]
@@ -239,6 +246,7 @@ def cloud_of_columns(found: CloudColumns, path: Path) -> PointCloud:
             normals=_unit(found.columns),
             is_simulated=SIMULATED in found.notes,
             forced=_names(found.notes, FORCED),
+            calibrations=_calibrations(found.notes),
         )
 
 
@@ -282,6 +290,7 @@ def own_cloud(found: CloudColumns, where: str) -> PointCloud:
             seen_from_mm=named.places_mm,
             is_simulated=named.is_simulated,
             forced=named.forced,
+            calibrations=named.calibrations,
         )
 
 
@@ -318,6 +327,8 @@ def _unit(columns: Mapping[str, Column]) -> FloatArray | None:
     if not set(NORMAL) <= set(columns):
         return None
     normals = _finite(_joined(columns, NORMAL))
+    # damaged numbers may be so large that their squares are none
+    normals /= np.maximum(np.abs(normals).max(axis=1, initial=0.0, keepdims=True), TINY)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.asarray(normals / np.where(length > 0.0, length, 1.0))
 
@@ -332,6 +343,7 @@ class _Named:
     places_mm: FloatArray | None
     is_simulated: bool
     forced: tuple[str, ...]
+    calibrations: tuple[CalibrationMark, ...]
 
 
 @lru_cache(maxsize=1)
@@ -350,7 +362,8 @@ def _named(notes: tuple[str, ...]) -> _Named:
     if places is not None:
         places.setflags(write=False)
     sheets, exposures, forced = (_names(notes, word) for word in ("sheet", "exposure", FORCED))
-    return _Named(frame, sheets, exposures, places, SIMULATED in notes, forced)
+    simulated = SIMULATED in notes
+    return _Named(frame, sheets, exposures, places, simulated, forced, _calibrations(notes))
 
 
 def _frame(notes: Sequence[str]) -> CloudFrame | None:
@@ -369,6 +382,18 @@ def _places(notes: Sequence[str]) -> FloatArray | None:
         return np.array([json.loads(text) for text in texts], dtype=np.float64)
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"the header's places of the sensor ({SEEN_FROM}) are damaged") from error
+
+
+def _calibrations(notes: Sequence[str]) -> tuple[CalibrationMark, ...]:
+    found = []
+    for text in notes:
+        if text.startswith(f"{CALIBRATION} "):
+            try:
+                document_id, created_utc = json.loads(text.split(" ", 2)[2])
+            except (IndexError, TypeError, ValueError, RecursionError) as error:
+                raise InputError(f"the header's comment {text!r} is damaged") from error
+            found.append(CalibrationMark(str(document_id), str(created_utc)))
+    return tuple(found)
 
 
 def _names(notes: Sequence[str], word: str) -> tuple[str, ...]:

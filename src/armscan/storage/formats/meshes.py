@@ -30,6 +30,7 @@ OBJ_LOSES = (
     "sheet, exposure and segment",
     "intensity",
     "where the sensor stood",
+    "which calibration",
     "n_points of a fused cloud",
     "digits beyond 0.1 nm",
 )

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recipes of an inspection (TOML), what one found on a part (JSON), and the table of parts."""
+"""Recipes of an inspection and title blocks (TOML), what one found on a part (JSON), and the table
+of parts.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,6 +34,7 @@ from armscan.inspection.recipe import (
     RelationMeasure,
 )
 from armscan.inspection.search import WantedFeature
+from armscan.inspection.title_block import TITLE_LABELS, TitleBlock
 from armscan.records.cloud import CloudFrame
 from armscan.storage.codec import (
     FieldCodec,
@@ -41,6 +44,11 @@ from armscan.storage.codec import (
     json_bytes,
     parse_json,
     parse_toml,
+)
+from armscan.storage.documents import (
+    is_scanner_document,
+    read_scanner_calibration,
+    read_sensor_calibration,
 )
 from armscan.storage.files import is_file, path_text, read_bytes
 from armscan.storage.parts.datums import (
@@ -86,6 +94,12 @@ def _read_box(content: Any, key: str) -> Box:
 
 def _same(value: Any) -> Any:
     return value
+
+
+def _same_table(content: Any, key: str) -> dict[str, Any]:
+    if not isinstance(content, dict):
+        raise MismatchError(key, "is no table of names and texts")
+    return content
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +160,8 @@ class _RecipeKeys:
     reach_mm: float | None = None
     faces: Mapping[str, float] | None = None
     clean: CleaningOptions | None = None
+    title_block: Mapping[str, Any] | None = None
+    pdf: bool = False
     feature: tuple[_FeatureKeys, ...] = ()
     relation: tuple[_RelationKeys, ...] = ()
     step: tuple[_StepKeys, ...] = ()
@@ -154,7 +170,10 @@ class _RecipeKeys:
 BOX = FieldCodec(_same, _read_box)
 LAYOUTS: Mapping[type, Layout] = {
     _RecipeKeys: Layout(
-        codecs={"faces": FieldCodec(_same, _read_faces)},
+        codecs={
+            "faces": FieldCodec(_same, _read_faces),
+            "title_block": FieldCodec(_same, _same_table),
+        },
         limits={
             "tolerance_mm": POSITIVE_MM, "uncertainty_mm": POSITIVE_MM, "reach_mm": POSITIVE_MM,
         },
@@ -195,6 +214,10 @@ class RecipeFile:
         The model; None without one.
     inputs
         The recipe's file, the model's, and that of reference points.
+    title_block
+        At the head of every page.
+    has_pdf
+        Whether every part's page is written as PDF too.
     measured_beside
         True if the places of reference points or markers were measured on each part: in a table
         beside its cloud, ``NAME.points.csv`` or ``NAME.markers.csv``.
@@ -203,6 +226,8 @@ class RecipeFile:
     recipe: Recipe
     part: PartModel | None
     inputs: tuple[Path, ...]
+    title_block: TitleBlock = field(default_factory=TitleBlock)
+    has_pdf: bool = False
     measured_beside: bool = False
 
     def measured_of(self, cloud: Path) -> Path | None:
@@ -270,8 +295,10 @@ def read_recipe(path: Path) -> RecipeFile:
             for one in keys.step
         ),
     )
+    place = f"{where}: 'title_block'"
+    block = title_block_of(keys.title_block or {}, place, path.parent)
     if keys.part is None:
-        return RecipeFile(recipe, None, (path,))
+        return RecipeFile(recipe, None, (path,), block, keys.pdf)
     part_path = path.parent / keys.part
     if not is_file(part_path):
         raise FileFormatError(
@@ -290,7 +317,8 @@ def read_recipe(path: Path) -> RecipeFile:
         options=_options(keys, part, where),
     )
     inputs = (path, part_path) if points is None else (path, part_path, points)
-    return RecipeFile(recipe, part, inputs, points is not None and not in_one_table)
+    measured_beside = points is not None and not in_one_table
+    return RecipeFile(recipe, part, inputs, block, keys.pdf, measured_beside)
 
 
 def _holds_measured(path: Path) -> bool:
@@ -443,6 +471,94 @@ def _options(keys: _RecipeKeys, part: PartModel, where: str) -> CadOptions:
     }
     known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     return CadOptions(face_tolerances_mm=faces, **known)
+
+
+SCANNER, VALID_DAYS = "scanner", "calibration_valid_days"
+TITLE_KEYS = (*TITLE_LABELS, SCANNER, VALID_DAYS)
+LONGEST_TEXT = 200
+"""Characters of one entry of a title block: more would push the results off the first page."""
+
+
+def read_title_block(words: Sequence[str], where: str) -> TitleBlock:
+    """The title block of ``KEY=TEXT`` words and TOML files of such keys; the later one holds.
+
+    Raises
+    ------
+    OptionError, FileFormatError
+        If a key is not known, a value is none, or a file is not understood.
+    """
+    entries: dict[str, Any] = {}
+    folder = Path()
+    for word in words:
+        key, is_pair, text = word.partition("=")
+        if is_pair and not is_file(Path(word)):
+            entries[key.strip()] = text.strip()
+            folder = Path() if key.strip() == SCANNER else folder
+        elif word.endswith(".toml"):
+            found = parse_toml(read_bytes(Path(word)), word, 'write lines as operator = "A. Ray"')
+            entries |= found
+            folder = Path(word).parent if SCANNER in found else folder
+        else:
+            raise OptionError(
+                f"'{word}' is no KEY=TEXT and no .toml file",
+                where=where,
+                remedy=f"write as serial=0012; keys are {', '.join(TITLE_KEYS)}",
+            )
+    return title_block_of(entries, where, folder)
+
+
+def title_block_of(entries: Mapping[str, Any], where: str, folder: Path) -> TitleBlock:
+    """The title block of keys and values; a scanner's document is named relative to ``folder``.
+
+    Raises
+    ------
+    OptionError, FileFormatError
+        If a key is not known, a value is none, or the scanner's document is not understood.
+    """
+    odd = [key for key in entries if key not in TITLE_KEYS]
+    if odd:
+        raise OptionError(
+            f"a title block has no '{odd[0]}'",
+            where=where,
+            remedy=f"give one of {', '.join(TITLE_KEYS)}",
+        )
+    texts: dict[str, Any] = {
+        key: _title_text(entries[key], key, where) for key in TITLE_LABELS if key in entries
+    }
+    days = _valid_days(entries[VALID_DAYS], where) if VALID_DAYS in entries else math.nan
+    block = replace(TitleBlock(calibration_valid_days=days), **texts)
+    name = str(entries.get(SCANNER, ""))
+    if not name:
+        return block
+    path = folder / name
+    is_scanner = is_scanner_document(path)
+    provenance = (
+        read_scanner_calibration(path) if is_scanner else read_sensor_calibration(path)
+    ).provenance
+    return replace(block, scanner=provenance.mark, scanner_name=path.name)
+
+
+def _title_text(value: Any, key: str, where: str) -> str:
+    text = str(value).strip()
+    if isinstance(value, dict | list) or not text.isprintable() or len(text) > LONGEST_TEXT:
+        raise OptionError(
+            f"'{key}' is no line of at most {LONGEST_TEXT} characters",
+            where=where,
+            remedy="shorten it, without line breaks",
+        )
+    return text
+
+
+def _valid_days(value: Any, where: str) -> float:
+    try:
+        days = float(value)
+    except (TypeError, ValueError):
+        days = math.nan
+    if not 0.0 < days < math.inf:
+        raise OptionError(
+            f"'{VALID_DAYS}' is '{value}'", where=where, remedy="give a number of days above 0"
+        )
+    return days
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages of an inspection in a browser at two widths and on paper: nothing overlaps, is cut or asked
+for from elsewhere. ``benchmarks/pages.py`` looks at the pages of any folder in the same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from armscan.cli import main
+from armscan.records.cloud import CalibrationMark
+from armscan.storage.clouds import ply_bytes
+from rigs.inspection_clouds import RADIUS_MM, ball_stripes, cloud_of
+from rigs.page_check import CHROMIUM, DRIVER, browser, page_faults
+from rigs.parts import wedge_part
+
+pytest.importorskip("selenium", reason="selenium is not installed")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None or DRIVER is None, reason="no Chromium with its driver is found"
+)
+LONG = "a-name-that-is-as-long-as-the-longest-that-a-title-block-takes-" * 3
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Pages of a comparison with long names, of a recipe over two parts, and of a ball."""
+    folder = tmp_path_factory.mktemp("pages")
+    part = wedge_part()
+    mesh = trimesh.Trimesh(part.vertices_mm, part.triangles, process=False)
+    (folder / "part.stl").write_bytes(mesh.export(file_type="stl"))
+    points, triangle = part.surface_points(4000)
+    normals = part.normals[triangle]
+    random = np.random.default_rng(0)
+    cloud = cloud_of(points, random.integers(0, 20, 4000), sigma_mm=0.003, normals=normals)
+    old = CalibrationMark("old", "2020-01-01T00:00:00+00:00")
+    (folder / "scans").mkdir()
+    for name in ("scans/a.ply", f"scans/{LONG[:80]}.ply"):
+        (folder / name).write_bytes(ply_bytes(replace(cloud, calibrations=(old,))))
+    ball = RADIUS_MM * ball_stripes(40, 40)
+    (folder / "ball.ply").write_bytes(ply_bytes(cloud_of(ball, np.repeat(np.arange(40), 40))))
+    (folder / "recipe.toml").write_text(
+        'part = "part.stl"\nalign = "none"\ntolerance_mm = 0.05\n'
+        f'[title_block]\ncustomer = "{LONG}"\n'
+    )
+    told = ["--title-block", f"part={LONG}", "--title-block", "calibration_valid_days=9"]
+    made = [
+        ["cad", "scans/a.ply", "part.stl", "--align", "none", "-o", "cad.html", *told],
+        ["sphere", "ball.ply", "--diameter", "34.96", "-o", "ball.html", *told],
+        ["recipe", "recipe.toml", "scans", "-o", "results"],
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for words in made:
+            assert main(["inspect", *words]) in (0, 1)
+    return folder
+
+
+def test_pages_are_whole_on_the_screen_and_on_paper(pages: Path, tmp_path: Path) -> None:
+    found = sorted(pages.rglob("*.html"))
+    assert len(found) == 5
+    with browser(tmp_path) as driver:
+        faults = {page.name: page_faults(driver, page) for page in found}
+    assert not any(faults.values()), faults
+
+
+def test_faults_are_found(tmp_path: Path) -> None:
+    page = tmp_path / "bad.html"
+    page.write_text(
+        '<!doctype html><div style="width: 3000px; text-align: right">far</div>'
+        '<p style="position: absolute; top: 90px">one text</p>'
+        '<p style="position: absolute; top: 92px">other text</p>'
+        '<p style="position: absolute; top: 200px; width: 40px; overflow: hidden; '
+        'white-space: nowrap">much too long</p><img alt="gone" src="http://127.0.0.1:9/x.png">'
+    )
+    with browser(tmp_path / "browser") as driver:
+        text = "\n".join(page_faults(driver, page))
+    for word in ("px wide", "beyond the edge", "text on text", "cut: P", "asks for http"):
+        assert word in text

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A live scan of rendered images: recorded, measured and shown; what is lost, late and used.
 
-Command: ``python benchmarks/live.py [--cameras 1|2] [--rate 80] [--seconds 60] [--record-only]``.
+Command: ``python benchmarks/live.py [--cameras 1|2] [--rate 80] [--seconds 60] [--record-only]
+[--compression auto|raw|zstd] [--folder /dev/shm]``, and with ``--budget --rate 4`` the processor
+time of each part an exposure: recorded as it is, recorded packed, recorded and measured.
 
 A process of its own holds rendered images of a plate in memory (2658x800; the thesis's head of one
 line, or of eleven lines before two cameras). At each trigger it copies one a camera into a ring of
@@ -36,18 +38,20 @@ from armscan.devices.registry import open_device
 from armscan.drivers.arm_stream import encode_sample
 from armscan.geometry.arrays import ImageArray
 from armscan.geometry.poses import Base, Pose, Tool
+from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.live.recorder import LiveRecorder
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.live.session import LiveSession
+from armscan.pipeline.measure import reconstruct
 from armscan.pipeline.simulate import TwinName
 from armscan.records.cloud import PointCloud
-from armscan.records.exposure import SensorWindow
+from armscan.records.exposure import Exposure, SensorWindow
 from armscan.records.recording import CameraSetup
 from armscan.storage.recordings.write_mcap import WriterOptions
 from rigs.true_scanner import true_scanner
 
 HEADS = {1: "thesis-single", 2: "thesis-multi"}
-N_IMAGES = 16
+N_IMAGES = 8
 SLOTS = 24
 WINDOW = SensorWindow(207, 624)
 """Where the scanning window of the twin's heads lies."""
@@ -203,6 +207,15 @@ def rendered(head: str, folder: Path) -> tuple[str, tuple[int, ...]]:
     return str(folder / "images.npz"), images.shape
 
 
+def warm_up(scanner: ScannerCalibration, place: str) -> None:
+    """Load what is compiled, which takes a second or two once a process."""
+    if scanner.sensor is None:
+        raise ValueError("a scanner without camera")
+    with np.load(place) as found:
+        pair = [Exposure(image, "first", window=WINDOW) for image in found["images"][0]]
+    reconstruct(pair[:1], scanner.sensor, rights=pair[1:])
+
+
 def words(label: str, values: Sequence[float], unit: str) -> str:
     if not values:
         return f"{label}: none"
@@ -210,13 +223,13 @@ def words(label: str, values: Sequence[float], unit: str) -> str:
     return f"{label}: median {median:.0f}, 95 % {most:.0f} {unit}"
 
 
-def run(given: argparse.Namespace, folder: Path) -> None:
+def run(given: argparse.Namespace, folder: Path, place: str, shape: tuple[int, ...]) -> None:
     """One scan, and what came of it."""
     n_cameras, seconds = given.cameras, given.seconds
     scanner = None
     if not given.record_only:
         scanner = true_scanner(TwinName(HEADS[n_cameras], "thesis", 1).build())
-    place, shape = rendered(HEADS[n_cameras], folder)
+        warm_up(scanner, place)
     ring = SharedMemory(create=True, size=SLOTS * int(np.prod(shape[1:])))
     slots: Any = np.ndarray((SLOTS, *shape[1:]), np.uint8, buffer=ring.buf)
     ends = [multiprocessing.Pipe() for _ in range(n_cameras)]
@@ -255,18 +268,21 @@ def run(given: argparse.Namespace, folder: Path) -> None:
     live = {one.value: n for one, n in snapshot.counts.items()}
     print(
         f"{n_cameras} cameras, {given.rate:g}/s, {seconds:g} s, {os.cpu_count()} cores, "
-        f"load before {load:.1f}, {given.compression}\n"
+        f"load before {load:.1f}, {given.compression}, "
+        f"{'recorded only' if scanner is None else 'recorded and measured'}\n"
         f"triggers {n_sent}; exposures recorded {end.n_written} of {n_sent * n_cameras}, lost "
         f"{sum(one.n_missing for one in counts[:n_cameras])}, aside {recorder.n_aside}\n"
         f"live: {live}, {snapshot.n_points} points; streams {snapshot.streams}\n"
         f"poses: {dict(recorder.poses)}\n"
         f"{words('exposure to screen', screen.latencies_ms, 'ms')}\n"
-        f"source process {100 * source_share:.0f} %, this process {100 * cpu:.0f} % of a core\n"
+        f"source process {100 * source_share:.0f} %, this process {100 * cpu:.0f} % of a core, "
+        f"{1e3 * cpu * taken_s / max(n_sent * n_cameras, 1):.1f} ms an exposure\n"
         f"disk {end.n_bytes / 1e6 / taken_s:.0f} MB/s "
         f"(pixels {n_sent * np.prod(shape[1:]) / 1e6 / taken_s:.0f} MB/s); "
         f"the recorder waited {end.n_waits} times; whole after {taken_s:.1f} s"
     )
     del slots
+    path.unlink()
     for camera in cameras:
         camera.let_go()
     ring.close()
@@ -280,9 +296,17 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--record-only", action="store_true")
     parser.add_argument("--compression", default="auto", choices=("auto", "raw", "zstd"))
+    parser.add_argument("--budget", action="store_true", help="what each part takes, one by one")
+    parser.add_argument("--folder", default=None, help="where the recording is made and removed")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="armscan-live-") as folder:
-        run(given, Path(folder))
+    with tempfile.TemporaryDirectory(prefix="armscan-live-", dir=given.folder) as folder:
+        place, shape = rendered(HEADS[given.cameras], Path(folder))
+        if not given.budget:
+            run(given, Path(folder), place, shape)
+            return
+        for compression, record_only in (("raw", True), ("zstd", True), ("raw", False)):
+            given.compression, given.record_only = compression, record_only
+            run(given, Path(folder), place, shape)
 
 
 if __name__ == "__main__":

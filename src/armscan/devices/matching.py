@@ -30,6 +30,8 @@ TRACK_NS = 10_000_000_000
 """Samples of the arm are kept so long."""
 USUAL_STEPS = 256
 """The arm's usual step is the median of its last ones."""
+REMEMBERED_TRIGGERS = 4096
+"""Frames may lie behind by so many triggers, where a disk keeps the recording waiting."""
 LASER_BOUND_NS = 50_000_000
 """Without trigger ids a frame may be so much later than its laser event: transport delays differ.
 Its lasers are known only if all events that near agree."""
@@ -37,7 +39,7 @@ SAME_TRIGGER_NS = 100_000_000
 """What bears one trigger id was taken within this, by clocks that are known: another count, before
 a device began to count anew, has the same ids."""
 ARRIVED_TOGETHER_NS = 250_000_000
-"""And arrived within this, while a clock is not known."""
+"""And arrived within this, while nothing else is known of their clocks."""
 SAME_INSTANT = 0.25
 """Frames of two cameras without ids are of one instant within this part of the usual step."""
 
@@ -108,17 +110,12 @@ class _Open:
 
 @dataclass(frozen=True, slots=True)
 class _Told(Generic[T]):
-    """What was told of a trigger, and when it was taken and arrived."""
+    """What was told of a trigger, and when: by the common clock, the device's, and on arrival."""
 
     value: T
     t_ns: int | None
+    t_device_ns: int
     t_host_ns: int
-
-    def is_of(self, t_ns: int | None, t_host_ns: int) -> bool:
-        """Whether it was taken together with something else of the same id."""
-        if t_ns is not None and self.t_ns is not None:
-            return abs(t_ns - self.t_ns) <= SAME_TRIGGER_NS
-        return abs(t_host_ns - self.t_host_ns) <= ARRIVED_TOGETHER_NS
 
 
 class InstantMatcher:
@@ -167,6 +164,7 @@ class InstantMatcher:
         self._steps: deque[int] = deque(maxlen=USUAL_STEPS)
         self._pose_of: dict[int, _Told[Pose[Base, Tool] | None]] = {}
         self._lasers_of: dict[int, _Told[tuple[str, ...]]] = {}
+        self._apart_ns: dict[tuple[int, int], int] = {}
         self._events: deque[tuple[int, tuple[str, ...]]] = deque(maxlen=USUAL_STEPS)
         self._frame_step_ns = 0.0
         self._last_ns: list[int | None] = [None] * n_cameras
@@ -179,10 +177,12 @@ class InstantMatcher:
         """Take laser events in the order of arrival."""
         for event in events:
             times = (event.t_device_ns, event.t_host_ns)
-            if self.controller.check(event.trigger_id, *times) in _SEEN_BEFORE:
+            status = self.controller.check(event.trigger_id, *times)
+            if status in _SEEN_BEFORE:
                 continue
+            self._forget_apart(status)
             t_ns = _common_ns(self.controller, event.t_device_ns)
-            _remember(self._lasers_of, event.trigger_id, _Told(event.lasers, t_ns, event.t_host_ns))
+            _remember(self._lasers_of, event.trigger_id, _Told(event.lasers, t_ns, *times))
             if t_ns is not None:
                 self._events.append((t_ns, event.lasers))
 
@@ -196,6 +196,7 @@ class InstantMatcher:
         status = monitor.check(frame.number, frame.t_device_ns, frame.t_host_ns)
         if status in _SEEN_BEFORE:
             return status
+        self._forget_apart(status)
         t_ns = _common_ns(monitor, frame.t_device_ns) if status == ElementStatus.USABLE else None
         self._learn_step(camera, t_ns)
         partner = self._partner(frame, camera, t_ns)
@@ -244,11 +245,13 @@ class InstantMatcher:
         pose = self._valid_pose(sample)
         if status in _SEEN_BEFORE:
             return TimedSample(sample, None, status, pose)
+        self._forget_apart(status)
         t_ns = None
         if status == ElementStatus.USABLE:
             t_ns = _common_ns(self.arm, sample.t_device_ns)
         if sample.trigger_id is not None:
-            _remember(self._pose_of, sample.trigger_id, _Told(pose, t_ns, sample.t_host_ns))
+            times = sample.t_device_ns, sample.t_host_ns
+            _remember(self._pose_of, sample.trigger_id, _Told(pose, t_ns, *times))
         if t_ns is None or (self._times and t_ns <= self._times[-1]):
             return TimedSample(sample, None, status, pose)
         if self._times:
@@ -281,9 +284,9 @@ class InstantMatcher:
             if one.frames[camera] is not None:
                 continue
             if frame.trigger_id is not None and one.trigger_id is not None:
-                told = _Told(None, t_ns, frame.t_host_ns)
                 is_same = frame.trigger_id == one.trigger_id
-                is_same = is_same and told.is_of(one.t_ns, one.newest_host_ns)
+                if t_ns is not None and one.t_ns is not None:
+                    is_same = is_same and abs(t_ns - one.t_ns) <= SAME_TRIGGER_NS
             elif t_ns is not None and one.t_ns is not None:
                 is_same = abs(t_ns - one.t_ns) <= SAME_INSTANT * self._frame_step_ns
             else:
@@ -298,11 +301,47 @@ class InstantMatcher:
             return False
         return self._has_lasers(one) and self._has_track(one)
 
+    def _told(self, of_trigger: dict[int, _Told[T]], one: _Open) -> _Told[T] | None:
+        """What was told of an instant's trigger; None for what bears its id from another count.
+
+        By the common clock where it is known; else by how far the two devices' clocks were apart
+        at the trigger before; else by arrival.
+        """
+        found = None if one.trigger_id is None else of_trigger.get(one.trigger_id)
+        if found is None:
+            return None
+        camera, frame = next((k, f) for k, f in enumerate(one.frames) if f is not None)
+        pair, apart_ns = (id(of_trigger), camera), frame.t_device_ns - found.t_device_ns
+        if one.t_ns is not None and found.t_ns is not None:
+            is_same = abs(one.t_ns - found.t_ns) <= SAME_TRIGGER_NS
+        elif pair in self._apart_ns:
+            is_same = abs(apart_ns - self._apart_ns[pair]) <= SAME_TRIGGER_NS
+        else:
+            is_same = abs(one.newest_host_ns - found.t_host_ns) <= ARRIVED_TOGETHER_NS
+        if is_same:
+            self._apart_ns[pair] = apart_ns
+        return found if is_same else None
+
+    def _is_told(self, of_trigger: dict[int, _Told[T]], one: _Open) -> bool:
+        """Whether an instant's trigger, or one after it, was told of: nothing more is to come."""
+        if self._told(of_trigger, one) is not None:
+            return True
+        if not of_trigger or one.trigger_id is None:
+            return False
+        last = next(reversed(of_trigger))
+        # what arrived long before belongs to another count
+        is_current = of_trigger[last].t_host_ns >= one.newest_host_ns - PATIENCE_NS
+        return last > one.trigger_id and is_current
+
+    def _forget_apart(self, status: ElementStatus) -> None:
+        if status == ElementStatus.JUMP:
+            self._apart_ns.clear()
+
     def _has_lasers(self, one: _Open) -> bool:
         if not self._has_controller:
             return True
         if one.trigger_id is not None:
-            return _is_told(self._lasers_of, one)
+            return self._is_told(self._lasers_of, one)
         if one.t_ns is None:
             return True
         return bool(self._events) and self._events[-1][0] > one.t_ns + LASER_BOUND_NS
@@ -311,7 +350,7 @@ class InstantMatcher:
         if not self._has_arm:
             return True
         if self._is_triggered:
-            return one.trigger_id is None or _is_told(self._pose_of, one)
+            return one.trigger_id is None or self._is_told(self._pose_of, one)
         if one.t_ns is None:
             return True
         return bool(self._times) and self._times[-1] >= one.t_ns + self.latency_ns
@@ -321,7 +360,7 @@ class InstantMatcher:
         if len(told) == 1:
             return told.pop()
         if one.trigger_id is not None and self._has_controller:
-            switched = _told(self._lasers_of, one)
+            switched = self._told(self._lasers_of, one)
             return None if switched is None else switched.value
         if one.t_ns is None:
             return None
@@ -332,7 +371,7 @@ class InstantMatcher:
         if self._is_triggered:
             if one.trigger_id is None:
                 return None, PoseStatus.NO_TRIGGER
-            latched = _told(self._pose_of, one)
+            latched = self._told(self._pose_of, one)
             if latched is None:
                 return None, PoseStatus.UNKNOWN_TRIGGER
             pose = latched.value
@@ -376,28 +415,10 @@ def _common_ns(monitor: StreamMonitor, t_device_ns: int) -> int | None:
     return monitor.clock.to_other_ns(t_device_ns)
 
 
-def _told(of_trigger: dict[int, _Told[T]], one: _Open) -> _Told[T] | None:
-    """What was told of an instant's trigger; None for what bears its id from another count."""
-    found = None if one.trigger_id is None else of_trigger.get(one.trigger_id)
-    return found if found is not None and found.is_of(one.t_ns, one.newest_host_ns) else None
-
-
-def _is_told(of_trigger: dict[int, _Told[T]], one: _Open) -> bool:
-    """Whether an instant's trigger, or one after it, was told of: nothing more is to come."""
-    if _told(of_trigger, one) is not None:
-        return True
-    if not of_trigger or one.trigger_id is None:
-        return False
-    last = next(reversed(of_trigger))
-    # what arrived long before belongs to another count
-    is_current = of_trigger[last].t_host_ns >= one.newest_host_ns - PATIENCE_NS
-    return last > one.trigger_id and is_current
-
-
 def _remember(of_trigger: dict[int, _Told[T]], trigger_id: int, value: _Told[T]) -> None:
     """Keep the last triggers only; a count that began anew forgets the old ones."""
     if of_trigger and trigger_id < next(reversed(of_trigger)):
         of_trigger.clear()
     of_trigger[trigger_id] = value
-    if len(of_trigger) > USUAL_STEPS:
+    if len(of_trigger) > REMEMBERED_TRIGGERS:
         del of_trigger[next(iter(of_trigger))]

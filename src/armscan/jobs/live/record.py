@@ -260,7 +260,12 @@ class _Recording:
         warnings = [f"{n} instants: {what}" for what, n in others.items()]
         if self._n_faults:
             warnings.insert(0, f"devices failed {self._n_faults} times; the recording says when")
-        next_step = f"armscan convert {self._output} {self._output.with_suffix('')}"
+        cloud = self._output.with_suffix(".ply")
+        next_step = (
+            f"armscan info {self._output}"
+            if scanner is None
+            else f"armscan reconstruct {self._output} --scanner {scanner} -o {cloud}"
+        )
         return Summary(
             title="Recorded.",
             quantities=tuple(quantities),

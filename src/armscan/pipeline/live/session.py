@@ -581,14 +581,15 @@ class LiveSession:
                         self._place(one, self._now, transform)
                 return
             except ArmscanError as error:
-                self._fail(str(error))
+                self._fail(error.what, str(error))
             except Exception as error:  # the thread must live: others wait for it
-                self._fail(f"an image could not be measured: {type(error).__name__}: {error}")
+                text = f"an image could not be measured: {type(error).__name__}: {error}"
+                self._fail(text, text)
 
-    def _fail(self, text: str) -> None:
-        """Count one instant and tell; the same words once, until something else happens."""
+    def _fail(self, fact: str, text: str) -> None:
+        """Count one instant and tell; the same fact once, until an instant is placed."""
         self._count(LiveStatus.FAILED)
-        is_new, self._told = text != self._told, text
+        is_new, self._told = fact != self._told, fact
         if is_new:
             self._tell(LiveEvent("warning", text))
 

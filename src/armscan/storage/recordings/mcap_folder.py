@@ -463,6 +463,10 @@ class McapFolder:
         """All files, as paths with ``/``."""
         return (*self._files, *self._images)
 
+    def __contains__(self, name: str) -> bool:
+        """True if there is a file of that name."""
+        return name in self._files or name in self._images
+
     def read(self, name: str) -> bytes:
         """Content of a file.
 

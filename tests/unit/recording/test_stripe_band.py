@@ -41,7 +41,7 @@ def test_wide_lines_have_a_wide_band() -> None:
     rng = np.random.default_rng(3)
     y, x = np.mgrid[:800, : SIZE[1]].astype(float)
     # so wide that its sides, where the background is told, lie beyond 40 px
-    light = 120 * np.exp(-0.5 * ((y - 200 - 0.7 * x + 60 * np.sin(x / 200)) / 12.0) ** 2)
+    light = 120 * np.exp(-0.5 * ((y - 200 - 0.7 * x + 60 * np.sin(x / 200)) / 22.0) ** 2)
     image = np.clip(light + 30 + 0.03 * y + rng.normal(0, 2, y.shape), 0, 255)
     whole = Exposure(image.astype(np.uint8), "wide")
     keep = near_lines(whole.image.astype(np.float32))

@@ -11,10 +11,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 from uuid import uuid4
 
 from armscan.errors import FileFormatError, InputError, OutputError
+
+if TYPE_CHECKING:
+    from armscan.storage.recordings.mcap_folder import McapFolder
 
 try:
     import fcntl
@@ -76,7 +79,7 @@ def is_file(path: Path) -> bool:
     try:
         packed = packed_place(path)
         if packed is not None and packed[1]:
-            return packed[1] in _packed_names(packed[0])
+            return packed[1] in _packed_folder(packed[0])
         return path.is_file()
     except (OSError, ValueError, FileFormatError):
         return False
@@ -103,15 +106,17 @@ def files_in(path: Path) -> tuple[Path, ...]:
         return tuple(path.iterdir())
     start = f"{packed[1]}/" if packed[1] else ""
     names = (
-        name.removeprefix(start) for name in _packed_names(packed[0]) if name.startswith(start)
+        name.removeprefix(start)
+        for name in _packed_folder(packed[0]).names
+        if name.startswith(start)
     )
     return tuple(path / name for name in names if "/" not in name)
 
 
-def _packed_names(path: Path) -> tuple[str, ...]:
+def _packed_folder(path: Path) -> McapFolder:
     from armscan.storage.recordings.mcap_folder import folder_in  # it reads files itself
 
-    return folder_in(path).names
+    return folder_in(path)
 
 
 def is_folder(path: Path) -> bool:
@@ -133,9 +138,7 @@ def read_bytes(path: Path) -> bytes:
     where = path_text(path)
     packed = packed_place(path)
     if packed is not None and packed[1]:
-        from armscan.storage.recordings.mcap_folder import folder_in  # it reads files itself
-
-        return folder_in(packed[0]).read(packed[1])
+        return _packed_folder(packed[0]).read(packed[1])
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):

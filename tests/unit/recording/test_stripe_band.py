@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,7 @@ from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions
 from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.stripe.ridge import near_lines
 
 SIZE = (400, 640)
 
@@ -34,6 +35,22 @@ def lit_image(seed: int, bits: int = 8, ambient: float = 25.0) -> np.ndarray:
     image = light + ambient * (0.5 + x / SIZE[1]) + rng.normal(0, 2.0, SIZE)
     full = (1 << bits) - 1
     return np.clip(image * full / 255, 0, full).astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def test_wide_lines_have_a_wide_band() -> None:
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:800, : SIZE[1]].astype(float)
+    # so wide that its sides, where the background is told, lie beyond 40 px
+    light = 120 * np.exp(-0.5 * ((y - 200 - 0.7 * x + 60 * np.sin(x / 200)) / 22.0) ** 2)
+    image = np.clip(light + 30 + 0.03 * y + rng.normal(0, 2, y.shape), 0, 255)
+    whole = Exposure(image.astype(np.uint8), "wide")
+    keep = near_lines(whole.image.astype(np.float32))
+    part = replace(whole, image=np.where(keep, whole.image, np.uint8(0)))
+    found = extract_stripes(whole)
+    assert len(found) > 200
+    assert keep.mean() < 0.9
+    np.testing.assert_array_equal(extract_stripes(part).points_px, found.points_px)
+    np.testing.assert_array_equal(extract_stripes(part).flags, found.flags)
 
 
 def row(k: int, lasers: tuple[str, ...] = ("A",), view: str | None = None) -> ExposureRow:

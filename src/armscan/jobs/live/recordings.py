@@ -98,6 +98,7 @@ def _summary(title: str, found: ReadBack, output: Path) -> Summary:
             Quantity("arm_samples", "arm samples", found.n_samples),
             Quantity("events", "events", found.n_events),
             Quantity("set_aside", "set aside", found.n_aside),
+            Quantity("lost_exposures", "lost exposures", found.n_lost),
             Quantity("seconds", "duration", found.seconds, unit="s"),
         ),
         warnings=(*(f"lost: {text}" for text in found.lost), *aside, *found.warnings),

@@ -59,7 +59,10 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 CHUNK_BEGIN = re.compile(rb"(?=\x06.{5}\x00{3}.{28}[\x00\x03\x04]\x00{3})", re.DOTALL)
 """Opcode, a length below a terabyte, times, size, checksum, length of the compression's name."""
 WINDOW_BYTES = 16 << 20
-MOST_RECORD_BYTES = 1 << 31
+MOST_RECORD_BYTES, MOST_OTHER_BYTES = 1 << 31, 1 << 28
+"""Of a chunk, and of any other record."""
+LONGEST_NAME = 4
+"""Of a compression: zstd."""
 MOST_OPCODE = 15
 UNKNOWN_SIZE = zstandard.CONTENTSIZE_UNKNOWN
 LISTED_KINDS = frozenset({EXPOSURE_TOPIC, ARM_TOPIC, EVENT_TOPIC})
@@ -239,8 +242,10 @@ def pieces_of(
     while place < size:
         end, reason = place, "a record is cut or is none"
         opcode, length = _record_head(file, place)
-        if 0 < opcode <= MOST_OPCODE and length <= min(size - place - HEAD.size, MOST_RECORD_BYTES):
+        is_record = 0 < opcode <= MOST_OPCODE and length <= size - place - HEAD.size
+        if is_record and _is_likely(file, opcode, length):
             end = place + HEAD.size + length
+            file.seek(place + HEAD.size)
             if opcode == Opcode.DATA_END:
                 return
             try:
@@ -265,6 +270,20 @@ def _record_head(file: BinaryIO, place: int) -> tuple[int, int]:
     return HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
 
 
+def _is_likely(file: BinaryIO, opcode: int, length: int) -> bool:
+    """Whether a record may be so long: a wrong length must not fill the memory."""
+    if opcode != Opcode.CHUNK:
+        return length <= MOST_OTHER_BYTES
+    head = file.read(CHUNK_HEAD.size + LONGEST_NAME + 8)
+    if len(head) < CHUNK_HEAD.size + 8:
+        return False
+    _, _, n_bytes, _, n_name = CHUNK_HEAD.unpack_from(head)
+    if n_name > LONGEST_NAME or max(n_bytes, length) > MOST_RECORD_BYTES:
+        return False
+    packed = head[CHUNK_HEAD.size + n_name :][:8]
+    return bool(length == CHUNK_HEAD.size + n_name + 8 + int.from_bytes(packed, "little"))
+
+
 def _next_chunk(file: BinaryIO, place: int, size: int) -> int:
     """Where the next chunk that is whole begins; the file's size if none is."""
     while place < size:
@@ -273,8 +292,9 @@ def _next_chunk(file: BinaryIO, place: int, size: int) -> int:
         for match in CHUNK_BEGIN.finditer(window):
             begin = place + match.start()
             length = _record_head(file, begin)[1]
-            if length > size - begin - HEAD.size or length < CHUNK_HEAD.size:
+            if length > size - begin - HEAD.size or not _is_likely(file, Opcode.CHUNK, length):
                 continue
+            file.seek(begin + HEAD.size)
             try:
                 chunk_content(file.read(length))
             except DAMAGE:
@@ -462,6 +482,10 @@ class McapFolder:
     def names(self) -> tuple[str, ...]:
         """All files, as paths with ``/``."""
         return (*self._files, *self._images)
+
+    def __contains__(self, name: str) -> bool:
+        """True if there is a file of that name."""
+        return name in self._files or name in self._images
 
     def read(self, name: str) -> bytes:
         """Content of a file.

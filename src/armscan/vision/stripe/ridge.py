@@ -65,8 +65,9 @@ def measure_level(image: FloatImage, threshold: float | None) -> ImageLevel:
     return ImageLevel(background, noise, clutter, threshold)
 
 
-BAND_PX = 40
-"""The farthest pixel from a run that extraction looks at: sections of lines of sigma 10 px."""
+BAND_PX, BAND_SIGMAS = 40, 8.0
+"""Farthest from a run that extraction looks: to tell a line's width, and beside a line of a width,
+which it follows along rows or columns that cut it at 45 degrees."""
 NEARLY_LIT = 0.98
 """Of the rise: what rounding could lift is kept."""
 
@@ -84,7 +85,8 @@ def near_lines(image: FloatImage) -> BoolArray:
     rows, columns = level.background.shape
     ground = cv2.resize(level.background, (columns * CELL_PX, rows * CELL_PX))[:height, :width]
     lit = (image > ground + np.float32(NEARLY_LIT * level.rise)).astype(np.uint8)
-    side = 2 * BAND_PX + 1
+    sigma = find_line_sigma(image, find_candidates(image, level), level)
+    side = 2 * max(BAND_PX, math.ceil(BAND_SIGMAS * sigma)) + 1
     keep: BoolArray = cv2.dilate(lit, np.ones((side, side), np.uint8)).astype(np.bool_)
     keep[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX] = True
     keep[:: 2 * SAMPLE_STEP_PX] = True

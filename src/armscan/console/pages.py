@@ -468,12 +468,12 @@ class ConsolePage:
         if step.filling not in ("placements", "touches"):
             return body
         body += paragraph(self._lacking(), ALERT)
+        if self._seen is not None:
+            body += paragraph(self._seen[1], GOOD if self._seen[0] else WRONG)
         wanted = self._n_wanted()
         n, kind = state.n_taken, "Touch" if step.filling == "touches" else "Placement"
         if n >= wanted:
             return body + paragraph(f"All {wanted} are taken.", GOOD)
-        if self._seen is not None:
-            body += paragraph(self._seen[1], GOOD if self._seen[0] else WRONG)
         shown = self._placement(n)
         enough = f" At least {step.least} are needed." if n < step.least else ""
         is_twin = self.bench is not None and self.bench.is_simulated
@@ -552,7 +552,7 @@ def result_card(state: StepState, link: str) -> str:
         f'<div style="border:1px solid {LINE};border-left:5px solid {tint};border-radius:4px;'
         f'padding:8px 10px;margin:6px 0;color:{INK};font-size:13px">'
         f'<div style="font-size:15px;font-weight:700;color:{tint}">{title.capitalize()}</div>'
-        f"{old}{reasons}{paragraph(result.next_step, INK, 13)}"
+        f"{old}{reasons}{paragraph('' if old else result.next_step, INK, 13)}"
         f'<details open><summary style="cursor:pointer;color:{MUTED}">Figures</summary>'
         f'<table style="font-size:12px;border-collapse:collapse">{rows}</table></details>'
         f"{link}</div>"

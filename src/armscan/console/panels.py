@@ -169,6 +169,7 @@ class ScanPanel:
         self._finish = button(
             "Finish", self._finish_scan, "F", "End the scan and calculate", "teal"
         )
+        self._arm = button("See the arm", self.see_arm, "A", "Turn the view to base and head")
         self._facts = self._controls.gui.add_html("", visible=False)
         self._start = start
 
@@ -204,6 +205,7 @@ class ScanPanel:
         if live is None:
             return 0
         live.stop()
+        self.show_image(None)
         self._points.view.show_head(None, None)
         return live.n_recorded
 
@@ -217,11 +219,20 @@ class ScanPanel:
         if self.live is not None:
             self.live.clear()
 
+    def see_arm(self) -> None:
+        """Turn the view to all of the arm."""
+        pose = None if self.live is None else self.live.snapshot.base_from_tool
+        if pose is not None:
+            reach = pose.translation_mm
+            self._points.view.look_at(0.5 * reach, 1.6 * float(np.linalg.norm(reach)))
+
     def arrange(self, *, is_motion: bool, can_start: bool, is_again: bool) -> None:
         """Show the controls that a step has now."""
         self.start_button.visible = can_start
         self._label(is_again=is_again)
-        for handle in (self._undo, self._clear, self._finish, self._range, self._facts):
+        for handle in (
+            *(self._undo, self._clear, self._finish, self._arm, self._range, self._facts),
+        ):
             handle.visible = is_motion and self.live is not None
 
     def show_image(self, exposure: Exposure | None) -> None:
@@ -311,7 +322,7 @@ def _live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) -
     late = "" if shown.latency_ms is None else f", shown after {shown.latency_ms[0]:.0f} ms"
     lines = [
         f"{live.n_recorded} exposures recorded, {shown.rate_hz:.2g} a second{late}",
-        f"{shown.n_passes} passes, {shown.n_points:,} points",
+        f"passes: {shown.n_passes}, points: {shown.n_points:,}",
         "passes do not meet yet"
         if drift is None
         else f"the last pass lies {drift:.3f} mm from the earlier ones (median)",

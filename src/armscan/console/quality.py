@@ -37,6 +37,8 @@ THIN, FLAT = 0.01, 0.2
 at most."""
 PROVISIONAL = 4
 """The latest exposures have neighbours on one side only, and are asked again."""
+MOST_ASKED = 100_000
+"""Points whose surface is sought at a time: about a second of processor time."""
 ALIGNED_POINTS, REACH_MM = 20_000, 5.0
 GROWN = 1.5
 """The cloud is laid on its model anew when it has so many times the points."""
@@ -90,7 +92,10 @@ class Incidence:
     _known: dict[int, FloatArray] = field(default_factory=dict)
 
     def angles_deg(self, cloud: ShownCloud, seen_from_mm: Mapping[int, FloatArray]) -> FloatArray:
-        """(N,) for each point; nan where its neighbours tell no surface.
+        """(N,) for each point; nan where its neighbours tell no surface, or it was not asked yet.
+
+        A call asks for the newest exposures that are not known, up to 100,000 points: a large cloud
+        is known after some calls.
 
         Parameters
         ----------
@@ -109,29 +114,31 @@ class Incidence:
                 for one, n in zip(number.tolist(), count.tolist(), strict=True)
             ]
         )
-        fresh = number[is_new]
-        if len(fresh):
-            self._ask(cloud, fresh, seen_from_mm)
+        later = np.cumsum((count * is_new)[::-1])[::-1]
+        fresh = is_new & (later <= max(MOST_ASKED, count[-1]))
+        self._ask(cloud, number[fresh], seen_from_mm)
         angles = np.full(len(cloud.points_mm), np.nan)
         for one, first, n in zip(number.tolist(), start.tolist(), count.tolist(), strict=True):
-            angles[first : first + n] = self._known[one]
+            if len(self._known.get(one, ())) == n:
+                angles[first : first + n] = self._known[one]
         return angles
 
     def _ask(
         self, cloud: ShownCloud, fresh: IntArray, seen_from_mm: Mapping[int, FloatArray]
     ) -> None:
-        is_pool = cloud.exposure >= fresh.min() - 2 * PROVISIONAL
-        is_asked = np.isin(cloud.exposure, fresh)
-        normals = surface_normals(
-            cloud.points_mm[is_pool], cloud.exposure[is_pool], is_asked[is_pool]
-        )
-        asked = cloud.exposure[is_asked]
+        low, high = fresh.min() - 2 * PROVISIONAL, fresh.max() + 2 * PROVISIONAL
+        is_pool = (cloud.exposure >= low) & (cloud.exposure <= high)
+        points, exposure = cloud.points_mm[is_pool], cloud.exposure[is_pool]
+        is_asked = np.isin(exposure, fresh)
+        normals = surface_normals(points, exposure, is_asked)
+        asked, own = points[is_asked], exposure[is_asked]
         nowhere = np.full(3, np.nan)
+        places = np.array([seen_from_mm.get(one, nowhere) for one in fresh.tolist()])
+        sight = places[np.searchsorted(fresh, own)] - asked
+        cosine = np.einsum("ni,ni->n", sight, normals) / np.linalg.norm(sight, axis=1)
+        angles = np.degrees(np.arccos(np.clip(np.abs(cosine), 0.0, 1.0)))
         for one in fresh.tolist():
-            own = asked == one
-            sight = seen_from_mm.get(one, nowhere) - cloud.points_mm[is_asked][own]
-            cosine = np.einsum("ni,ni->n", sight, normals[own]) / np.linalg.norm(sight, axis=1)
-            self._known[one] = np.degrees(np.arccos(np.clip(np.abs(cosine), 0.0, 1.0)))
+            self._known[one] = angles[own == one]
 
 
 def surface_normals(points_mm: FloatArray, exposure: IntArray, is_asked: BoolArray) -> FloatArray:

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -20,6 +21,7 @@ from armscan.console.quality import Incidence, passes_apart_mm
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample, arm_track
 from armscan.devices.protocols import Frame, LaserEvent
+from armscan.errors import OutputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.arm import axis_frames
@@ -37,7 +39,7 @@ from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.recording import NO_TRIGGER, ArmTrack, ExposureRow, Session
 from armscan.storage.arm import ARM_FILE, arm_columns
-from armscan.storage.files import write_files
+from armscan.storage.files import path_text, write_files
 from armscan.storage.recording import encoded_png, read_recording
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
@@ -49,6 +51,8 @@ from armscan.storage.tables import csv_bytes
 
 TABLES_EVERY_S = 1.0
 """A scan's tables are written so often: a kill loses no more."""
+WRITERS, MOST_PENDING = 2, 64
+"""Threads that pack images, and images that may wait for them: more, and the devices wait."""
 ArmReading = tuple[int, Pose[Base, Tool] | None, int]
 """Time in ns, ``base_from_tool`` or None, and number of the trigger."""
 
@@ -97,11 +101,26 @@ class GrowingRecording:
 
     def add(self, row: ExposureRow, exposure: Exposure) -> None:
         """Write an image; `flush` lists it."""
+        self.write_image(row, exposure)
+        self.rows.append(row)
+
+    def write_image(self, row: ExposureRow, exposure: Exposure) -> None:
+        """Write an image of a row that is added afterwards; several threads may do so.
+
+        Raises
+        ------
+        OutputError
+            If the disk is full or refuses.
+        """
         content = encoded_png(exposure, self.session.cameras[row.camera])
         path = self.folder / row.source
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"the folder cannot be made ({error.strerror})", where=path_text(path.parent)
+            ) from error
         write_files({path: content}, is_overwriting=True)
-        self.rows.append(row)
 
     def take_back(self) -> None:
         """Take the latest view out of the list, and samples of the arm that came after the rest."""
@@ -222,8 +241,16 @@ class ScanRecorder:
         """By number of the frame."""
         self.latest_joints_rad: FloatArray | None = None
         self._rows_of: dict[int, list[ExposureRow]] = {}
+        self._n_rows = len(self.grown.rows)
+        self._writers = ThreadPoolExecutor(WRITERS)
+        self._pending: deque[tuple[Future[None], ExposureRow]] = deque()
         self._lock = threading.Lock()
         self._written = time.monotonic()
+
+    @property
+    def n_rows(self) -> int:
+        """Exposures that are recorded, also those whose images are being written."""
+        return len(self.grown.rows) + len(self._pending)
 
     def add_frame(self, camera: int, frame: Frame, status: ElementStatus) -> None:
         """Instants hold the frames."""
@@ -250,7 +277,7 @@ class ScanRecorder:
                 t_ns = frame.t_device_ns if self.is_triggered else instant.t_ns
                 if t_ns is None:
                     continue
-                index = len(self.grown.rows) + len(self.grown.left_out)
+                index, self._n_rows = self._n_rows, self._n_rows + 1
                 row = ExposureRow(
                     index,
                     t_ns,
@@ -260,28 +287,33 @@ class ScanRecorder:
                     frame.trigger_id if self.is_triggered else None,
                 )
                 shot = exposure_of(frame, self.setups[camera], instant, camera)
-                self.grown.add(row, shot)
+                self._pending.append((self._writers.submit(self.grown.write_image, row, shot), row))
                 self.pose_of[frame.number] = instant.pose
                 self._rows_of.setdefault(frame.number, []).append(row)
+            self._list_written(MOST_PENDING)
             if time.monotonic() - self._written > TABLES_EVERY_S:
                 self._written = time.monotonic()
                 self.grown.flush()
 
-    def leave_out(self, first: int, last: int) -> None:
-        """Take the exposures between two frame numbers, both included, out of the list."""
+    def _list_written(self, most_pending: int) -> None:
+        """List the images that are on disk, and wait until no more than so many are not."""
+        while self._pending and (len(self._pending) > most_pending or self._pending[0][0].done()):
+            done, row = self._pending.popleft()
+            done.result()
+            self.grown.rows.append(row)
+
+    def leave_out(self, first: int) -> None:
+        """Take what was recorded since a frame, by its number, out of the list."""
         with self._lock:
-            chosen = [
-                row
-                for number, rows in self._rows_of.items()
-                if first <= number <= last
-                for row in rows
-            ]
-            self.grown.leave_out(chosen)
+            self._list_written(0)
+            since = min((row.index for row in self._rows_of.get(first, ())), default=self._n_rows)
+            self.grown.leave_out([row for row in self.grown.rows if row.index >= since])
             self.grown.flush()
 
     def finish(self) -> None:
-        """Write the tables."""
+        """Write the tables, with all images that came."""
         with self._lock:
+            self._list_written(0)
             self.grown.flush()
 
 
@@ -337,13 +369,15 @@ class LiveScan:
         if self._starts:
             start = self._starts.pop()
             self.session.undo_pass()
-            self._leave_out({number for number in self._frame_of if number >= start})
+            # also what came with it and was not placed
+            self.recorder.leave_out(self._frame_of[start])
 
     def clear(self) -> None:
         """Take all passes out."""
         self.session.clear()
         self._starts.clear()
-        self._leave_out(set(self._frame_of))
+        if self._frame_of:
+            self.recorder.leave_out(min(self._frame_of.values()))
 
     def stop(self) -> None:
         """End the scan; the recording is whole."""
@@ -359,7 +393,7 @@ class LiveScan:
     @property
     def n_recorded(self) -> int:
         """Exposures in the recording."""
-        return len(self.recorder.grown.rows)
+        return self.recorder.n_rows
 
     def drift_mm(self) -> float | None:
         """Median distance of the last pass from the surface of the earlier ones, where they meet.
@@ -398,11 +432,6 @@ class LiveScan:
             self._starts = [*self._starts[: n_passes - 1], number]
         for source in cloud.exposure_sources:
             self._frame_of[number] = int(source.rpartition(" ")[2])
-
-    def _leave_out(self, numbers: set[int]) -> None:
-        known = [self._frame_of[one] for one in numbers if one in self._frame_of]
-        if known:
-            self.recorder.leave_out(min(known), max(known))
 
     def _hear(self, event: LiveEvent) -> None:
         is_end = event.kind in ("fault", "recovered") and (

@@ -251,7 +251,7 @@ class SceneView:
                         (corners / UNIT_MM).astype(np.float32),
                         np.array([[0, 1, 2], [0, 2, 3]]),
                         color=sheet_colour(number),
-                        opacity=0.35,
+                        opacity=0.12,
                         side="double",
                         cast_shadow=False,
                         receive_shadow=False,
@@ -286,22 +286,21 @@ def _placed(pose: Pose[Any, Any]) -> tuple[Any, Any]:
 
 
 def sheet_corners_mm(sensor: SensorCalibration) -> list[FloatArray]:
-    """(4, 3) corners in Sensor of the calibrated part of each sheet."""
+    """(4, 3) corners in Sensor of the part of each sheet that is calibrated and in the image."""
+    camera = sensor.camera.camera
+    focal_px = float(min(camera.matrix[0, 0], camera.matrix[1, 1]))
+    widest = 0.5 * max(camera.width_px, camera.height_px) / focal_px
     found = []
     for one in sensor.sheets:
         along, deep, _ = one.sheet.axes
-        origin, half = one.sheet.origin_mm, one.sheet.scale_mm
-        near, far = one.depth_range_mm
-        # along the sheet's own axis to the two depths
-        steps = [
-            (depth - origin[2]) / deep[2] if abs(deep[2]) > 1e-3 else half for depth in (near, far)
-        ]
-        corners = [
-            origin + steps[0] * deep - half * along,
-            origin + steps[0] * deep + half * along,
-            origin + steps[1] * deep + half * along,
-            origin + steps[1] * deep - half * along,
-        ]
+        corners = []
+        for depth, sides in zip(one.depth_range_mm, ((-1.0, 1.0), (1.0, -1.0)), strict=True):
+            # along the sheet's own axis to the depth
+            is_steep = abs(deep[2]) > 1e-3
+            step = (depth - one.sheet.origin_mm[2]) / deep[2] if is_steep else one.sheet.scale_mm
+            half = min(one.sheet.scale_mm, widest * depth)
+            middle = one.sheet.origin_mm + step * deep
+            corners += [middle + side * half * along for side in sides]
         found.append(np.array(corners))
     return found
 

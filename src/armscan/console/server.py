@@ -199,7 +199,10 @@ def open_server(
     # viser prints a box with its own addresses: ours is told by who opens the console
     with _guarded(Door(token, folder_of_pages)), redirect_stdout(StringIO()):
         server = viser.ViserServer(host=host, port=chosen, label="armscan", verbose=False)
-    shown = f"http://{'localhost' if is_loopback(host) else host}:{server.get_port()}/"
+    name = "localhost" if is_loopback(host) else host
+    # an address that means all of this computer's is none to open
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else name
+    shown = f"http://{f'[{name}]' if ':' in name else name}:{server.get_port()}/"
     return server, shown if is_loopback(host) else f"{shown}?token={token}"
 
 

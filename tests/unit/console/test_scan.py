@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("viser")
 
+import armscan.console.scan as scan_module
 from armscan.console.journey import SessionSettings, StepName
 from armscan.console.placements import (
     CAMERA,
@@ -28,9 +29,11 @@ from armscan.console.rig import DeviceBench, _Hand, _HandArm, _HandCamera, take_
 from armscan.console.scan import LiveScan
 from armscan.console.scene import ShownPoints, depths_mm, point_colours, range_bar, thinned
 from armscan.devices.sources import ScanSource
+from armscan.errors import OutputError
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.records.recording import ArmTrack, CameraSetup, Session
+from armscan.storage.files import write_files
 from armscan.storage.recording import read_recording
 from rigs.scan_fake import CAMERA as DRAWN
 from rigs.scan_fake import as_source, fake_scan, scanner
@@ -116,6 +119,35 @@ def test_a_pass_taken_back_is_in_neither_cloud_nor_recording(tmp_path: Path) -> 
     # an exposure that arrived while the pause began belongs to no pass that was taken back
     assert n_first - 1 <= len(rows) <= n_first + 1
     assert [row.trigger_id for row in rows][: len(before)] == list(range(len(before)))
+
+
+def test_a_disk_that_refuses_is_told_and_what_was_listed_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, n_written = DrawnBench(30, rate_hz=20.0), 0
+    write = write_files
+
+    def full_after_five(files, **how) -> None:
+        nonlocal n_written
+        n_written += any(path.suffix == ".png" for path in files)
+        if n_written > 5:
+            raise OutputError("the disk is full")
+        write(files, **how)
+
+    monkeypatch.setattr(scan_module, "write_files", full_after_five)
+    monkeypatch.setattr(scan_module, "TABLES_EVERY_S", 0.0)
+    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01", scanner())
+    live.start()
+    waited(lambda: any("the disk is full" in event.text for event in live.events))
+    assert not live.session.is_recording
+    n_shown = live.snapshot.n_points
+    waited(lambda: live.snapshot.n_points > n_shown)  # it goes on to show
+    live.session.stop()
+    monkeypatch.setattr(scan_module, "write_files", write)
+    live.recorder.grown.flush()
+    recorded = read_recording(tmp_path / "scan-01")
+    assert [row.trigger_id for row in recorded.rows] == list(range(5))
+    assert all(recorded.exposure(k).image.any() for k in range(5))
 
 
 def test_devices_are_taken_from_one_placement_at_a_time(tmp_path: Path) -> None:

@@ -112,3 +112,22 @@ def test_a_taken_port_is_one_sentence(tmp_path: Path) -> None:
             open_server(lambda: tmp_path, port=taken.getsockname()[1])
     with pytest.raises(OptionError):
         open_server(lambda: tmp_path, port=70_000)
+
+
+def test_all_addresses_of_this_computer_are_told_by_its_name(tmp_path: Path) -> None:
+    server, address = open_server(lambda: tmp_path, "0.0.0.0", port=0)
+    try:
+        port, token = server.get_port(), address.partition("?token=")[2]
+        assert address == f"http://{socket.gethostname()}:{port}/?token={token}"
+        # from here by its loopback address as ever; by another name with the token alone
+        assert ask(port, "/")[0] == 200
+        name = f"{socket.gethostname()}:{port}"
+        assert ask(port, "/", Host=name)[0] == 403
+        assert ask(port, "/?token=wrong", Host=name)[0] == 403
+        status, _, headers = ask(port, f"/?token={token}", Host=name)
+        assert status == 200
+        cookie = headers["Set-Cookie"].partition(";")[0]
+        assert ask(port, "/", Host=name, Cookie=cookie)[0] == 200
+        assert ask(port, "/", Host=name, Cookie=f"{COOKIE}=wrong")[0] == 403
+    finally:
+        close_server(server)

@@ -281,7 +281,10 @@ class LiveSession:
         self._range_mm: float | None = None
         self._arrivals: deque[int] = deque(maxlen=LATENCIES)
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
-        self._wants_pass = True
+        self._next_pass: int | None = 0
+        """Number of the instant with which a pass begins; those before belong to the last one."""
+        self._taken_back = 0
+        """Instants before this number that still wait to be measured are not placed any more."""
         self._told = ""
         self._now: _Waiting | None = None
         self._asked: tuple[str, ...] = ()
@@ -346,7 +349,7 @@ class LiveSession:
         if self._state in ("closed", "stopped"):
             fact = "is over" if self._state == "stopped" else "is not open"
             raise DeviceError(f"the session {fact}", remedy="open a new one")
-        self._wants_pass = True
+        self._next_pass = self._n_instants
         self._acquisition.recorder = self._recorder
         self._change("scanning")
 
@@ -362,7 +365,7 @@ class LiveSession:
         with self._lock:
             if self._passes:
                 self._passes.pop()
-            self._wants_pass = True
+            self._next_pass = self._taken_back = self._n_instants
             self._version += 1
         self._tell(LiveEvent("pass", "the last pass was taken back"))
 
@@ -370,7 +373,7 @@ class LiveSession:
         """Empty the live cloud; the recording keeps all."""
         with self._lock:
             self._passes.clear()
-            self._wants_pass = True
+            self._next_pass = self._taken_back = self._n_instants
             self._version += 1
 
     def stop(self) -> None:
@@ -539,7 +542,8 @@ class LiveSession:
             return LiveStatus.NO_POSE
         last, t_ns = self._last_moved, frame.t_device_ns
         if last is not None and _is_still(last, pose):
-            self._wants_pass |= t_ns - self._moved_ns > STOP_NS
+            if self._next_pass is None and t_ns - self._moved_ns > STOP_NS:
+                self._next_pass = number
             return LiveStatus.STILL
         self._last_moved, self._moved_ns = pose, t_ns
         return LiveStatus.NOT_SHOWN if number % self.options.measured_every else None
@@ -605,9 +609,13 @@ class LiveSession:
             clouds.append(propagate_to_base(found.points, labelled.profile, pose, transform))
             depths.append(found.points.points_mm[:, 2])
         with self._lock:
-            if self._wants_pass or not self._passes or self._has_turned(pose):
+            if number < self._taken_back:
+                self._counts[LiveStatus.PLACED] += 1
+                return
+            is_next = self._next_pass is not None and number >= self._next_pass
+            if is_next or not self._passes or self._has_turned(pose):
                 self._passes.append(_Pass(pose))
-                self._wants_pass = False
+                self._next_pass = None if is_next else self._next_pass
             for camera, (found, cloud) in enumerate(zip(one.profiles, clouds, strict=True)):
                 seen = found.labelled.status == PointStatus.MEASURED
                 pixels = found.labelled.profile.points_px[seen]

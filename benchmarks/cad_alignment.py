@@ -68,7 +68,8 @@ def main() -> None:
     arguments = parser.parse_args()
     print(f"seed {arguments.seed}, overlap {arguments.overlap}, normals {arguments.normals}")
     print(f"{'part':8} {'poses':>5} {'right':>5} {'wrong':>5} {'of these named':>14} "
-          f"{'right, named':>12} {'as well':>7} {'median mm':>9} {'worst mm':>9} {'s each':>6}")  # fmt: skip
+          f"{'right, named':>12} {'as well':>7} {'median mm':>9} {'worst mm':>9} "
+          f"{'s each':>6}")  # fmt: skip
     for name in arguments.parts:
         part = model(name)
         surface = PartSurface(part)

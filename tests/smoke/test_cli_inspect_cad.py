@@ -78,7 +78,41 @@ def test_a_good_part_passes(files: Path) -> None:
     assert inspect(files, "--align", "none", cloud="good.ply") == 0
 
 
+def test_datums_are_told_with_what_they_hold(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A side that is 0.08 mm high is the first datum, and met by itself."""
+    low_x, _, low_z = (int(PART.face[np.argmax(PART.normals @ way)]) for way in -np.eye(3))
+    names = "|".join(PART.face_names[k] for k in (3, low_x, low_z))
+    assert inspect(files, "--align", "features", "--datums", names, "--json") == 0
+    told = json.loads(capsys.readouterr().out)["alignment"]
+    assert told["method"] == "features"
+    assert told["datums"][0]["residual_mm"] < 1e-6
+    assert [len(one["holds"]) for one in told["datums"]] == [3, 2, 1]
+    assert all(one["sigma_mm"] > 0.0 for one in told["datums"])
+
+
+def test_a_cloud_is_laid_on_points_and_markers(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = np.random.default_rng(3).uniform(0.0, 50.0, (6, 3))
+    rows = [f"P{k},{x},{y},{z}" for k, (x, y, z) in enumerate(places)]
+    nominal = tmp_path / "nominal.csv"
+    nominal.write_text("\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n")
+    words = ("--points", str(nominal), "--measured", str(nominal), "--json")
+    for method in ("points", "markers"):
+        assert inspect(files, "--align", method, *words, cloud="good.ply") == 0
+        told = json.loads(capsys.readouterr().out)["alignment"]
+        assert told["method"] == method
+        assert np.allclose(told["cad_from_part"], np.eye(4), atol=1e-9)
+        assert len(told["datums"]) == 6
+
+
 REFUSED = [
+    (("--align", "features"), "part.stl"),
+    (("--align", "points"), "part.stl"),
+    (("--align", "features", "--datums", "face 99"), "part.stl"),
+    (("--measured", "x.csv"), "part.stl"),
     (("--unit", "furlong"), "part.stl"),
     (("--tolerance", "-1"), "part.stl"),
     (("--tolerance", "missing.toml"), "part.stl"),

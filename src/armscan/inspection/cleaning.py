@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -112,7 +112,8 @@ class Cleaning(ArrayRecord):
     Parameters
     ----------
     cloud
-        What is left.
+        What is left; points keep their covariances, but share their noise with fewer neighbours
+        where some of these were taken.
     taken_by
         (N,) of each point of the cloud that was given, the index of the step that took it; -1 for
         those that are left.
@@ -172,7 +173,33 @@ def clean_cloud(cloud: PointCloud, options: CleaningOptions) -> Cleaning:
                 f"after the filter '{label}' no point is left of {len(left)}",
                 remedy="give it a number that lets more pass",
             )
-    return Cleaning(cloud=cloud.select(taken_by < 0), taken_by=taken_by, steps=tuple(steps))
+    kept = taken_by < 0
+    left_over = cloud.select(kept)
+    if cloud.noise_length is not None and not cloud.is_fused:
+        left_over = replace(left_over, noise_length=_length_left(cloud, kept)[kept])
+    return Cleaning(cloud=left_over, taken_by=taken_by, steps=tuple(steps))
+
+
+def _length_left(cloud: PointCloud, kept: BoolArray) -> FloatArray:
+    """(N,) neighbours along the stripe that share a point's noise, as many as are kept.
+
+    A point shares the noise of L neighbours, itself among them: of those as far along the stripe
+    as L reaches, the part that is left.
+    """
+    length = np.ones(len(cloud)) if cloud.noise_length is None else cloud.noise_length
+    stripe = cloud.exposure * len(cloud.sheet_names) + cloud.sheet
+    order = np.argsort(stripe, kind="stable")
+    at, ordered = np.arange(len(order)), stripe[order]
+    first = np.searchsorted(ordered, ordered, side="left")
+    last = np.searchsorted(ordered, ordered, side="right") - 1
+    reach = np.maximum(np.rint((length[order] - 1.0) / 2.0).astype(np.int64), 1)
+    low, high = np.maximum(at - reach, first), np.minimum(at + reach, last)
+    sums = np.concatenate([[0], np.cumsum(kept[order])])
+    others = sums[high + 1] - sums[low] - kept[order]
+    share = others / np.maximum(high - low, 1)
+    found = np.ones(len(order))
+    found[order] = 1.0 + (length[order] - 1.0) * share
+    return found
 
 
 def _outside(cloud: PointCloud, region: Box, options: CleaningOptions) -> BoolArray:

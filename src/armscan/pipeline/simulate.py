@@ -472,6 +472,8 @@ def simulate_scene(
         If a process that renders came to an end.
     """
     settings = SimulateOptions() if options is None else options
+    if settings.unit != "mm" and not settings.part:
+        raise OptionError("a unit is that of a part", where="--unit", remedy="give --part with it")
     if settings.part and scene != "workpiece":
         raise OptionError(
             f"a part goes with the scene workpiece, not {scene}",

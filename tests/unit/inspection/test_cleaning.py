@@ -182,3 +182,51 @@ def test_a_fused_cloud_has_no_stripes(options: CleaningOptions) -> None:
     with pytest.raises(InputError, match="fused one"):
         clean_cloud(fused, options)
     assert len(clean_cloud(fused, CleaningOptions(density_mm=1.0)).cloud)
+
+
+def test_a_cleaned_cloud_keeps_what_its_points_know() -> None:
+    """Every filter chooses points and changes none: covariances and noise stay theirs."""
+    random = np.random.default_rng(3)
+    cloud = plate(0.2)
+    n = len(cloud)
+    root = 0.01 * random.normal(size=(n, 3, 3))
+    whole = replace(
+        cloud,
+        covariance_mm2=root @ np.swapaxes(root, 1, 2),
+        sigma_noise_mm=random.uniform(0.001, 0.01, n),
+        noise_length=np.ones(n),
+    )
+    options = CleaningOptions(
+        region=Box.from_limits([1.0, 25.0, -1.0, 10.0, -1.0, 1.0], "region"),
+        isolated_mm=0.6, line_spacing_mm=0.5, edge_mm=0.3, line_to_line_mm=0.3, overlap_mm=1.0,
+        density_mm=0.4,
+    )  # fmt: skip
+    found = clean_cloud(whole, options)
+    kept = np.flatnonzero(found.taken_by < 0)
+    assert 0 < len(kept) < n // 2
+    for name in ("points_mm", "covariance_mm2", "sigma_noise_mm", "noise_length", "exposure"):
+        assert np.array_equal(getattr(found.cloud, name), getattr(whole, name)[kept]), name
+
+
+def test_thinned_points_share_their_noise_with_fewer() -> None:
+    """White noise averaged over nine points, every third kept: the mean scatters as is stated.
+
+    Its correlations sum to 9; at every third point to 1 + 2 (6/9 + 3/9) = 3.
+    """
+    width, sigma, runs = 9, 0.01, 400
+    cloud = replace(plate(5.0), noise_length=np.full(N_POINTS * N_STRIPES, float(width)))
+    every = Box.from_limits([-1.0, 99.0, -1.0, 999.0, -1.0, 1.0], "region")
+    whole = replace(cloud, sigma_noise_mm=np.full(len(cloud), sigma))
+    found = clean_cloud(whole, CleaningOptions(region=every, density_mm=3.0 * SPACING_MM))
+    inner = np.abs(found.cloud.points_mm[:, 0] - 15.0) < 13.0
+    assert found.cloud.noise_length is not None
+    assert np.median(found.cloud.noise_length[inner]) == pytest.approx(3.0)
+    random = np.random.default_rng(0)
+    rows = np.flatnonzero(found.taken_by < 0)
+    means = []
+    for _ in range(runs):
+        white = random.normal(0.0, sigma * np.sqrt(width), (N_STRIPES, N_POINTS + width - 1))
+        smooth = np.apply_along_axis(np.convolve, 1, white, np.full(width, 1.0 / width), "valid")
+        means.append(smooth.ravel()[rows].mean())
+    stated = np.sqrt(np.sum(sigma**2 * found.cloud.noise_length)) / len(rows)
+    assert np.std(means) / stated == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * runs) + 0.03)

@@ -134,6 +134,8 @@ def test_results_that_exist_stop_it_before_any_work(tmp_path: Path) -> None:
     (tmp_path / "scan.truth.json").write_text("mine")
     with pytest.raises(OutputError, match="the truth of an earlier recording is there"):
         simulate_scene(tmp_path / "scan", HEAD, "ball")
+    with pytest.raises(OptionError, match="unit"):
+        simulate_scene(tmp_path / "scan", HEAD, "workpiece", SimulateOptions(unit="m"))
     assert not (tmp_path / "scan").exists()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").write_text("")
@@ -230,4 +232,6 @@ def test_a_part_in_another_unit_or_for_another_scene_is_refused(tmp_path: Path) 
     assert "open" in scannable_part(block(tmp_path, "open.stl", is_open=True), "mm").notes[0]
     with pytest.raises(OptionError, match="scene workpiece"):
         simulate_scene(tmp_path / "scan", HEAD, "ball", SimulateOptions(part=str(whole)))
+    with pytest.raises(OptionError, match="unit"):
+        simulate_scene(tmp_path / "scan", HEAD, "workpiece", SimulateOptions(unit="m"))
     assert not (tmp_path / "scan").exists()

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from scipy.stats import t as student
 
 from armscan.errors import OptionError
 from armscan.geometry.arrays import (
@@ -297,6 +298,7 @@ def compare_with_part(
         )
         scatter = scatter_of_means(face, n_faces, d, cloud.exposure)
         u_face = np.maximum(u_face, COVERAGE * scatter)
+        u_spot = np.maximum(u_spot, median_uncertainty(spot, n_spots, d))
     else:
         u = options.uncertainty_mm
         u_point, u_face, u_spot = (np.full(n, u) for n in (len(cloud), n_faces, n_spots))
@@ -337,6 +339,47 @@ def compare_with_part(
         spot_width_mm=spot_width,
         is_fused=cloud.is_fused,
     )
+
+
+ONE_SIDE = 0.02275
+"""Chance beyond two standard deviations of a normal error, on one side: k = 2."""
+MEDIAN_OVER_MEAN = math.sqrt(math.pi / 2.0)
+"""Standard deviation of the median of many normal errors, over that of their mean."""
+QUARTILES_OVER_SIGMA = 1.349
+"""Distance of the quartiles of a normal distribution, over its standard deviation."""
+EFFICIENCY = 0.37
+"""Degrees of freedom of a standard deviation by quartiles, over those of the usual one."""
+
+
+def median_uncertainty(label: IntArray, count: int, values: FloatArray) -> FloatArray:
+    """(count,) U of groups' medians by how far their points scatter; 0 of fewer than four points.
+
+    The standard deviation of a median of few points is known no better than these tell it: U is
+    Student's factor for what quartiles of as many points tell and a level of 95.45 %, times it.
+    Neighbours that err alike are taken as independent, so that it is a least U, not the whole one.
+
+    Parameters
+    ----------
+    label, count
+        (N,) group of each point, -1 for none, and how many groups there are.
+    values
+        (N,) of the points.
+    """
+    n = np.bincount(label[label >= 0], minlength=count)
+    order = np.lexsort((values, label))[int((label < 0).sum()) :]
+    start = np.concatenate([[0], np.cumsum(n)[:-1]])
+    many = np.flatnonzero(n >= 4)
+    last = n[many] - 1
+    quartiles = []
+    for part in (1, 3):
+        before, rest = np.divmod(part * last, 4)
+        below, above = (values[order[start[many] + before + k * (rest > 0)]] for k in (0, 1))
+        quartiles.append(below + (above - below) * rest / 4.0)
+    spread = (quartiles[1] - quartiles[0]) / QUARTILES_OVER_SIGMA
+    sigma = MEDIAN_OVER_MEAN * spread / np.sqrt(n[many])
+    found = np.zeros(count)
+    found[many] = student.isf(ONE_SIDE, EFFICIENCY * last) * sigma
+    return found
 
 
 class _Spots(RowRecord):

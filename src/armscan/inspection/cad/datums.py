@@ -579,6 +579,8 @@ def _fitted(
     if isinstance(fit, FitFailure):
         return FitFailure(f"the datum {feature.name}: {fit.reason}", fit.remedy)
     shape, kept = fit
+    if not kept.any():
+        return _unseen(feature.name, 0)
     shape, own, points = shape.turned_to(start.direction), own[kept], points[kept]
     linear = linearise(shape, points, with_plane=True)
     source = own[linear.point]

@@ -6,11 +6,12 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from armscan.errors import FileFormatError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.storage.files import path_text
 from armscan.storage.formats.columns import (
     DAMAGED,
@@ -22,9 +23,10 @@ from armscan.storage.formats.columns import (
     CloudPiece,
 )
 from armscan.storage.formats.ply import vertices_remark
-from armscan.storage.formats.stl import stl_corners
+from armscan.storage.formats.stl import float_numbers, stl_corners
 from armscan.storage.formats.text import SIGMA_LOSS
 
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 OBJ_LOSES = (
     SIGMA_LOSS,
     "sheet, exposure and segment",
@@ -53,6 +55,88 @@ def stl_columns(data: bytes, path: Path) -> CloudColumns:
     )
 
 
+class ObjContent(NamedTuple):
+    """What an OBJ file holds.
+
+    Parameters
+    ----------
+    vertices, normals
+        (N, 3) of the lines ``v``, (M, 3) of the lines ``vn``.
+    polygons
+        Of each line ``f`` its (K,) rows of ``vertices``; beyond these where the file is damaged.
+    group
+        Of each polygon the row of ``names``.
+    names
+        Of groups and objects, in order; "unnamed" before the first.
+    notes
+        Comments.
+    """
+
+    vertices: FloatArray
+    normals: FloatArray
+    polygons: list[IntArray]
+    group: list[int]
+    names: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def parse_obj(data: bytes, where: str) -> ObjContent:
+    """Content of an OBJ file.
+
+    Raises
+    ------
+    FileFormatError
+        If numbers or faces are not understood.
+    """
+    vertices: list[bytes] = []
+    normals: list[bytes] = []
+    polygons: list[IntArray] = []
+    owner: list[int] = []
+    names: dict[str, int] = {}
+    notes: list[str] = []
+    group, n = 0, 0
+    for line in data.removeprefix(BYTE_ORDER_MARK).splitlines():
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == b"v":
+            vertices += words[1:4]
+            n += 1
+        elif words[0] == b"vn":
+            normals += words[1:4]
+        elif words[0] == b"f":
+            polygons.append(_polygon(words[1:], n, where))
+            owner.append(group)
+        elif words[0] in (b"g", b"o"):
+            name = b" ".join(words[1:]).decode("utf-8", "replace") or "unnamed"
+            group = names.setdefault(name, len(names))
+        elif line.startswith(b"# "):
+            notes.append(line[2:].decode("utf-8", "replace"))
+    if len(vertices) != 3 * n or len(normals) % 3:
+        raise FileFormatError(
+            "a vertex of the OBJ file has no three numbers", where=where, remedy=DAMAGED
+        )
+    return ObjContent(
+        float_numbers(vertices, where, "OBJ").reshape(-1, 3),
+        float_numbers(normals, where, "OBJ").reshape(-1, 3),
+        polygons,
+        owner,
+        tuple(names) or ("unnamed",),
+        tuple(notes),
+    )
+
+
+def _polygon(words: list[bytes], n: int, where: str) -> IntArray:
+    """Rows of the vertices of a face; numbers below 0 count back from the last one so far."""
+    try:
+        rows = np.array([int(word.partition(b"/")[0]) for word in words], dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise FileFormatError(
+            "the faces of the OBJ file are not understood", where=where, remedy=DAMAGED
+        ) from error
+    return np.where(rows < 0, n + rows, rows - 1)
+
+
 def obj_columns(data: bytes, path: Path) -> CloudColumns:
     """Vertices of an OBJ file, with its normals where there is one for each.
 
@@ -61,33 +145,18 @@ def obj_columns(data: bytes, path: Path) -> CloudColumns:
     FileFormatError
         If it holds no vertices, or numbers that are not understood.
     """
-    lines = data.decode("utf-8-sig", errors="replace").splitlines()
-    points = _numbers(lines, "v ", path)
+    found = parse_obj(data, path_text(path))
+    points, normals = found.vertices, found.normals
     if not len(points):
         raise FileFormatError(
             "the OBJ file holds no vertices", where=path_text(path), remedy=DAMAGED
         )
     columns = {name: points[:, k] for k, name in enumerate(POINT)}
-    normals = _numbers(lines, "vn ", path)
-    n_faces = sum(line.startswith("f ") for line in lines)
+    n_faces = len(found.polygons)
     if len(normals) == len(points) and not n_faces:
         columns |= {name: normals[:, k] for k, name in enumerate(NORMAL)}
-    notes = tuple(line.removeprefix("# ") for line in lines if line.startswith("# "))
     remarks = (vertices_remark(n_faces),) if n_faces else ()
-    return CloudColumns(columns, notes, remarks=remarks)
-
-
-def _numbers(lines: list[str], word: str, path: Path) -> FloatArray:
-    """(N, 3) of the lines that begin with a word."""
-    rows = [line.removeprefix(word).split()[:3] for line in lines if line.startswith(word)]
-    try:
-        return np.array(rows, dtype=np.float64).reshape(len(rows), 3)
-    except ValueError as error:
-        raise FileFormatError(
-            "the vertices of the OBJ file are not understood",
-            where=path_text(path),
-            remedy=DAMAGED,
-        ) from error
+    return CloudColumns(columns, found.notes, remarks=remarks)
 
 
 def obj_bytes(piece: CloudPiece) -> bytes:

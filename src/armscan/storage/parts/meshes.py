@@ -12,8 +12,9 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.inspection.cad.part import PartModel, part_of
 from armscan.storage.files import path_text, read_bytes
 from armscan.storage.formats.columns import DAMAGED as CUT
+from armscan.storage.formats.meshes import parse_obj
 from armscan.storage.formats.ply import BYTE_ORDERS, TYPES, parse_ply
-from armscan.storage.formats.stl import float_numbers, stl_corners
+from armscan.storage.formats.stl import stl_corners
 from armscan.storage.parts.step import STEP_SUFFIXES, ChordError, read_step
 
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
@@ -200,40 +201,11 @@ def _triangulated(points: FloatArray, polygons: list[IntArray], where: str) -> F
 
 def _obj(data: bytes, where: str) -> tuple[FloatArray, IntArray | None, tuple[str, ...]]:
     """Corners, and the groups ``g`` or ``o`` as faces where there are several."""
-    vertices: list[list[bytes]] = []
-    polygons: list[IntArray] = []
-    owner: list[int] = []
-    names: dict[str, int] = {}
-    group = 0
-    for line in data.splitlines():
-        words = line.split()
-        if not words:
-            continue
-        if words[0] == b"v":
-            vertices.append(words[1:4])
-        elif words[0] == b"f":
-            try:
-                rows = np.array([int(word.partition(b"/")[0]) for word in words[1:]])
-            except ValueError as error:
-                raise FileFormatError(
-                    "the faces of the OBJ file are not understood", where=where, remedy=CUT
-                ) from error
-            polygons.append(np.where(rows < 0, len(vertices) + rows, rows - 1))
-            owner.append(group)
-        elif words[0] in (b"g", b"o"):
-            name = b" ".join(words[1:]).decode("utf-8", "replace") or "unnamed"
-            group = names.setdefault(name, len(names))
-    if any(len(row) != 3 for row in vertices):
-        raise FileFormatError(
-            "a vertex of the OBJ file has no three numbers", where=where, remedy=CUT
-        )
-    words_of_all = [word for row in vertices for word in row]
-    points = float_numbers(words_of_all, where, "OBJ").reshape(-1, 3)
-    corners = _triangulated(points, polygons, where)
-    if len(set(owner)) < 2:
+    found = parse_obj(data, where)
+    corners = _triangulated(found.vertices, found.polygons, where)
+    if len(set(found.group)) < 2:
         return corners, None, ()
-    counts = [max(len(one) - 2, 0) for one in polygons]
-    face = np.repeat(np.array(owner, dtype=np.int64), counts)
+    counts = [max(len(one) - 2, 0) for one in found.polygons]
+    face = np.repeat(np.array(found.group, dtype=np.int64), counts)
     used, face = np.unique(face, return_inverse=True)
-    listed = list(names) or ["unnamed"]
-    return corners, face.astype(np.int64), tuple(listed[k] for k in used.tolist())
+    return corners, face.astype(np.int64), tuple(found.names[k] for k in used.tolist())

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Cad, Part, Pose
+from armscan.inspection.cad import search
 from armscan.inspection.cad.alignment import (
     Alignment,
     align_best,
@@ -55,6 +56,12 @@ def laid(surface: PartSurface, points: FloatArray, normals: FloatArray | None = 
     return found
 
 
+@pytest.fixture
+def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fifth of the starting turns: enough for what is no test of the search, and quicker."""
+    monkeypatch.setattr(search, "TURNS", 140)
+
+
 def test_a_part_of_a_scan_finds_its_place() -> None:
     points, _ = scanned(WEDGE.part)
     points = points[points @ [1.0, 0.5, 0.3] > 60.0]
@@ -65,6 +72,7 @@ def test_a_part_of_a_scan_finds_its_place() -> None:
     assert found.rms_mm == pytest.approx(0.02, rel=0.1)
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_a_patch_of_a_plate_slides_and_turns() -> None:
     points, normals = scanned(PLATE)
     patch = (normals[:, 2] > 0.9) & (np.abs(points - [50, 40, 5]).max(axis=1) < 20.0)
@@ -79,6 +87,7 @@ def test_a_patch_of_a_plate_slides_and_turns() -> None:
     assert max(sigma[3], sigma[4]) < 1e-6
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_a_turned_part_turns_about_its_axis_though_its_triangles_are_flat() -> None:
     points, _ = scanned(STEPPED)
     found = laid(PartSurface(STEPPED), points)
@@ -114,6 +123,7 @@ def test_a_small_mark_tells_the_poses_of_a_box_apart() -> None:
     assert not any(one.is_equal for one in found.rivals)
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_the_mirrored_part_and_another_part_are_refused() -> None:
     points, _ = scanned(WEDGE.part)
     mirrored = align_best(WEDGE, cloud_of(points * [1.0, 1.0, -1.0]), True)
@@ -138,6 +148,7 @@ def test_units_are_noticed(factor: float, word: str) -> None:
         assert word in found.reason
 
 
+@pytest.mark.usefixtures("few_starts")
 @pytest.mark.parametrize(
     ("factor", "word"),
     [(1 / 25.4, "cloud seems to be in inches"), (0.1, "cloud seems to be in centimetres")],
@@ -153,6 +164,7 @@ def test_a_small_cloud_that_fits_much_better_enlarged_is_in_another_unit(
     assert "leave --unit" in found.remedy
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_a_small_patch_of_the_part_is_in_the_right_unit() -> None:
     """A tenth of the plate, 0.05 mm of noise: scaling makes it fit no better over its size."""
     points, normals = scanned(PLATE, 60_000, 0.05)
@@ -162,6 +174,7 @@ def test_a_small_patch_of_the_part_is_in_the_right_unit() -> None:
     assert isinstance(align_best(PartSurface(PLATE), cloud, True), Alignment)
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_a_cloud_that_lies_a_hundredth_of_its_size_off_is_of_another_part() -> None:
     """Waves of 2 mm on a patch of 30 mm, near the plate as its size goes, and not of it."""
     x, y = np.meshgrid(np.linspace(-15, 15, 40), np.linspace(-15, 15, 40))

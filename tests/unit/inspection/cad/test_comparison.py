@@ -20,6 +20,7 @@ from armscan.inspection.cad.comparison import (
     CadOptions,
     compare_with_part,
     deviation_statistics,
+    median_uncertainty,
 )
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import part_of
@@ -296,3 +297,15 @@ def test_a_normal_that_is_askew_beside_an_edge_moves_no_point_to_another_face() 
     below = np.column_stack([np.full(50, 30.0), np.linspace(5.0, 35.0, 50), np.full(50, 0.8)])
     up = np.tile([0.0, 0.0, 1.0], (50, 1))
     np.testing.assert_allclose(wall.distance(below, towards=up).signed_mm, -1.2, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [10, 20, 200])
+def test_the_median_of_few_points_lies_within_its_wider_u(n: int) -> None:
+    """95.45 % of normal draws, as k = 2 says; with the factor 2, ten points hold 90 %."""
+    trials = 4000
+    values = np.random.default_rng(n).normal(0.0, 0.3, (trials, n))
+    label = np.repeat(np.arange(trials), n)
+    u = median_uncertainty(label, trials, values.ravel())
+    held = float((np.abs(np.median(values, axis=1)) <= u).mean())
+    assert 0.935 < held < 0.975
+    assert median_uncertainty(np.array([0, 0, 0, -1]), 2, np.arange(4.0)).tolist() == [0.0, 0.0]

@@ -53,8 +53,22 @@ def cloud_quantities(result: Reconstruction) -> tuple[Quantity, ...]:
     )
 
 
-def _point_quantities(digest: CloudDigest, n_stripe: int) -> tuple[Quantity, ...]:
+def sigma_quantities(digest: CloudDigest) -> tuple[Quantity, ...]:
+    """Median and 95 % of the points' standard deviations."""
     median, high = (float(value) for value in digest.sigma_mm[:2])
+    return (
+        Quantity(
+            "sigma_median_mm",
+            "Sigma of a point",
+            median,
+            unit="mm",
+            meaning=f"median; 95 % below {significant(high)} mm",
+        ),
+        Quantity("sigma_95_mm", "", high),
+    )
+
+
+def _point_quantities(digest: CloudDigest, n_stripe: int) -> tuple[Quantity, ...]:
     low, top, frame = digest.low_mm.tolist(), digest.high_mm.tolist(), digest.shown.frame
     return (
         Quantity(
@@ -64,14 +78,7 @@ def _point_quantities(digest: CloudDigest, n_stripe: int) -> tuple[Quantity, ...
             meaning=f"in the {frame} frame, of {n_stripe:,} stripe points",
         ),
         Quantity("frame", "", frame),
-        Quantity(
-            "sigma_median_mm",
-            "Sigma of a point",
-            median,
-            unit="mm",
-            meaning=f"median; 95 % below {significant(high)} mm",
-        ),
-        Quantity("sigma_95_mm", "", high),
+        *sigma_quantities(digest),
         Quantity("low_corner_mm", "", low),
         Quantity("high_corner_mm", "", top),
         *(fact(axis, f"{low[k]:.2f} to {top[k]:.2f} mm") for k, axis in enumerate("XYZ")),

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from armscan.fusion.digest import CloudDigest
 from armscan.models.calibration import Provenance
-from armscan.report.cloud import digest_view, sigma_histogram
+from armscan.report.cloud import digest_view, sigma_histogram, sigma_quantities
 from armscan.report.page import Gallery, Page, Section, Text, page_of
-from armscan.report.quantity import Quantity, fact, only, significant
+from armscan.report.quantity import Quantity, fact, only
 
 NOT_KNOWN = "not known"
 SIGMA_TEXT = (
@@ -73,16 +73,8 @@ def _sigma_quantities(result: FusedCloud) -> tuple[Quantity, ...]:
             Quantity("sigma_95_mm", "", None),
             Quantity("private_median_mm", "Noise left in it", None, shown=NOT_KNOWN),
         )
-    median, high = (float(value) for value in result.digest.sigma_mm[:2])
     return (
-        Quantity(
-            "sigma_median_mm",
-            "Sigma of a point",
-            median,
-            unit="mm",
-            meaning=f"median; 95 % below {significant(high)} mm",
-        ),
-        Quantity("sigma_95_mm", "", high),
+        *sigma_quantities(result.digest),
         Quantity(
             "private_median_mm",
             "Noise left in it",

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.colors import LinearSegmentedColormap
 
 from armscan.geometry.arrays import FloatArray, IntArray
@@ -71,8 +72,11 @@ FOREIGN_FRAME = "a frame that the file does not name"
 MAX_SHOWN = 20_000
 BAND_MM = 0.05
 LEAST_HALF_WIDTH_MM = 0.01
-RAMP = LinearSegmentedColormap.from_list("deviation", ("#1d4fa5", "#a9b4bd", "#c2331c"))
-"""Blue below, grey at zero, red above: a white middle would vanish on the page."""
+RAMP = LinearSegmentedColormap.from_list(
+    "deviation", colormaps["cividis"](np.linspace(0.0, 0.93, 32))
+)
+"""As of the comparison with a model: lightness alone tells the sign, also in grey print and to
+colour-blind readers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -601,7 +605,7 @@ def feature_view(cloud: PointCloud, rows: IntArray, deviations: Deviations) -> P
 def deviation_view(
     points_mm: FloatArray, deviations_mm: FloatArray, *, title: str, frame: str, reference: str
 ) -> Picture:
-    """Points in space, coloured by deviation: blue inside or below, red outside or above.
+    """Points in space, coloured by deviation: dark inside or below, light outside or above.
 
     Parameters
     ----------

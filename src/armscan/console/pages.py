@@ -87,6 +87,9 @@ class ConsolePage:
         self.points = PointsPanel(SceneView(server))
         self.scanning = ScanPanel(self.controls, self.points, self.finish, self._look)
         self._seen: tuple[bool, str] | None = None
+        self._is_listing = False
+        # real lasers are on only when somebody asked for it
+        self._is_viewing = bench is not None and bench.is_simulated
         self._held = ExitStack()
         self._lock = threading.RLock()
         self.journey = self._opened(folder)
@@ -139,6 +142,9 @@ class ConsolePage:
         self._choice.on_update(lambda _: self._choose_title(self._choice.value))
         self._guide = gui.add_html("")
         self._settings()
+        self._view = self.controls.button(
+            "Camera view", self.view, "V", "Show what the camera sees, lasers on where needed"
+        )
         self._take = self.controls.button(
             "Take", self.take_one, "T", "Record this placement", "teal"
         )
@@ -208,7 +214,7 @@ class ConsolePage:
             self.refresh()
             return
         self.step, self._seen = step, None
-        self.scanning.show_image(None)
+        self._rest()
         self.refresh()
         self._show_stored()
 
@@ -219,7 +225,7 @@ class ConsolePage:
             self.choose(chosen)
 
     def _choose_scan(self, scan: str) -> None:
-        if scan in self.journey.scans and scan != self.scan:
+        if not self._is_listing and scan in self.journey.scans and scan != self.scan:
             self.scan = scan
             self.refresh()
             self._show_stored()
@@ -229,6 +235,18 @@ class ConsolePage:
         order = [one.name for one in self.journey.steps]
         place = order.index(self.step)
         self.choose(order[min(place + 1, len(order) - 1)])
+
+    def view(self) -> None:
+        """Show what the camera sees, or no more."""
+        self._is_viewing = not self._is_viewing
+        if not self._is_viewing:
+            self._rest()
+
+    def _rest(self) -> None:
+        self._is_viewing = self.bench is not None and self.bench.is_simulated
+        self.scanning.show_image(None)
+        if self.bench is not None:
+            self.bench.rest()
 
     def take(self) -> None:
         """Record the placement or touch that is drawn."""
@@ -346,7 +364,7 @@ class ConsolePage:
     def _look(self) -> Exposure | None:
         """What a camera sees while something is put before it to be taken."""
         step = BY_NAME[self.step]
-        if self.bench is None or step.filling in ("motion", "nothing"):
+        if self.bench is None or not self._is_viewing or step.filling != "placements":
             return None
         if self.worker.is_busy or not self._take.visible or not self._lock.acquire(blocking=False):
             return None
@@ -385,6 +403,9 @@ class ConsolePage:
         is_full = is_taken and state.n_taken >= self._n_wanted()
         self._take.visible = is_taken and has_rig and not is_full and not is_blocked
         is_twin = self.bench is not None and self.bench.is_simulated
+        is_view = self._take.visible and step.filling == "placements" and not is_twin
+        self._view.visible = is_view
+        self._view.label = "End the camera view (V)" if self._is_viewing else "Camera view (V)"
         self._take_all.visible = self._take.visible and is_twin
         self._take_back.visible = is_taken and state.n_taken > 0 and has_rig
         self._start_over.visible = is_taken and state.n_taken > 0
@@ -399,10 +420,7 @@ class ConsolePage:
         self._part.visible = self._tolerance.visible = is_cad
         self._scan_choice.visible = self.step in OF_A_SCAN and bool(self.journey.scans)
         self._scan_choice.visible = self._scan_choice.visible and not is_live
-        if self.journey.scans:
-            self._scan_choice.options = self.journey.scans
-            if self.scan in self.journey.scans:
-                put(self._scan_choice, self.scan)
+        self._list_scans()
         now = self.journey.settings
         known: tuple[tuple[Any, object], ...] = (
             (self._target, now.target),
@@ -416,13 +434,23 @@ class ConsolePage:
         self._target.visible = self.step in (StepName.CAMERA, StepName.LASER)
         uses_ball = is_inspection and self._compare.value == "ball"
         self._ball.visible = (self.step is StepName.CHECK or uses_ball) and not is_live
-        can_run = state.n_taken >= step.least or (is_inspection and not is_blocked)
+        can_run = not is_blocked and (is_inspection or state.n_taken >= step.least)
         self._calculate.visible = can_run and not is_live
         verb = "Inspect" if is_inspection else "Calculate"
         self._calculate.label = f"{verb} again (K)" if state.result else f"{verb} (K)"
         is_settled = state.status in ("good", "doubtful")
         self._calculate.color = "gray" if is_settled else "teal"
         self._next.visible = is_settled and not is_live and self.step is not StepName.INSPECT
+
+    def _list_scans(self) -> None:
+        """Show the scans; the library chooses the first of new options by itself."""
+        scans, chosen = self.journey.scans, self.scan
+        if scans and self._scan_choice.options != scans:
+            self._is_listing = True
+            self._scan_choice.options = scans
+            self._is_listing = False
+        if chosen in scans and self._scan_choice.value != chosen:
+            put(self._scan_choice, chosen)
 
     def _overview(self) -> str:
         rows = []

@@ -277,6 +277,9 @@ class TwinBench:
         lit = [row for row in rows[k] if source.rows[row].lasers]
         return self._rendered(scene, (lit or rows[k])[0])
 
+    def rest(self) -> None:
+        """As of `Bench`."""
+
     def _rendered(self, scene: TwinScene, row: int) -> Exposure:
         """An image of a scene; the latest is kept, for it is looked at before it is taken."""
         kept = self._shot
@@ -401,6 +404,7 @@ class DeviceBench:
         self.is_over = self.is_simulated = False
         self._lock = threading.RLock()
         self._watched: tuple[LiveSession, _Latest] | None = None
+        self._lit: tuple[str, ...] | None = None
 
     @property
     def settings(self) -> SessionSettings:
@@ -413,7 +417,7 @@ class DeviceBench:
 
     def take(self, step: StepName, folder: Path, k: int) -> Exposure | None:
         """As of `Bench`: one image in the light of the room, one of each laser, or both."""
-        sources = () if self.rig.lasers is None else self.rig.lasers.sources
+        sources = self._sources
         states: list[tuple[str, ...]] = [()]
         if step is StepName.LASER:
             states = [*((source,) for source in sources), ()]
@@ -444,6 +448,7 @@ class DeviceBench:
         if self.rig.arm is None:
             raise DeviceError("the rig has no arm", remedy="name it in rig.toml")
         latest = self._watch()
+        self._light(())
         latest.samples.clear()
         end = time.monotonic() + WAIT_S
         while not (found := [one for one in tuple(latest.samples) if one.pose is not None]):
@@ -458,7 +463,9 @@ class DeviceBench:
 
     def look(self, step: StepName, k: int) -> Exposure | None:
         """As of `Bench`: the latest image of the first camera."""
-        instants = tuple(self._watch().instants)
+        latest = self._watch()
+        self._light(() if step is StepName.CAMERA else self._sources)
+        instants = tuple(latest.instants)
         frames = [one.frames[0] for one in instants if one.frames[0] is not None]
         if not frames:
             return None
@@ -471,14 +478,25 @@ class DeviceBench:
                 latest = _Latest()
                 session = LiveSession(self.rig, recorder=latest)
                 session.start()
-                self._watched = session, latest
+                self._watched, self._lit = (session, latest), None
             return self._watched[1]
 
-    def _rest(self) -> None:
+    def rest(self) -> None:
+        """As of `Bench`."""
         with self._lock:
             if self._watched is not None:
                 self._watched[0].stop()
             self._watched = None
+
+    @property
+    def _sources(self) -> tuple[str, ...]:
+        return () if self.rig.lasers is None else self.rig.lasers.sources
+
+    def _light(self, lasers: tuple[str, ...]) -> None:
+        """Have these lasers on from now."""
+        if self.rig.lasers is not None and self._lit != lasers:
+            self.rig.lasers.set_next(lasers)
+            self._lit = lasers
 
     def _instants(
         self, states: Sequence[tuple[str, ...]], step: StepName
@@ -486,8 +504,7 @@ class DeviceBench:
         """One complete instant of each state of the lasers."""
         latest = self._watch()
         for state in states:
-            if self.rig.lasers is not None:
-                self.rig.lasers.set_next(state)
+            self._light(state)
             latest.instants.clear()
             end = time.monotonic() + WAIT_S
             while (one := self._complete(latest, state, step)) is None:
@@ -498,6 +515,7 @@ class DeviceBench:
                     )
                 time.sleep(0.01)
             yield one
+        self._light(())
 
     def _complete(
         self, latest: _Latest, state: tuple[str, ...], step: StepName
@@ -512,7 +530,7 @@ class DeviceBench:
 
     def scan_rig(self, step: StepName) -> Rig:
         """As of `Bench`."""
-        self._rest()
+        self.rest()
         return self.rig
 
     def hold(self, is_held: bool) -> None:
@@ -520,7 +538,7 @@ class DeviceBench:
 
     def close(self) -> None:
         """As of `Bench`."""
-        self._rest()
+        self.rest()
         self.rig.close()
 
 

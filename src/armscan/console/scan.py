@@ -198,11 +198,16 @@ class Bench(Protocol):
     def look(self, step: StepName, k: int) -> Exposure | None:
         """What a camera sees now, before placement ``k`` is taken; None if there is nothing new.
 
+        The lasers that the step is about are on meanwhile, until `rest`.
+
         Raises
         ------
         ArmscanError
             If a device does not open.
         """
+
+    def rest(self) -> None:
+        """Lasers off, and no more images."""
 
     def scan_rig(self, step: StepName) -> Rig:
         """Opened devices for a scan, with the thing that the step is about before them."""
@@ -434,8 +439,9 @@ class LiveScan:
             self._frame_of[number] = int(source.rpartition(" ")[2])
 
     def _hear(self, event: LiveEvent) -> None:
-        is_end = event.kind in ("fault", "recovered") and (
-            self.bench.is_over or self.session.snapshot().state != "scanning"
+        # a simulated hand waits for its images to be rendered, and any hand may pause
+        is_silence = event.kind in ("fault", "recovered") and (
+            self.bench.is_simulated or self.session.snapshot().state != "scanning"
         )
-        if not is_end:
+        if not is_silence:
             self.events.append(event)

@@ -274,7 +274,7 @@ class SceneView:
         for k, place in enumerate(joints[:-1]):
             self._head.append(
                 self._scene.add_icosphere(
-                    f"/head/joint{k}", radius=0.12, color=rgb(INK), position=tuple(place.tolist())
+                    f"/head/joint{k}", radius=0.06, color=rgb(INK), position=tuple(place.tolist())
                 )
             )
         self._head.append(self._scene.add_frame("/head/base", axes_length=0.6, axes_radius=0.02))

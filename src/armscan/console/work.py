@@ -285,7 +285,8 @@ def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> t
         lacks += [reason for _, reason in found.not_found]
     if step in (StepName.LASER, StepName.HAND_EYE):
         n = [len(extract_stripes(one).points_px) for one in lit]
-        seen += [f"a laser line of {count} points" for count in n if count >= LEAST_LINE]
+        counts = [str(count) for count in n if count >= LEAST_LINE]
+        seen += [f"a laser line of {' and '.join(counts)} points"] if counts else []
         if not lit or min(n) < LEAST_LINE:
             lacks.append("no laser line is seen: look at laser, exposure and distance")
     if lacks:

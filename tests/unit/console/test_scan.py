@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from armscan.console.placements import (
 from armscan.console.rig import DeviceBench, _Hand, _HandArm, _HandCamera, take_back
 from armscan.console.scan import LiveScan
 from armscan.console.scene import ShownPoints, depths_mm, point_colours, range_bar, thinned
+from armscan.devices.protocols import LaserEvent
 from armscan.devices.sources import ScanSource
 from armscan.errors import OutputError
 from armscan.pipeline.live.rig import Rig, RigDescription
@@ -106,6 +108,9 @@ def test_a_pass_taken_back_is_in_neither_cloud_nor_recording(tmp_path: Path) -> 
     live.start()
     waited(lambda: sum(live.snapshot.counts.values()) >= 5)
     live.pause()
+    n_counted = -1
+    while n_counted != (n_counted := sum(live.snapshot.counts.values())):
+        time.sleep(0.5)  # what came before the pause is measured
     n_first = live.n_recorded
     before = set(live.session.cloud().exposure.tolist())
     live.start()
@@ -168,6 +173,47 @@ def test_devices_are_taken_from_one_placement_at_a_time(tmp_path: Path) -> None:
     assert [row.view for row in found.rows] == ["01", "01"] and len(found.arm.t_ns) == 2
     bench.take(StepName.HAND_EYE, tmp_path / "r", 1)
     assert [row.view for row in read_recording(tmp_path / "r").rows] == ["01", "01", "02", "02"]
+    bench.close()
+
+
+class TellingLasers:
+    """A laser that says what it was asked for."""
+
+    name, sources = "drawn laser", ("A",)
+
+    def __init__(self) -> None:
+        self.asked: list[object] = []
+
+    def set_schedule(self, steps: Sequence[tuple[str, ...]]) -> None:
+        self.asked.append(("schedule", *steps))
+
+    def set_next(self, lasers: tuple[str, ...]) -> None:
+        self.asked.append(lasers)
+
+    def start(self, rate_hz: float | None) -> None:
+        self.asked.append("start")
+
+    def read(self, timeout_s: float) -> tuple[LaserEvent, ...]:
+        time.sleep(timeout_s)
+        return ()
+
+    def stop(self) -> None:
+        self.asked.append("off")
+
+    def close(self) -> None:
+        self.asked.append("closed")
+
+
+def test_lasers_are_on_only_where_the_step_needs_them_and_off_afterwards() -> None:
+    hand, lasers = _Hand(drawn_scan(40), rate_hz=50.0, is_held=False), TellingLasers()
+    description = RigDescription(("d",), is_common_trigger=True)
+    rig = Rig([_HandCamera(hand, 0)], _HandArm(hand), lasers, description)
+    bench = DeviceBench(rig, "rig.toml")
+    assert lasers.asked == [], "a page that is opened turns nothing on"
+    for step in (StepName.CAMERA, StepName.CAMERA, StepName.HAND_EYE):
+        bench.look(step, 0)
+    bench.rest()
+    assert lasers.asked == ["start", (), ("A",), "off"]
     bench.close()
 
 

@@ -8,15 +8,19 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from armscan.cli import main
 from armscan.fusion.voxel_map import VoxelMap
 from armscan.reconstruction.place import merge_clouds
 from armscan.storage import clouds as clouds_module
 from armscan.storage.clouds import ply_bytes, read_ply
+from armscan.storage.documents import scanner_document
 from rigs.long_scan import stripes
+from rigs.scan_fake import line_image, looking_down, scanner
 
 
 @pytest.fixture
@@ -116,3 +120,48 @@ def test_bad_input_is_refused_and_nothing_is_left(
     assert main(["fuse", *words]) == 2
     assert capsys.readouterr().err.startswith("error: ")
     assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def write_scan(folder: Path, n: int) -> tuple[Path, Path]:
+    """A folder recording of n lines over a plate, 0.4 mm apart, and its scanner's document."""
+    rng = np.random.default_rng(0)
+    recording = folder / "scan"
+    recording.mkdir()
+    exposures = ["index,t_ns,camera,file,lasers,trigger_id"]
+    arm = ["t_ns,x_mm,y_mm,z_mm,qw,qx,qy,qz,trigger_id"]
+    for k in range(n):
+        pose = looking_down(0.4 * k)
+        grey = np.clip(np.round(line_image(pose, rng)), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(recording / f"{k}.png"), grey)
+        exposures.append(f"{k},{1000 * (k + 1)},0,{k}.png,A,{k}")
+        x, y, z, w = Rotation.from_matrix(pose.rotation).as_quat()
+        numbers = [float(value) for value in (*pose.translation_mm, w, x, y, z)]
+        arm.append(f"{1000 * (k + 1)},{','.join(map(repr, numbers))},{k}")
+    (recording / "exposures.csv").write_text("\n".join(exposures) + "\n")
+    (recording / "arm.csv").write_text("\n".join(arm) + "\n")
+    document = folder / "scanner.json"
+    document.write_bytes(scanner_document(scanner()))
+    return recording, document
+
+
+def test_a_scan_thinned_as_it_is_written_is_its_cloud_fused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`reconstruct --voxel` and `fuse` of the whole cloud make the same points."""
+    recording, scanner = write_scan(tmp_path, n=24)
+    words = ["reconstruct", str(recording), "--scanner", str(scanner), "--no-cache", "--json"]
+    whole, thin, fused = (tmp_path / f"{name}.ply" for name in ("whole", "thin", "fused"))
+    assert main([*words, "-o", str(whole)]) == 0
+    n_points = json.loads(capsys.readouterr().out)["n_points"]
+    assert main([*words, "-o", str(thin), "--voxel", "0.5"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert main(["fuse", str(whole), "--voxel", "0.5", "-o", str(fused)]) == 0
+    found, wanted = read_ply(thin), read_ply(fused)
+    assert told["n_points"] == n_points > 2 * told["n_fused"]
+    assert told["n_fused"] == len(found) == len(wanted)
+    # the file of the whole cloud holds its numbers in single precision
+    np.testing.assert_allclose(found.points_mm, wanted.points_mm, atol=1e-5)
+    np.testing.assert_allclose(found.covariance_mm2, wanted.covariance_mm2, rtol=1e-4, atol=1e-9)
+    assert main([*words, "-o", str(tmp_path / "no.ply"), "--voxel", "-1"]) == 2
+    assert "voxels of -1 mm" in capsys.readouterr().err
+    assert not (tmp_path / "no.ply").exists()

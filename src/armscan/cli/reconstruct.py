@@ -36,6 +36,7 @@ RECONSTRUCT_EXAMPLE = (
     "  armscan reconstruct scan/laser.png --background scan/dark.png --sensor sensor.json \\\n"
     "      --sheet A -o cloud.ply\n"
     "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply\n"
+    "  armscan reconstruct scan --scanner scanner.json --voxel 0.2 -o thin.ply\n"
     "  armscan reconstruct 'p*.yml' --poses RobPoses.rob --scanner scanner.json -o cloud.ply"
 )
 FUSE_EXAMPLE = "\b\nExample:\n  armscan fuse monday.ply tuesday.ply --voxel 0.2 -o fused.ply"
@@ -86,6 +87,14 @@ ClusterOption = Annotated[
         show_default=False,
     ),
 ]
+VoxelOption = Annotated[
+    float | None,
+    typer.Option(
+        "--voxel",
+        help="Thin the cloud in Base to one point a voxel of this edge, mm, as `fuse` does.",
+        show_default=False,
+    ),
+]
 Volume = Annotated[
     str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
 ]
@@ -109,6 +118,7 @@ def reconstruct(
     sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
     depth_margin: DepthMargin = None,
     volume: Volume = "",
+    voxel: VoxelOption = None,
     arm: ArmFile = None,
     poses: ProfilePoses = None,
     euler: EulerAngles = None,
@@ -155,6 +165,7 @@ def reconstruct(
             image_options=given(ImageOptions, bits_used=bits_used, align=bits_align),
             is_profiled=profile,
             cluster=None if cluster is None else ClusterAddress(cluster),
+            voxel_mm=voxel,
         ),
         as_json=as_json,
         output=output,

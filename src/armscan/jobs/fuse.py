@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,6 +70,27 @@ def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
             voxels.close()
 
 
+def fused_marks(voxels: VoxelMap) -> PointCloud:
+    """Names and marks of a map's fused points, and none of these."""
+    empty = PointCloud.empty(
+        frame=voxels.frame or "Part", sheet_names=(FUSED,), exposure_sources=(FUSED,)
+    )
+    return replace(
+        empty,
+        normals=np.zeros((0, 3)) if voxels.has_normals else None,
+        noise_length=np.zeros(0) if voxels.has_noise_length else None,
+        is_simulated=voxels.is_simulated,
+        forced=voxels.forced,
+        calibrations=voxels.calibrations,
+    )
+
+
+def fused_pieces(voxels: VoxelMap) -> Iterator[CloudPiece]:
+    """A map's points, as files take them."""
+    for piece in voxels.fused():
+        yield CloudPiece(piece.cloud, piece.cloud.sigma_mm, piece.n_points)
+
+
 def _refuse_twice(paths: Sequence[Path]) -> None:
     """Points that count twice would seem more certain than they are."""
     first: dict[str, Path] = {}
@@ -86,18 +107,10 @@ def _refuse_twice(paths: Sequence[Path]) -> None:
 def _written(
     job: Job, paths: Sequence[Path], places: Sequence[Path], voxels: VoxelMap, scratch: Path
 ) -> Summary:
-    assert voxels.frame is not None  # noqa: S101 - there are points
-    with PointSpool(voxels.frame, (FUSED,), scratch) as points:
+    with PointSpool(voxels.frame or "Part", (FUSED,), scratch) as points:
         for piece in voxels.fused():
             points.add(piece.cloud)
-        marks = replace(
-            PointCloud.empty(frame=voxels.frame, sheet_names=(FUSED,), exposure_sources=(FUSED,)),
-            normals=np.zeros((0, 3)) if voxels.has_normals else None,
-            noise_length=np.zeros(0) if voxels.has_noise_length else None,
-            is_simulated=voxels.is_simulated,
-            forced=voxels.forced,
-            calibrations=voxels.calibrations,
-        )
+        marks = fused_marks(voxels)
         digest = CloudDigest.of_spool(points, marks)
         n_points = len(points)
         private = percentiles(lambda: (part[:, 1] for part in points.sigmas()), (50.0,), n_points)
@@ -110,10 +123,7 @@ def _written(
     )
     warnings = () if voxels.has_covariance else (NOT_KNOWN,)
     provenance = job.provenance(paths, (), warnings=warnings, forced=voxels.forced)
-    pieces = (
-        CloudPiece(piece.cloud, piece.cloud.sigma_mm, piece.n_points) for piece in voxels.fused()
-    )
-    content = cloud_parts(places[0], marks, n_points, pieces, is_fused=True)
+    content = cloud_parts(places[0], marks, n_points, fused_pieces(voxels), is_fused=True)
     written = job.write({places[0]: content, places[1]: fused_page(result, provenance, warnings)})
     losses = cloud_losses(marks, places[0])
     kind = places[0].suffix.lstrip(".").upper()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,10 @@ import numpy as np
 from armscan.errors import InputError, OptionError
 from armscan.fusion.digest import CloudDigest
 from armscan.fusion.point_spool import PointSpool
+from armscan.fusion.voxel_map import VoxelMap
 from armscan.geometry.arrays import Box
 from armscan.geometry.rotations import EulerConvention, check_convention
+from armscan.jobs.fuse import fused_marks, fused_pieces
 from armscan.jobs.job import Job
 from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
 from armscan.pipeline.cluster.extraction import ClusterAddress, ClusterReader
@@ -43,7 +46,7 @@ from armscan.report.cloud import (
     status_totals,
 )
 from armscan.report.page import Page, render_page
-from armscan.report.quantity import Summary, sentences
+from armscan.report.quantity import Quantity, Summary, sentences
 from armscan.storage.arm import read_arm_model
 from armscan.storage.clouds import CLOUD_SUFFIXES, CloudPiece, cloud_losses, cloud_parts
 from armscan.storage.documents import (
@@ -147,6 +150,7 @@ def reconstruct(
     image_options: ImageOptions | None = None,
     is_profiled: bool = False,
     cluster: ClusterAddress | None = None,
+    voxel_mm: float | None = None,
 ) -> Summary:
     """Measure a recording in Base if there is one and a scanner's document, else in Sensor.
 
@@ -173,6 +177,8 @@ def reconstruct(
         Say what each stage of a scan took.
     cluster
         Whose workers extract the stripes of a scan; None to do so here.
+    voxel_mm
+        Edge of the voxels of which each gives one point of the cloud in Base; None for all points.
 
     Raises
     ------
@@ -182,8 +188,11 @@ def reconstruct(
     """
     options, image_options = options or MeasureOptions(), image_options or ImageOptions()
     box = Box.parse(volume, "--volume") if volume else None
+    if voxel_mm is not None:
+        # a wrong size is refused before the work
+        VoxelMap(voxel_mm).close()
     if poses is not None:
-        return _delivered(job, calibration, paths.images, poses, box)
+        return _delivered(job, calibration, paths.images, poses, box, voxel_mm=voxel_mm)
     recordings = [Path(name) for name in paths.images if is_recording(Path(name))]
     if recordings and not (paths.background or paths.right):
         image_options.check_unused()
@@ -197,9 +206,22 @@ def reconstruct(
         _check_own_images(paths)
         chosen = ScanOptions(measure=options, volume=box)
         return _scan(
-            job, calibration, recordings[0], arm, chosen, is_profiled=is_profiled, cluster=cluster
+            job,
+            calibration,
+            recordings[0],
+            arm,
+            chosen,
+            is_profiled=is_profiled,
+            cluster=cluster,
+            voxel_mm=voxel_mm,
         )
-    of_scans = {"--volume": volume, "--arm": arm, "--profile": is_profiled, "--cluster": cluster}
+    of_scans = {
+        "--volume": volume,
+        "--arm": arm,
+        "--profile": is_profiled,
+        "--cluster": cluster,
+        "--voxel": voxel_mm,
+    }
     for option, value in of_scans.items():
         if value:
             raise OptionError(
@@ -303,9 +325,10 @@ def _write(
     n_points: int,
     pieces: Iterable[CloudPiece],
     page: Callable[[], Page],
+    is_fused: bool = False,
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """The files written, the page last, and what they do not hold."""
-    content = cloud_parts(places[0], marks, n_points, pieces)
+    content = cloud_parts(places[0], marks, n_points, pieces, is_fused=is_fused)
     written = job.write({places[0]: content, places[1]: (render_page(make()) for make in (page,))})
     losses = cloud_losses(marks, places[0])
     kind = places[0].suffix.lstrip(".").upper()
@@ -321,6 +344,7 @@ def _scan(
     *,
     is_profiled: bool,
     cluster: ClusterAddress | None,
+    voxel_mm: float | None,
 ) -> Summary:
     clock = StageClock()
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
@@ -356,11 +380,18 @@ def _scan(
             scanner=scanner,
             is_simulated=recording.is_simulated,
             clock=clock if is_profiled else None,
+            voxel_mm=voxel_mm,
         )
 
 
 def _delivered(
-    job: Job, calibration: Path, names: Sequence[str], table: PoseTable, volume: Box | None
+    job: Job,
+    calibration: Path,
+    names: Sequence[str],
+    table: PoseTable,
+    volume: Box | None,
+    *,
+    voxel_mm: float | None,
 ) -> Summary:
     """Place profiles that a sensor delivered."""
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
@@ -385,6 +416,7 @@ def _delivered(
         provenance=provenance,
         warnings=scan.warnings,
         scanner=scanner,
+        voxel_mm=voxel_mm,
     )
 
 
@@ -400,6 +432,7 @@ def _told(
     scanner: ScannerCalibration,
     is_simulated: bool = False,
     clock: StageClock | None = None,
+    voxel_mm: float | None = None,
 ) -> Summary:
     """Write a cloud in Base and say what came out."""
     timer = clock or StageClock()
@@ -417,24 +450,22 @@ def _told(
             is_simulated=is_simulated,
         )
 
-    def pieces() -> Iterator[CloudPiece]:
-        with timer.stage("writing", is_alone=True):
-            yield from (CloudPiece(one.cloud, one.sigma_mm) for one in points.pieces())
-
-    written, losses = _write(
-        job,
-        places,
-        marks=scan.cloud,
-        n_points=len(points),
-        pieces=pieces(),
-        page=page,
-    )
+    with _writing(points, scan.cloud, voxel_mm, timer) as cloud:
+        written, losses = _write(
+            job,
+            places,
+            marks=cloud.marks,
+            n_points=cloud.n_points,
+            pieces=cloud.pieces,
+            page=page,
+            is_fused=voxel_mm is not None,
+        )
     profile = None if clock is None else clock.profile()
     costs = () if profile is None else profile_quantities(scan, digest, profile)
     tables = (status_totals(scan),) if scan.counts else ()
     return Summary(
         title="Scan placed in Base" + (" (simulated images)." if is_simulated else "."),
-        quantities=(*scan_quantities(scan, digest), *costs),
+        quantities=(*scan_quantities(scan, digest), *cloud.told, *costs),
         tables=tables if profile is None else (*tables, profile_table(scan, profile)),
         warnings=sentences((*warnings, *losses)),
         written=written,
@@ -446,6 +477,47 @@ def _told(
             "hand_eye_of": scanner.provenance.document_id,
         },
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Writing:
+    """What goes into the file of a cloud: names, count, points, and what is told of thinning."""
+
+    marks: PointCloud
+    n_points: int
+    pieces: Iterator[CloudPiece]
+    told: tuple[Quantity, ...] = ()
+
+
+@contextmanager
+def _writing(
+    points: PointSpool, marks: PointCloud, voxel_mm: float | None, timer: StageClock
+) -> Iterator[_Writing]:
+    """All points, or one a voxel, while they are written."""
+
+    def timed(pieces: Iterable[CloudPiece]) -> Iterator[CloudPiece]:
+        with timer.stage("writing", is_alone=True):
+            yield from pieces
+
+    if voxel_mm is None:
+        every = (CloudPiece(one.cloud, one.sigma_mm) for one in points.pieces())
+        yield _Writing(marks, len(points), timed(every))
+        return
+    voxels = VoxelMap(voxel_mm, points.folder)
+    try:
+        with timer.stage("fusing", is_alone=True):
+            for piece in points.pieces():
+                voxels.add(piece.cloud)
+            n_fused = sum(len(part.cloud) for part in voxels.fused())
+        own = replace(fused_marks(voxels), is_simulated=marks.is_simulated, forced=marks.forced)
+        meaning = f"in the cloud, one a voxel of {voxel_mm:g} mm; all else is told of all points"
+        told = (
+            Quantity("n_fused", "Fused points", n_fused, meaning=meaning),
+            Quantity("voxel_mm", "", voxel_mm),
+        )
+        yield _Writing(own, n_fused, timed(fused_pieces(voxels)), told)
+    finally:
+        voxels.close()
 
 
 def _check_own_images(paths: StillPaths) -> None:

@@ -12,7 +12,6 @@ import typer.main
 from armscan.cli import (
     calibrate_cameras,
     calibrate_sensor,
-    clean,
     files,
     inspect,
     inspect_cad,
@@ -114,7 +113,7 @@ app.command("reconstruct", epilog=reconstruct_command.RECONSTRUCT_EXAMPLE)(
 app.command("fuse", epilog=reconstruct_command.FUSE_EXAMPLE)(reconstruct_command.fuse)
 app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
 app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
-app.command("clean", epilog=clean.CLEAN_EXAMPLE)(clean.clean)
+app.command("clean", epilog=surface.CLEAN_EXAMPLE)(surface.clean)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
 app.command("mesh", epilog=surface.MESH_EXAMPLE)(surface.mesh)
 app.command("record", epilog=RECORD_EXAMPLE)(record)

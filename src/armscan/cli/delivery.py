@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from armscan.jobs.job import Job
 
 TitleBlockOption = Annotated[
-    list[str],
+    list[str] | None,
     typer.Option(
         "--title-block",
         help="At the head of the page: KEY=TEXT with part, serial, order, customer, operator, "
@@ -48,15 +48,15 @@ def delivered(command: Callable[..., Any]) -> Callable[..., Any]:
     """The command with both options; jobs that it runs are given them by `with_delivery`."""
 
     @functools.wraps(command)
-    def both(*words: Any, title_block: list[str], pdf: Path | None, **options: Any) -> Any:
-        token = ASKED.set(Asked(tuple(title_block), pdf))
+    def both(*words: Any, title_block: list[str] | None, pdf: Path | None, **options: Any) -> Any:
+        token = ASKED.set(Asked(tuple(title_block or ()), pdf))
         try:
             return command(*words, **options)
         finally:
             ASKED.reset(token)
 
     kinds: dict[str, tuple[Any, Any]] = {
-        "title_block": (TitleBlockOption, []),
+        "title_block": (TitleBlockOption, None),
         "pdf": (PdfOption, None),
     }
     known = inspect.signature(command, eval_str=True)

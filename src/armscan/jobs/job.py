@@ -21,7 +21,7 @@ from armscan.inspection.title_block import TitleBlock, calibration_state
 from armscan.models.calibration import Provenance
 from armscan.pipeline.progress import Progress, silent
 from armscan.records.cloud import PointCloud
-from armscan.report.delivery import Delivery, delivery_of, pdf_bytes, require_pdf
+from armscan.report.inspection.delivery import Delivery, delivery_of, pdf_bytes, require_pdf
 from armscan.report.page import Page, render_page
 from armscan.report.quantity import sentences
 from armscan.storage.detection_cache import DetectionCache

@@ -16,8 +16,8 @@ import pytest
 from armscan.cli import main
 from armscan.inspection.title_block import TitleBlock, calibration_state
 from armscan.records.cloud import CalibrationMark
-from armscan.report.delivery import calibration_warnings, pdf_bytes
 from armscan.report.drawing import _turned
+from armscan.report.inspection.delivery import calibration_warnings, pdf_bytes
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.documents import scanner_document
 from rigs.calibration_documents import scanner_calibration

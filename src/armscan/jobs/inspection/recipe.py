@@ -14,8 +14,8 @@ from armscan.errors import ArmscanError, OptionError, OutputError
 from armscan.inspection.recipe import FollowedRecipe, PartRow, follow_recipe
 from armscan.jobs.job import Job, solved
 from armscan.pipeline.progress import ProgressEvent
-from armscan.report.delivery import require_pdf
 from armscan.report.inspection.cad import cad_page, cad_warnings
+from armscan.report.inspection.delivery import require_pdf
 from armscan.report.inspection.recipe import (
     part_page,
     parts_table,

@@ -203,7 +203,8 @@ class _Recording:
         speed = (status.n_bytes - before.n_bytes) / max(seconds - then, 1e-3)
         rate = (status.n_accepted - before.n_accepted) / max(seconds - then, 1e-3)
         free = shutil.disk_usage(self._output.parent).free
-        lasts = f" ({free / speed / 60.0:,.0f} min)" if speed > 0.0 else ""
+        # chunks are written now and then: how long the space lasts follows from the whole
+        lasts = f" ({free * seconds / status.n_bytes / 60.0:,.0f} min)" if status.n_bytes else ""
         n_lost, n_late = self._losses()
         words = [
             f"{seconds:5.0f} s",

@@ -194,6 +194,24 @@ def _changed(**changes: Any) -> Callable[[Any, float], Frame | None]:
     return read
 
 
+_HELD: dict[str, Frame | None] = {}
+
+
+def _starting(start: Any, trigger: Any) -> None:
+    _HELD["again"] = _HELD.get("last")
+    start(trigger)
+
+
+def _holding(read: Any, timeout_s: float) -> Frame | None:
+    """After a start, first of all the last frame of before the stop."""
+    again = _HELD.pop("again", None)
+    if again is not None:
+        return again
+    frame: Frame | None = read(timeout_s)
+    _HELD["last"] = frame or _HELD.get("last")
+    return frame
+
+
 def _late(read: Any, timeout_s: float) -> Any:
     time.sleep(1.0)
     return read(timeout_s)
@@ -212,6 +230,7 @@ def _late(read: Any, timeout_s: float) -> Any:
         ({"read": _late}, "keep to the timeout"),
         ({"read": lambda read, _: ()}, r"\(\) where nothing came|no Frame|frames came"),
         ({"stop": lambda stop, _: None}, "though it is not started"),
+        ({"start": _starting, "read": _holding}, "had taken before the stop"),
         ({"close": lambda close, _: None}, "after close"),
         ({"configure": lambda configure, _: CameraSettings()}, "without values changed"),
     ],

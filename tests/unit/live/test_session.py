@@ -19,6 +19,7 @@ from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import ArmSample, CameraSettings, Frame, LaserEvent
 from armscan.errors import DeviceError, InputError, OutputError
 from armscan.models.arm import forward, thesis_arm
+from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
 from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus, exposure_of
 from armscan.pipeline.measure import measure_instants
@@ -298,6 +299,28 @@ def test_a_driver_that_fails_at_the_start_stops_the_rig() -> None:
     with pytest.raises(DeviceError, match="camera 0: its driver failed"):
         session.start()
     assert rig.arm.calls == ["start", "stop"]
+
+
+def test_a_rig_that_did_not_start_may_be_started_again() -> None:
+    """With exposure control, whose thread must not be left behind."""
+    rig = rig_of(triggered_scan(2))
+    real = rig.arm.start
+
+    def start() -> None:
+        raise DeviceError("not referenced")
+
+    rig.arm.start = start
+    before = threading.active_count()
+    options = replace(ALL, exposure=ExposureSettings("automatic"))
+    session = LiveSession(rig, scanner(), options=options)
+    with pytest.raises(DeviceError, match="not referenced"):
+        session.start()
+    assert threading.active_count() == before
+    rig.arm.start = real
+    session.start()
+    assert session.snapshot().state == "scanning"
+    session.stop()
+    assert threading.active_count() == before
 
 
 def test_a_fault_in_measuring_is_told_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

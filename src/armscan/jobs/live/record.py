@@ -119,7 +119,6 @@ def record_scan(
     scanner = None if place is None else read_scanner_calibration(place)
     with Rig.open(description, open_device) as rig:
         rig.set_windows()
-        output.unlink(missing_ok=True)
         run = _Recording(rig, scanner, output, tell)
         run.until_the_end(request)
     return run.summary(place)
@@ -154,6 +153,8 @@ class _Recording:
         self._session.open()
         try:
             self._wait_for_clocks()
+            # what is to be replaced stays until the devices run
+            self._output.unlink(missing_ok=True)
             self._recorder.begin()
             self._session.add_listener(self._recorder.hear)
             start = time.monotonic()
@@ -163,10 +164,12 @@ class _Recording:
             except KeyboardInterrupt:
                 self._is_interrupted = True
             self._seconds = time.monotonic() - start
-        finally:
+        except BaseException:
             self._session.stop()
             with suppress(OutputError):
-                self._end = self._recorder.status()
+                self._recorder.close()
+            raise
+        self._session.stop()
         self._end = self._recorder.close()
         if not self._end.n_written:
             self._output.unlink(missing_ok=True)
@@ -203,7 +206,8 @@ class _Recording:
         speed = (status.n_bytes - before.n_bytes) / max(seconds - then, 1e-3)
         rate = (status.n_accepted - before.n_accepted) / max(seconds - then, 1e-3)
         free = shutil.disk_usage(self._output.parent).free
-        lasts = f" ({free / speed / 60.0:,.0f} min)" if speed > 0.0 else ""
+        # chunks are written now and then: how long the space lasts follows from the whole
+        lasts = f" ({free * seconds / status.n_bytes / 60.0:,.0f} min)" if status.n_bytes else ""
         n_lost, n_late = self._losses()
         words = [
             f"{seconds:5.0f} s",

@@ -188,7 +188,7 @@ class ExposureControl:
         self._changed = threading.Condition()
         self._is_over = False
         self._wanted: dict[tuple[str, ...], tuple[float, float]] = {}
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Set what is given, and begin to look at images.
@@ -203,6 +203,8 @@ class ExposureControl:
             wished = CameraSettings(exposure_us=given.exposure_us or None, gain_db=given.gain_db)
             self._tell(self._camera.configure(wished))
         if given.mode != "fixed":
+            self._is_over = False
+            self._thread = threading.Thread(target=self._run, daemon=True)
             self._thread.start()
 
     def show(self, frame: Frame, lasers: tuple[str, ...] | None) -> None:
@@ -217,8 +219,9 @@ class ExposureControl:
         with self._changed:
             self._is_over = True
             self._changed.notify()
-        if self._thread.is_alive():
+        if self._thread is not None:
             self._thread.join()
+            self._thread = None
 
     def adjust(self, frame: Frame, lasers: tuple[str, ...]) -> CameraSettings | None:
         """Look at one image and set the camera; returns what it took, None if nothing changed.

@@ -325,9 +325,15 @@ class LiveSession:
         """
         if self._state != "closed":
             raise DeviceError("a session is opened once", remedy="make a new one")
-        for control in self._controls:
-            control.start()
-        self._acquisition.start()
+        try:
+            for control, camera in zip(self._controls, self._rig.cameras, strict=True):
+                with told_as_fault_of(camera.name):
+                    control.start()
+            self._acquisition.start()
+        except BaseException:
+            for control in self._controls:
+                control.stop()
+            raise
         self._measuring.start()
         self._choose_lasers()
         self._change("ready")

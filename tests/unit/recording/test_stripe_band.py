@@ -117,6 +117,7 @@ def test_a_recording_is_converted_to_its_band(
         found = read_recording(band)
         assert found.session.is_stripe_band
         assert 0.2 < (found.exposure(0).image == lit_image(0)).mean() < 0.75
+    assert "of these as a band  1" in capsys.readouterr().out
     assert main(["convert", str(tmp_path / "a.mcap"), str(tmp_path / "b"), "--stripe-band"]) == 2
     assert "--stripe-band: a stripe band is for recordings" in capsys.readouterr().err
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from armscan.errors import OptionError
 from armscan.report.quantity import Quantity, Summary
 from armscan.storage.files import check_outputs, is_folder, scratch_folder
-from armscan.storage.recording import is_recording
+from armscan.storage.recording import is_recording, read_recording
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording, record_folder
+from armscan.storage.recordings.write_mcap import has_band
 
 SUFFIX = ".mcap"
 
@@ -53,9 +54,18 @@ def convert_recording(
         )
     check_outputs((output,), is_overwriting=is_overwriting)
     status = record_folder(source, output, is_stripe_band=is_stripe_band)
+    made = read_recording(output) if is_stripe_band else None
+    n_banded = (
+        0
+        if made is None
+        else sum(has_band(row, made.session.cameras[row.camera]) for row in made.rows)
+    )
     return Summary(
         title="Converted: recording to one file.",
-        quantities=(Quantity("exposures", "exposures", status.n_written),),
+        quantities=(
+            Quantity("exposures", "exposures", status.n_written),
+            *((Quantity("with_band", "of these as a band", n_banded),) if is_stripe_band else ()),
+        ),
         written=(output,),
         next_step=f"armscan convert {output} FOLDER",
         extra={"kind": "conversion"},

@@ -74,6 +74,7 @@ from armscan.storage.recordings.write_mcap import (
     RecordingWriter,
     WriterOptions,
     WriterStatus,
+    has_band,
 )
 from armscan.storage.tables import read_csv
 
@@ -354,11 +355,10 @@ def image_bytes(folder: Path, rows: Sequence[ExposureRow]) -> Iterator[bytes]:
 def _stored(
     recording: FolderRecording, rows: Sequence[ExposureRow]
 ) -> Iterator[ImageArray | bytes]:
-    """Pixels of grey cameras as their files hold them, and files of the others."""
+    """Pixels, as their files hold them, of images of which a band is kept; files of the others."""
     for row in rows:
         setup, path = recording.session.cameras[row.camera], recording.folder / row.source
-        is_grey = setup.colour == "mono"
-        yield read_exposure(path).image if is_grey else read_bytes(path)
+        yield read_exposure(path).image if has_band(row, setup) else read_bytes(path)
 
 
 def _span(arm: ArmTrack, rows: Sequence[ExposureRow], session: Session) -> slice:

@@ -46,11 +46,8 @@ CHUNK_BYTES = 4 << 20
 """Of images in one chunk: reading one exposure unpacks no more than this and one image."""
 CHUNK_SECONDS = 0.5
 """After so long a chunk is closed and handed to the system; a killed process loses no more."""
-DOCUMENTS_SECONDS = 5.0
-"""So often the documents are written again: what is left of a broken file can be read without its
-beginning."""
-MOST_REPEATED_BYTES = 1 << 16
-"""Larger documents are written once, at the beginning."""
+DOCUMENTS_SECONDS, MOST_REPEATED_BYTES = 5.0, 1 << 16
+"""So often documents up to this size come again: a broken file is read without its beginning."""
 SYNC_SECONDS = 1.0
 """So often the system is asked to put all on the disk: a power cut loses about as much."""
 NS_PER_S = 1_000_000_000
@@ -122,9 +119,8 @@ class _Message:
 
 @dataclass
 class _Chunk:
-    """An open chunk: messages whose bytes are not joined before they are written.
-
-    It begins with what it needs of schemas and channels, so that it can be read alone.
+    """An open chunk: messages whose bytes are not joined before they are written, and what they
+    need of schemas and channels, so that it can be read alone.
     """
 
     pieces: list[bytes] = field(default_factory=list)
@@ -279,9 +275,8 @@ class RecordingWriter:
         """
         if not 0 <= row.camera < len(self._session.cameras):
             raise InputError(f"camera {row.camera} is not among those of the session")
-        banded = None
-        if self._options.is_stripe_band:
-            banded = _banded(row, image, self._session.cameras[row.camera])
+        setup = self._session.cameras[row.camera]
+        banded = _banded(row, image, setup) if self._options.is_stripe_band else None
         pieces, facts = _image_message(row, image if banded is None else banded, self._session)
         facts |= {} if banded is None else {"outside_band": "zero"}
         topic = f"/camera/{row.camera}/" + facts["stored"]
@@ -677,9 +672,14 @@ def _image_message(
     return (shown.SerializeToString(), bytes([tag]) + _varint(len(data)), data), facts
 
 
+def has_band(row: ExposureRow, setup: CameraSetup) -> bool:
+    """Whether extraction takes this image as it is: of a view, the one without laser comes off."""
+    return bool(row.lasers) and row.view is None and setup.colour == "mono"
+
+
 def _banded(row: ExposureRow, image: ImageArray | bytes, setup: CameraSetup) -> ImageArray | None:
-    """Pixels near stripes; None where extraction does not take this image alone, as of a view."""
-    if isinstance(image, bytes) or image.ndim != 2 or not row.lasers or row.view is not None:
+    """Pixels near stripes; None for images that stay whole."""
+    if isinstance(image, bytes) or image.ndim != 2 or not has_band(row, setup):
         return None
     bits = setup.bits_used if setup.align == "low" else 8 * image.dtype.itemsize
     keep = near_lines(image.astype(np.float32) * np.float32(255.0 / ((1 << bits) - 1)))

@@ -350,6 +350,9 @@ class ConsolePage:
         if chosen != self._name():
             self.journey = self._opened(self.journey.folder.resolve().parent / chosen)
             self.scan = self.journey.scans[-1] if self.journey.scans else ""
+            titles = tuple(step.title for step in self.journey.steps)
+            if self._choice.options != titles:
+                self._choice.options = titles
             self.choose(self.journey.next_step())
 
     # what is shown

@@ -38,7 +38,7 @@ GROWN = 1.6
 """The view follows points that have spread by more than this since it was turned to them, or
 whose middle has gone half as far aside."""
 IMAGE_WIDTH = 640
-UNKNOWN = np.array([150, 150, 150])
+UNKNOWN = np.array([120, 120, 120])
 STEEP_DEG = 60.0
 """Lines seen at a steeper angle scatter; colours of incidence end here."""
 
@@ -99,14 +99,14 @@ def point_colours(shown: ShownPoints, by: ColourBy) -> tuple[Colours, str]:
         text = f"sigma from {low:.4f} mm (dark) to {high:.4f} mm (yellow)"
         return ramp_colours(shown.sigma_mm, low, high), text
     if by == "incidence" and shown.incidence_deg is not None:
-        text = f"seen square on (dark) to {STEEP_DEG:.0f}° or more aslant (yellow); grey: not known"
+        text = f"seen square on (dark) to {STEEP_DEG:.0f}° or more aslant (yellow); grey: unknown"
         is_known = np.isfinite(shown.incidence_deg)
         colours = ramp_colours(np.where(is_known, shown.incidence_deg, 0.0), 0.0, STEEP_DEG)
         return np.where(is_known[:, None], colours, UNKNOWN).astype(np.uint8), text
     if by == "deviation" and shown.deviation_mm is not None:
         return _deviations(shown.deviation_mm, shown.limit_mm), (
-            f"blue: {shown.limit_mm:g} mm too low, white: as the model, "
-            f"red: {shown.limit_mm:g} mm too high; grey: not of the part"
+            f"blue: {shown.limit_mm:g} mm too low, pale: as the model, "
+            f"red: {shown.limit_mm:g} mm too high; dark grey: not of the part"
         )
     if by == "coverage" and len(shown.points_mm):
         count = coverage(shown.points_mm, COVERED_MM)
@@ -122,7 +122,7 @@ def point_colours(shown: ShownPoints, by: ColourBy) -> tuple[Colours, str]:
 def _deviations(deviation_mm: FloatArray, limit_mm: float) -> Colours:
     is_known = np.isfinite(deviation_mm)[:, None]
     share = np.clip(np.nan_to_num(deviation_mm) / limit_mm, -1.0, 1.0)[:, None]
-    low, middle, high = np.array([33, 102, 172]), np.array([240, 240, 240]), np.array([178, 24, 43])
+    low, middle, high = np.array([33, 102, 172]), np.array([205, 205, 205]), np.array([178, 24, 43])
     end = np.where(share < 0.0, low, high)
     colours = middle + np.abs(share) * (end - middle)
     return np.where(is_known, colours, UNKNOWN).astype(np.uint8)

@@ -66,9 +66,8 @@ def test_what_is_dark_need_not_be_copied(bits: int) -> None:
     """Lines found in the part that is copied are those of the whole image, to the last bit."""
     image = np.full((530, 700), 9, np.uint8)
     image[:200, :300] = thick_line(1, 2.0)[:200, :300]
-    if bits > 8:
-        image = image.astype(np.uint16) * 16 + 3
-    exposure = Exposure(image, "corner", bits_used=bits)
+    deep = image.astype(np.uint16) * 16 + 3
+    exposure = Exposure(image if bits == 8 else deep, "corner", bits_used=bits)
     plane, level = lit_plane(exposure, None)
     whole = mono_plane(exposure, None).image
     every = measure_level(whole, None)

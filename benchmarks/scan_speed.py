@@ -8,6 +8,8 @@ millions of them a second:
 
 - *triangulate*: 3000 stripe points of one exposure, with the derivatives of their covariance;
 - *place*: the same points in Base with full covariance;
+- *an exposure after its stripes*: 1050 of them named, measured, placed and kept in the spool of a
+  scan, one sheet, one camera;
 - *poses*: 2000 exposures looked up by time among 20,000 samples of the arm;
 - *naming*, *points of pairs*: twelve exposures of the thesis's head of eleven lines (the scenes of
   `multi_naming.py`), each of both cameras: names and epipolar offset, then points; a pair;
@@ -30,11 +32,18 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray, homogeneous
 from armscan.models.arm import forward, parameter_jacobian, thesis_arm
 from armscan.models.calibration import SensorCalibration
+from armscan.pipeline.scan import scan_spool
 from armscan.reconstruction.label_stereo import StereoLabeller
+from armscan.reconstruction.labels import SingleLabeller
 from armscan.reconstruction.place import BaseTransform, estimate_normals, propagate_to_base
 from armscan.reconstruction.points import measure_points
 from armscan.reconstruction.sync import exposure_poses
-from armscan.reconstruction.triangulate import LABEL_DEPTHS, intersect_sheets, triangulate_stripe
+from armscan.reconstruction.triangulate import (
+    LABEL_DEPTHS,
+    DepthRange,
+    intersect_sheets,
+    triangulate_stripe,
+)
 from armscan.records.recording import ArmTrack, ExposureRow
 from rigs import placing_rig as rig
 from rigs.sheet_rig import thesis_rig
@@ -102,6 +111,26 @@ def pair_rows(repeats: int) -> list[Row]:
     ]
 
 
+def after_stripes(placing: BaseTransform) -> Callable[[], object]:
+    """Everything that a scan does with one exposure of 1050 points once they are extracted."""
+    scanner, depths = placing.scanner, DepthRange(50.0)
+    sensor = scanner.sensor
+    if sensor is None:
+        raise SystemExit("the rig has a camera")
+    pixels = np.stack([np.linspace(200.0, 1800.0, 1050), np.full(1050, 700.0)], axis=1)
+    profile, labeller = rig.profile_at(pixels), SingleLabeller(sensor, depths, "A")
+
+    def work() -> object:
+        # one exposure a spool, so that none grows
+        spool = scan_spool(scanner)
+        (measured,) = measure_points(labeller.label([profile]), sensor, depths)
+        cloud = propagate_to_base(measured.points, profile, rig.BASE_FROM_TOOL, placing)
+        spool.add(cloud, profile.points_px[measured.points.row], instant=0)
+        return spool
+
+    return work
+
+
 def ray_rows(sensor: SensorCalibration, placing: BaseTransform, repeats: int) -> list[Row]:
     """Pixels to Base: name, work, repeats, and 0: the work is one."""
     pixels = RNG.uniform([200.0, 600.0], [1800.0, 800.0], (MANY, 2))
@@ -155,6 +184,7 @@ def main() -> None:
             lambda: propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing),
             repeats,
         ),
+        ("after stripes 1050", after_stripes(placing), repeats),
         ("poses 2000", lambda: exposure_poses(rows, samples), repeats),
         ("normals 200,000 plate", lambda: estimate_normals(plate, seen), few),
         ("normals 200,000 ball", lambda: estimate_normals(ball, seen), few),

@@ -234,6 +234,14 @@ class RowRecord(ArrayRecord):
 
     def select(self, rows: RowChoice) -> Self:
         """The rows of a mask (N,), of indices (M,) or of a slice; other fields stay."""
+        # a record never changes, so that all of it is itself
+        if (
+            isinstance(rows, np.ndarray)
+            and rows.dtype == np.bool_
+            and len(rows) == len(self)
+            and rows.all()
+        ):
+            return self
         chosen: dict[str, Any] = {}
         for name, column in self._columns.items():
             value = getattr(self, name)

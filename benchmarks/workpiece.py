@@ -9,7 +9,8 @@
 made: a bore 0.05 mm too large, a pad 0.08 mm too high. ``measure`` calibrates from them, makes the
 cloud and compares it with the CAD model, laid on from the cloud alone; only then the truth is
 looked at. Each step that is done is not done again; each seed measured is a line of
-``DIR/measured.jsonl`` with the commit. Everything here is simulated.
+``DIR/measured.jsonl`` with the commit. ``measure --keep-clouds`` compares clouds that are there.
+Everything here is simulated.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ import numpy as np
 from armscan.cli import main as armscan
 from armscan.devices.sources import load_driver
 from armscan.geometry.features import Shape, fit_shape
-from armscan.inspection.cad.alignment import align_best
+from armscan.inspection.cad.alignment import Alignment, align_best, fit_to_part
 from armscan.inspection.cad.comparison import CadOptions, compare_with_part
 from armscan.inspection.cad.distance import PartSurface
 from armscan.jobs.job import solved
+from armscan.records.cloud import PointCloud
 from armscan.storage.clouds import read_cloud
 from armscan.storage.parts.meshes import read_part
 
@@ -62,8 +64,10 @@ def render(seed: int, folder: Path, processes: int) -> None:
             run(*words, "--processes", processes)
 
 
-def scanned(place: Path) -> Path:
-    """The cloud of a seed, calibrated and reconstructed anew."""
+def scanned(place: Path, *, is_kept: bool) -> Path:
+    """The cloud of a seed, calibrated and reconstructed anew unless one is there and kept."""
+    if is_kept and (place / "cloud.ply").is_file():
+        return place / "cloud.ply"
     names = ("camera.json", "sensor.json", "plate.csv", "scanner.json", "cloud.ply")
     camera, sensor, plate, scanner, cloud = (place / name for name in names)
     anew = ("--force",)
@@ -77,9 +81,9 @@ def scanned(place: Path) -> Path:
     return cloud
 
 
-def measured(seed: int, place: Path) -> dict[str, Any]:
+def measured(seed: int, place: Path, *, is_kept: bool = False) -> dict[str, Any]:
     """What a seed's scan says of the part, and then how far that is from the truth."""
-    cloud = read_cloud(scanned(place))
+    cloud = read_cloud(scanned(place, is_kept=is_kept))
     model = Path(str(files("armscan.simulation"))) / "workpiece" / "workpiece.step"
     part = read_part(model)
     surface = PartSurface(part)
@@ -102,6 +106,22 @@ def measured(seed: int, place: Path) -> dict[str, Any]:
         "faces": faces,
         "bore_mm": 2.0 * bore.radius_mm,
         **_beside_truth(seed, cloud.points_mm, alignment),
+        **_beside_as_made(cloud, alignment),
+    }
+
+
+def _beside_as_made(cloud: PointCloud, alignment: Alignment) -> dict[str, float]:
+    """The alignment beside the best fit of the same cloud on the surface as it was made.
+
+    What the calibration shifts the whole cloud by is in both, and not in their difference.
+    """
+    made = Path(str(files("armscan.simulation"))) / "workpiece" / "as_made.stl"
+    best = fit_to_part(PartSurface(read_part(made)), cloud, alignment.cad_from_part, True)
+    error = alignment.cad_from_part @ best.cad_from_part.inverse()
+    middle = np.array([[0.0, 0.0, 10.0]])
+    return {
+        "own_shift_mm": float(np.linalg.norm(error.apply(middle) - middle)),
+        "own_turn_deg": float(np.degrees(np.linalg.norm(error.rotation_vector_rad))),
     }
 
 
@@ -133,6 +153,8 @@ def table(lines: list[dict[str, Any]]) -> str:
 
     row("alignment, shift at the part's middle, mm", [one["shift_mm"] for one in lines])
     row("alignment, turn, degrees", [one["turn_deg"] for one in lines])
+    row("alignment beside the surface as made, shift, mm", [one["own_shift_mm"] for one in lines])
+    row("the same, turn, degrees", [one["own_turn_deg"] for one in lines])
     within = [one["percent_within_50_um"] for one in lines]
     row("points within 0.05 mm of the surface as made, %", within, 2, is_most=False)
     seen = [
@@ -175,6 +197,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=601)
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--keep-clouds", action="store_true")
     parser.add_argument("--folder", type=Path, required=True)
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
@@ -192,7 +215,8 @@ def main() -> None:
         if given.step == "render":
             render(seed, given.folder, given.processes)
         elif seed not in done:
-            line = {"commit": commit, **measured(seed, given.folder / str(seed))}
+            place = given.folder / str(seed)
+            line = {"commit": commit, **measured(seed, place, is_kept=given.keep_clouds)}
             with kept.open("a") as file:
                 file.write(json.dumps(line) + "\n")
 

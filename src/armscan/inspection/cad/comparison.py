@@ -23,7 +23,7 @@ from armscan.geometry.arrays import (
 )
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.cad.alignment import Alignment, measured
-from armscan.inspection.cad.distance import PartSurface
+from armscan.inspection.cad.distance import PartSurface, SurfaceDistance
 from armscan.inspection.cad.point_errors import PointErrors, scatter_of_means
 from armscan.inspection.conformity import COVERAGE, judge
 from armscan.inspection.conformity import Verdict as Validity
@@ -285,7 +285,7 @@ def compare_with_part(
     placed = alignment.cad_from_part.apply(cloud.points_mm)
     normals, d = found.normals, found.signed_mm
     along = np.abs(np.einsum("nk,nk->n", surface.part.normals[found.triangle], normals))
-    is_beside = near & (along < ALONG_FACE)
+    is_beside = near & ((along < ALONG_FACE) | _seen_from_behind(surface, cloud, alignment, found))
     face = np.where(near & ~is_beside, part.face[found.triangle], -1)
     by_density = math.sqrt(2 * LEAST_SPOT_POINTS * float(part.areas_mm2.sum()) / len(rows))
     spot_width = max(SPOT_SHARE * part.diagonal_mm, by_density)
@@ -382,6 +382,28 @@ def median_uncertainty(label: IntArray, count: int, values: FloatArray) -> Float
     return found
 
 
+FROM_BEHIND = -0.05
+"""Cosine of the angle between a face's normal and the direction to the sensor below which the face
+was out of sight: 93 degrees, as facets of a curved face lean by some."""
+
+
+def _seen_from_behind(
+    surface: PartSurface, cloud: PointCloud, alignment: Alignment, found: SurfaceDistance
+) -> BoolArray:
+    """(N,) points next to a face that the sensor could not see from where it stood.
+
+    They are of the face beyond the edge: a stripe along a rim, half of which falls beside it.
+    """
+    if cloud.seen_from_mm is None or cloud.is_fused or not surface.is_closed:
+        return np.zeros(len(cloud), dtype=np.bool_)
+    pose = alignment.cad_from_part
+    towards = pose.rotate(cloud.seen_from_mm[cloud.exposure] - cloud.points_mm)
+    length = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
+    normals = surface.part.normals[found.triangle]
+    cosine = np.einsum("ni,ni->n", towards, normals) / length
+    return np.asarray(cosine < FROM_BEHIND)
+
+
 class _Spots(RowRecord):
     """Spots with enough points: face, median deviation, U, where, and if seen by one exposure."""
 
@@ -401,6 +423,8 @@ def _spots(closest_mm: FloatArray, face: IntArray, width_mm: float) -> tuple[Int
     A spot is what one face has in a cube of the width.
     """
     inside = np.flatnonzero(face >= 0)
+    if len(inside) == 0:
+        return np.full(len(face), -1, dtype=np.int64), 0
     cells = np.floor(closest_mm[inside] / width_mm).astype(np.int64)
     cells -= cells.min(axis=0)
     size = cells.max(axis=0) + 1

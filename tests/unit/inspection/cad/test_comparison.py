@@ -309,3 +309,21 @@ def test_the_median_of_few_points_lies_within_its_wider_u(n: int) -> None:
     held = float((np.abs(np.median(values, axis=1)) <= u).mean())
     assert 0.935 < held < 0.975
     assert median_uncertainty(np.array([0, 0, 0, -1]), 2, np.arange(4.0)).tolist() == [0.0, 0.0]
+
+
+def test_a_stripe_along_a_rim_is_not_of_the_face_that_nobody_saw() -> None:
+    """Points 0.07 mm beside the upper rim of a block, seen from above: next to its side, not of it.
+
+    From the side, the same points are that side's; without a sensor's place nobody can tell.
+    """
+    block = part_of(box_corners([0, 0, 0], [60, 40, 20]), source="block")
+    surface = PartSurface(block)
+    side = int(block.face[np.argmax(block.normals @ [0.0, -1.0, 0.0])])
+    x = np.linspace(5.0, 55.0, 200)
+    rim = np.column_stack([x, np.full(200, -0.07), np.full(200, 19.98)])
+    for where, counted in (([30.0, 60.0, 120.0], 0), ([30.0, -140.0, 60.0], 200), (None, 200)):
+        places = None if where is None else np.array([where])
+        cloud = replace(cloud_of(rim), seen_from_mm=places)
+        found = compare_with_part(surface, cloud, align_none(cloud), CadOptions(), False)
+        assert isinstance(found, CadComparison)
+        assert found.faces[side].statistics.n == counted

@@ -225,7 +225,7 @@ REFUSED = [
     (FEATURE + "nominal_deg = 3", "no size in that unit"),
     (FEATURE + "seed_mm = [1, 2]", "the seed is no point"),
     (FEATURE + "region = [1, 2]", "'feature.0.region'"),
-    (FEATURE + FEATURE, "'feature.name' is 'b' twice"),
+    (FEATURE + FEATURE, "the name 'b' is there twice"),
     (FEATURE.replace("cylinder", "hole"), "'feature.0.kind' is 'hole'"),
     (FEATURE.replace("[[", "[").replace("]]", "]"), "two brackets"),
     ("align = ", "this is no TOML"),

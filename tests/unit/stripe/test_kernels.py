@@ -12,8 +12,11 @@ from armscan.kernels.profile_fit import (
     CENTRE,
     SIGMA,
     VARIANCE,
+    bin_residuals,
+    common_terms,
     fit_profiles,
     read_sides,
+    weigh_section,
 )
 from armscan.kernels.ridge import (
     BLOCK_PX,
@@ -27,7 +30,6 @@ from armscan.kernels.ridge import (
     sample_across,
     shared_derivatives_at,
 )
-from armscan.kernels.section import bin_residuals, common_terms, weigh_section
 
 FLOAT32 = 3e-5
 """Rounding of 32-bit sums over a few hundred pixels of grey level 255, relative to 1."""

@@ -30,6 +30,8 @@ from armscan.records.recording import ArmTrack
 
 SEARCHED_NS = 300_000_000
 """Clocks that are said to be shared differ by less."""
+MOST_SEARCHED_NS = 1_800_000_000_000
+"""Separate clocks are searched over half an hour at most; that takes minutes."""
 SEARCH_STEP_NS = 4_000_000
 """A hand reverses within 0.1 s at the fastest: in so short a time its speed hardly changes."""
 INSTRUMENT_NS = 20_000_000
@@ -333,6 +335,12 @@ def _search(problem: _Problem, is_shared: bool) -> _State | FitFailure:
         span = int(problem.t_ns[-1] - problem.t_ns[0])
         low = int(problem.arm.t_ns[0] - problem.t_ns[0]) - span // 4
         high = int(problem.arm.t_ns[-1] - problem.t_ns[-1]) + span // 4
+    if high - low > MOST_SEARCHED_NS:
+        return FitFailure(
+            f"the clocks may differ by anything within {(high - low) * 1e-9:.0f} s, too long to be "
+            "searched",
+            f"give the arm's samples of {MOST_SEARCHED_NS * 1e-9:.0f} s about the exposures",
+        )
     shifts = np.arange(low, high + 1, SEARCH_STEP_NS).tolist()
     tried = [(_flatness(problem.place(shift), len(problem.t_ns)), shift) for shift in shifts]
     if not tried or min(tried)[0] == np.inf:
@@ -341,6 +349,16 @@ def _search(problem: _Problem, is_shared: bool) -> _State | FitFailure:
             "let the arm record before the camera starts and after it stops",
         )
     best, shift = min(tried)
+    at = shifts.index(shift)
+    if any(misfit == np.inf for misfit, _ in tried[max(at - 1, 0) : at + 2]) or not (
+        0 < at < len(tried) - 1
+    ):
+        return FitFailure(
+            "the plate is flattest at the end of what can be searched, "
+            f"{shift * 1e-6:.0f} ms between the clocks",
+            "say that the clocks are separate, if they are; else let the arm record before the "
+            "camera starts and after it stops",
+        )
     far = [(misfit, at) for misfit, at in tried if abs(at - shift) > 0.1e9]
     # of a rough minimum between two steps the misfit is the way of half a step
     lowest = best + 0.02

@@ -391,8 +391,9 @@ def calibrate_latency(
         page = latency_page(fit, provenance, warnings=odd, is_simulated=is_simulated)
         contents = (scanner_document(timed), page)
         written = job.write(dict(zip(places, contents, strict=True)))
+    done = "Latency calibrated" if written else "Clocks of this recording compared"
     return Summary(
-        title="Latency calibrated" + (" from simulated images." if is_simulated else "."),
+        title=done + (" from simulated images." if is_simulated else "."),
         quantities=latency_quantities(fit),
         warnings=sentences(odd),
         written=written,

@@ -175,6 +175,22 @@ def test_an_arm_elsewhere_in_time_is_refused():
     assert isinstance(failure, FitFailure) and "within the arm's track" in failure.reason
 
 
+@pytest.mark.parametrize("latency_ns", [-330_000_000, 310_000_000])
+def test_a_latency_beyond_what_is_searched_is_not_taken_for_its_end(latency_ns):
+    looks, arm, hand_eye, _ = draw(replace(EXACT, latency_ns=latency_ns), 3)
+    failure = calibrate_latency(looks, arm, hand_eye)
+    assert isinstance(failure, FitFailure), failure.latency_ns
+
+
+def test_separate_clocks_are_not_searched_for_hours():
+    looks, arm, hand_eye, _ = draw(LatencyCase(seconds=3.0), 9)
+    t_ns = arm.t_ns.copy()
+    t_ns[-1] += 3_600_000_000_000
+    long = replace(arm, t_ns=t_ns)
+    failure = calibrate_latency(looks, long, hand_eye, is_shared=False)
+    assert isinstance(failure, FitFailure) and "too long to be searched" in failure.reason
+
+
 def test_times_that_do_not_increase_are_no_looks():
     looks, arm, hand_eye, _ = draw(LatencyCase(seconds=3.0), 9)
     twice = replace(looks, t_ns=np.full(len(looks), 5, dtype=np.int64))

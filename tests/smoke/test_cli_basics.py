@@ -52,8 +52,8 @@ def test_help_lists_the_commands_as_the_chain(capsys: pytest.CaptureFixture[str]
     listed = capsys.readouterr().out.split("\nCommands:\n")[1].split("\n\n")[0]
     names = [line.split()[0] for line in listed.splitlines() if line[2:3].strip()]
     chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers"]
-    looks = ["clean", "inspect", "verify", "mesh", "convert", "recover", "info", "devices"]
-    assert names == [*chain, "register", *looks, "doctor"]
+    looks = ["clean", "inspect", "verify", "mesh", "record", "console", "convert", "recover"]
+    assert names == [*chain, "register", *looks, "info", "devices", "doctor"]
 
 
 def test_devices_lists_what_is_there_and_the_drivers(capsys: pytest.CaptureFixture[str]) -> None:

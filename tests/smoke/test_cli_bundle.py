@@ -28,6 +28,13 @@ from rigs.recording_folders import lab_folder
         ("~/scans/one.png", ".../one.png"),
         ('lasers = "serial:/dev/ttyUSB0:115200"', 'lasers = "serial:/dev/ttyUSB0:115200"'),
         ("speed in mm/s, +/- 3, and/or http://host/page", "speed in mm/s, +/- 3, and/or http://host/page"),
+        ("open file:///home/anna/scan.mcap", "open .../scan.mcap"),
+        ("from \\\\nas01\\anna\\scan.mcap", "from .../scan.mcap"),
+        ("rtsp://anna:hunter2@10.0.0.5/x", "rtsp://***@10.0.0.5/x"),
+        ("Authorization: Bearer abc.def", "Authorization: ***"),
+        ("--token abc -o x", "--token *** -o x"),
+        ('{"passphrase": "a,b}c", "x": 1}', '{"passphrase": "***", "x": 1}'),
+        ("compass = 3, 4 passes", "compass = 3, 4 passes"),
         ("token=abc123&x=1 Password: 'secret!'", "token=***&x=1 Password: '***'"),
     ],
 )  # fmt: skip

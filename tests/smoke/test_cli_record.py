@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from armscan.cli import main
-from armscan.errors import OutputError
+from armscan.errors import DeviceError, OutputError
 from armscan.jobs.live.record import RecordRequest, record_scan
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import extract_recording
@@ -91,7 +91,8 @@ def test_a_full_disk_ends_it_and_says_what_is_safe(
     monkeypatch.setattr(RecordingWriter, "add_exposure", full)
     output = rig.parent / "scan.mcap"
     told: list[str] = []
-    record_scan(RecordRequest(rig, seconds=60.0), output, told.append)
+    with pytest.raises(DeviceError, match="no space"):
+        record_scan(RecordRequest(rig, seconds=60.0), output, told.append)
     assert any("no space" in line for line in told)
     assert extract_recording(output, rig.parent / "scan").n_exposures == 5
 
@@ -104,6 +105,33 @@ def test_without_an_image_there_is_no_file(tmp_path: Path) -> None:
     assert main(["record", str(tmp_path / "rig.toml"), "--seconds", "0.3", "-o", str(output)]) == 2
     assert not output.exists() and time.monotonic() - start < 60.0
     assert threading.active_count() <= n_before
+
+
+def test_what_is_to_be_replaced_stays_where_no_image_comes(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(RIG.replace(f'lasers = "{TWIN}"\n', ""))
+    output = tmp_path / "scan.mcap"
+    output.write_bytes(b"an hour of scanning")
+    words = ["record", str(tmp_path / "rig.toml"), "--seconds", "0.3", "--force", "-o", str(output)]
+    assert main(words) == 2
+    assert output.read_bytes() == b"an hour of scanning"
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["rig.toml", "scan.mcap"]
+
+
+def test_what_arrives_and_cannot_be_matched_is_no_success(
+    rig: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real, n_left = RecordingWriter.add_exposure, iter([True] * 5)
+
+    def broken(self: RecordingWriter, *given: object, **named: object) -> float:
+        if not next(n_left, False):
+            raise ValueError("a bug")
+        return real(self, *given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(RecordingWriter, "add_exposure", broken)
+    output = rig.parent / "scan.mcap"
+    assert main(["record", str(rig), "--seconds", "60", "-o", str(output)]) == 2
+    assert "no longer matched" in capsys.readouterr().err
+    assert extract_recording(output, rig.parent / "scan").n_exposures == 5
 
 
 @pytest.mark.parametrize(

@@ -384,6 +384,11 @@ class StreamMonitor:
         self._excess_ns = 0.0
         self._is_doubtful = False
 
+    @property
+    def is_timed(self) -> bool:
+        """Whether the newest element has a time by this computer's clock."""
+        return not self.clock.missing(self._t_device_ns)
+
     def check(self, number: int, t_device_ns: int, t_host_ns: int) -> ElementStatus:
         """Take one element.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample
@@ -103,6 +104,19 @@ def test_frames_that_no_table_places_are_kept_and_set_aside(tmp_path: Path) -> N
     assert told["lasers"] == {
         "trigger_id": 4, "t_device_ns": 10**15, "t_host_ns": 9, "lasers": ["A", "B"],
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("is_triggered", [False, True])
+def test_a_first_frame_that_lacks_parts_is_no_exposure(tmp_path: Path, is_triggered: bool) -> None:
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=is_triggered))
+    recorder.begin()
+    recorder.add_instant(instant(0, 10**9, is_complete=False))
+    recorder.add_instant(instant(1, 2 * 10**9))
+    recorder.hear(LiveEvent("button", "2", "arm"))
+    recorder.close()
+    recorded, found, _ = read_back(tmp_path / "scan.mcap")
+    assert [row.t_ns for row in recorded.rows] == [2 * 10**9]
+    assert (found.n_exposures, found.n_aside) == (1, 1)
 
 
 def test_where_ids_decide_a_clock_that_is_not_known_sets_nothing_aside(tmp_path: Path) -> None:

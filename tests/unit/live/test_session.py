@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from armscan.devices.matching import MatchedInstant
+from armscan.devices.matching import InstantMatcher, MatchedInstant
 from armscan.devices.protocols import ArmSample, CameraSettings, Frame, LaserEvent
 from armscan.errors import DeviceError, InputError, OutputError
 from armscan.models.arm import forward, thesis_arm
@@ -506,11 +506,15 @@ def test_a_full_disk_ends_the_recording_and_not_the_scan() -> None:
 def test_a_fault_in_matching_is_told_and_nobody_waits_for_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    def failing(*_: object) -> None:
+        raise ValueError("a fault of its own")
+
     monkeypatch.setattr("armscan.pipeline.live.acquire.MOST_WAITING", 2)
+    monkeypatch.setattr(InstantMatcher, "add_frame", failing)
     scan = triggered_scan(8)
     rig = rig_of(scan)
     told: list[Any] = []
-    session = LiveSession(rig, scanner(), recorder=FaultyRecorder(ValueError("a fault of its own")))
+    session = LiveSession(rig, scanner())
     session.add_listener(told.append)
     session.start()
     end = time.monotonic() + 10.0

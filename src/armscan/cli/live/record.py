@@ -71,10 +71,13 @@ def record(
     is_live = sys.stderr.isatty()
 
     def tell(line: str) -> None:
+        typer.echo(f"\r\x1b[K{line}" if is_live else line, err=True)
+
+    def show_rate(line: str) -> None:
         # one line that is written over, unless it is kept in a file
         typer.echo(f"\r\x1b[K{line}" if is_live else line, err=True, nl=not is_live)
 
-    summary = record_scan(request, output, tell, is_overwriting=force)
+    summary = record_scan(request, output, tell, show_rate=show_rate, is_overwriting=force)
     if is_live:
         typer.echo(err=True)
     show(summary, as_json=as_json)

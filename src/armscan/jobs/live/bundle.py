@@ -33,24 +33,40 @@ QUOTED_PATH = re.compile(r"""(["'])((?:/|~/|[A-Za-z]:[\\/])[^"'\n]*)\1""")
 BARE_PATH = re.compile(
     r"""(?<![\w/.~])(?:~?/(?!dev/)[\w.~][^\s"'<>|;,:*?()]*|[A-Za-z]:[\\/]+[^\s"'<>|;,*?()]*)"""
 )
+SECRET_NAME = r"(?:token|pass(?:w(?:or)?d|phrase)?|pwd|secret|api[_-]?key|credentials?)"
 SECRET = re.compile(
-    r"""(?i)((?:token|passw(?:or)?d|secret|api_?key)["']?\s*[=:]\s*["']?)[^\s"'&,}]+"""
+    rf"""(?i)((?<![a-z]){SECRET_NAME}["']?\s*[=:]\s*|--{SECRET_NAME}\s+)"""
+    r"""("(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[^\s"'&,}]+)"""
 )
+HEADER = re.compile(r"(?i)((?:authorization|cookie)[\"']?\s*[:=]\s*[\"']?)[^\"'\n]+")
+ADDRESS = re.compile(r"(?i)\b([a-z][a-z0-9+.-]*://)[^\s/@\"']*@")
+FILE_ADDRESS = re.compile(r"(?i)\bfile://[^\s\"'<>]+")
+SHARE = re.compile(r"(?<![\w:])\\\\[\w.$-]+\\[^\s\"'<>|;,*?()]*")
 PLAIN_NAMES = {"root", "user", "admin", "localhost"}
 
 
 def without_secrets(text: str) -> str:
     """Text whose absolute paths keep their last names alone, and that names no user and computer.
 
-    Values behind ``token``, ``password``, ``secret`` and ``key`` of an interface are masked.
+    Values behind ``token``, ``password`` and their like, headers of authorisation, and users of
+    addresses are masked. Of a path with blanks that is not quoted, what follows the first stays.
     """
+    text = HEADER.sub(r"\1***", text)
+    text = SECRET.sub(_masked, text)
+    text = ADDRESS.sub(r"\1***@", text)
+    for path in (FILE_ADDRESS, SHARE):
+        text = path.sub(lambda found: _last_name(found[0]), text)
     text = QUOTED_PATH.sub(lambda found: f"{found[1]}{_last_name(found[2])}{found[1]}", text)
     text = BARE_PATH.sub(lambda found: _last_name(found[0]), text)
-    text = SECRET.sub(r"\1***", text)
     for name, mask in ((_user(), "USER"), (platform.node(), "COMPUTER")):
         if len(name) > 2 and name.lower() not in PLAIN_NAMES:
             text = re.sub(rf"(?<![\w-]){re.escape(name)}(?![\w-])", mask, text)
     return text
+
+
+def _masked(found: re.Match[str]) -> str:
+    quote = found[2][0] if found[2][0] in "\"'" else ""
+    return f"{found[1]}{quote}***{quote}"
 
 
 def _last_name(path: str) -> str:

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import shutil
+import signal
+import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -84,6 +86,7 @@ def record_scan(
     output: Path,
     tell: Callable[[str], None],
     *,
+    show_rate: Callable[[str], None] | None = None,
     is_overwriting: bool = False,
 ) -> Summary:
     """Record until the time or count is reached, or Ctrl-C; what is there is then whole.
@@ -95,7 +98,9 @@ def record_scan(
     output
         File to write, ``.mcap``; it grows while it is recorded.
     tell
-        Told once a second how it goes, and at once of faults.
+        Told at once of faults.
+    show_rate
+        Told once a second how it goes; None for ``tell``.
     is_overwriting
         Replace a file that exists.
 
@@ -104,7 +109,8 @@ def record_scan(
     OptionError
         If the request contradicts itself.
     DeviceError
-        If a device does not answer at the start, or no image came at all.
+        If a device does not answer at the start, no image came at all, or what arrived could not be
+        kept to the end; what came before is whole.
     OutputError
         If the file exists, or the disk is full; what was written stays.
     """
@@ -119,9 +125,22 @@ def record_scan(
     scanner = None if place is None else read_scanner_calibration(place)
     with Rig.open(description, open_device) as rig:
         rig.set_windows()
-        run = _Recording(rig, scanner, output, tell)
+        run = _Recording(rig, scanner, output, tell, show_rate or tell)
         run.until_the_end(request)
     return run.summary(place)
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """A second Ctrl-C does not cut short what ends a recording."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class _Recording:
@@ -133,8 +152,9 @@ class _Recording:
         scanner: ScannerCalibration | None,
         output: Path,
         tell: Callable[[str], None],
+        show_rate: Callable[[str], None],
     ) -> None:
-        self._output, self._tell = output, tell
+        self._output, self._tell, self._show_rate = output, tell, show_rate
         simulated = all(one.startswith(TWIN) for one in rig.description.cameras)
         self._recorder = LiveRecorder(output, rig, is_simulated=simulated)
         options = LiveOptions.of(rig.description)
@@ -147,14 +167,16 @@ class _Recording:
         self._end = WriterStatus(0, 0, 0.0, 0, 0)
         self._before = replace(self._end), 0.0
         self._is_interrupted = False
+        self._before_it: Path | None = None
+        self._last_fault = ""
+        self._is_triggered = rig.description.is_common_trigger
 
     def until_the_end(self, request: RecordRequest) -> None:
         """Record; the file is whole afterwards, whatever happens."""
         self._session.open()
         try:
             self._wait_for_clocks()
-            # what is to be replaced stays until the devices run
-            self._output.unlink(missing_ok=True)
+            self._put_aside()
             self._recorder.begin()
             self._session.add_listener(self._recorder.hear)
             start = time.monotonic()
@@ -165,24 +187,56 @@ class _Recording:
                 self._is_interrupted = True
             self._seconds = time.monotonic() - start
         except BaseException:
-            self._session.stop()
-            with suppress(OutputError):
-                self._recorder.close()
+            with _deaf():
+                self._session.stop()
+                with suppress(OutputError):
+                    self._close()
             raise
-        self._session.stop()
-        self._end = self._recorder.close()
+        is_kept = self._session.is_recording
+        with _deaf():
+            self._session.stop()
+            self._close()
         if not self._end.n_written:
-            self._output.unlink(missing_ok=True)
             raise DeviceError(
                 f"no image came in {self._seconds:.1f} s",
                 remedy="check camera and trigger; `armscan devices` lists what answers",
             )
+        if not is_kept:
+            raise DeviceError(
+                f"the recording ended after {self._seconds:.1f} s: {self._last_fault}",
+                where=str(self._output),
+                remedy="what came before is whole",
+            )
+
+    def _put_aside(self) -> None:
+        """What is to be replaced, until the first image is there."""
+        if self._output.exists():
+            place = self._output.with_name(f".{self._output.name}.before")
+            self._output.replace(place)
+            self._before_it = place
+
+    def _close(self) -> None:
+        """The new file where it holds an image; else what was there before."""
+        try:
+            self._end = self._recorder.close()
+        finally:
+            if not self._recorder.status().n_written:
+                self._output.unlink(missing_ok=True)
+                if self._before_it is not None:
+                    self._before_it.replace(self._output)
+            elif self._before_it is not None:
+                self._before_it.unlink()
 
     def _wait_for_clocks(self) -> None:
         """Without an arm nothing is placed by time, so that nobody waits for clocks."""
         end = time.monotonic() + CLOCKS_S
         while self._has_arm and not self._session.is_timed and time.monotonic() < end:
             time.sleep(LOOK_S)
+        if self._has_arm and not self._session.is_timed and not self._is_triggered:
+            self._tell(
+                f"warning: after {CLOCKS_S:g} s not all clocks are related to this computer's; "
+                "what comes before they are is kept, and used by nobody"
+            )
 
     def _watch(self, request: RecordRequest, start: float) -> None:
         told = start
@@ -197,7 +251,7 @@ class _Recording:
                 return
             if now - told >= TOLD_EVERY_S:
                 told = now
-                self._tell(self._line(status, now - start))
+                self._show_rate(self._line(status, now - start))
 
     def _line(self, status: WriterStatus, seconds: float) -> str:
         """How it goes, in one line."""
@@ -213,7 +267,7 @@ class _Recording:
             f"{seconds:5.0f} s",
             f"{status.n_accepted:,} exposures",
             f"{rate:.1f}/s",
-            f"lost {n_lost}, late {n_late}",
+            f"lost {n_lost}, late {n_late}, not to be used {self._recorder.n_aside}",
             f"{speed / 1e6:.0f} MB/s, {free / 1e9:,.0f} GB left{lasts}",
         ]
         if status.fill > 0.5:
@@ -235,6 +289,8 @@ class _Recording:
             self._n_faults += event.kind == "fault"
             where = f"{event.device}: " if event.device and event.device not in event.text else ""
             self._tell(f"{event.kind}: {where}{event.text}")
+        if event.kind in ("fault", "warning"):
+            self._last_fault = event.text
 
     def summary(self, scanner: Path | None) -> Summary:
         """What was written."""
@@ -262,6 +318,12 @@ class _Recording:
             )  # fmt: skip
         others = {one.value: n for one, n in shown.counts.items() if one is not LiveStatus.PLACED}
         warnings = [f"{n} instants: {what}" for what, n in others.items()]
+        if self._recorder.n_aside:
+            warnings.insert(
+                0,
+                f"{self._recorder.n_aside} of {self._end.n_written} exposures are kept and not to "
+                "be used: parts of them were lost, or their clock was not known",
+            )
         if self._n_faults:
             warnings.insert(0, f"devices failed {self._n_faults} times; the recording says when")
         cloud = self._output.with_suffix(".ply")

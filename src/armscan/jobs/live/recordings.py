@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from armscan.errors import OptionError
+from armscan.errors import OptionError, OutputError
 from armscan.report.quantity import Quantity, Summary
 from armscan.storage.files import check_outputs, is_folder, scratch_folder
 from armscan.storage.recording import is_recording, read_recording
@@ -83,6 +83,10 @@ def recover_recording(source: Path, output: Path, *, is_overwriting: bool = Fals
         If the output exists or cannot be written.
     """
     title = "Recovered."
+    if output.exists() and output.samefile(source):
+        raise OutputError(
+            "this is the damaged file itself", where=f"-o {output}", remedy="name another file"
+        )
     if output.suffix.lower() != SUFFIX:
         return _summary(title, extract_recording(source, output, is_recovering=True), output)
     check_outputs((output,), is_overwriting=is_overwriting)
@@ -95,8 +99,8 @@ def recover_recording(source: Path, output: Path, *, is_overwriting: bool = Fals
 
 def _summary(title: str, found: ReadBack, output: Path) -> Summary:
     aside = (
-        (f"{found.n_aside} exposures or samples were set aside: their times or numbers repeat or "
-         "go back, or their names cannot be used",)
+        (f"{found.n_aside} exposures or samples were set aside: parts or times of them "
+         "are missing, times or numbers repeat or go back, or names cannot be used",)
         if found.n_aside
         else ()
     )  # fmt: skip

@@ -177,6 +177,11 @@ class Acquisition:
         first = found[0] if isinstance(found, tuple) else found
         return bool(first.t_host_ns > self._stopped_ns + LATE_NS)
 
+    @property
+    def is_matching(self) -> bool:
+        """Whether what arrives still becomes instants."""
+        return not self._is_broken.is_set()
+
     def _put(self, what: str, k: int, found: Any) -> None:
         """Hand on what arrived; while there is no room the device's own buffer must hold."""
         is_told = False

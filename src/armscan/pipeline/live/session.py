@@ -21,7 +21,6 @@ from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import CameraSettings, Frame
 from armscan.errors import ArmscanError, DeviceError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray, ImageArray, IntArray
-from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.instants import Instant, InstantImages
@@ -398,13 +397,12 @@ class LiveSession:
     @property
     def is_recording(self) -> bool:
         """Whether what arrives is kept now; not any more after the recorder failed."""
-        return self._acquisition.recorder is not None
+        return self._acquisition.recorder is not None and self._acquisition.is_matching
 
     @property
     def is_timed(self) -> bool:
-        """Whether the clocks of all devices are related to this computer's."""
-        clocks = [one.clock.fit for one in self._monitors]
-        return not any(isinstance(fit, FitFailure) for fit in clocks)
+        """Whether the clocks of all devices are known well enough to place by time."""
+        return all(one.is_timed for one in self._monitors)
 
     @property
     def stream_counts(self) -> tuple[StreamCounts, ...]:

@@ -64,6 +64,8 @@ MOST_RECORD_BYTES, MOST_OTHER_BYTES = 1 << 31, 1 << 28
 LONGEST_NAME = 4
 """Of a compression: zstd."""
 MOST_OPCODE = 15
+ASIDE_FLAGS = frozenset({"incomplete", "no-time", "back"})
+"""A frame that lacks parts, or has no time or one that goes back: in the file, used by none."""
 UNKNOWN_SIZE = zstandard.CONTENTSIZE_UNKNOWN
 LISTED_KINDS = frozenset({EXPOSURE_TOPIC, ARM_TOPIC, EVENT_TOPIC})
 CAMERA_TOPICS = "/camera/"
@@ -148,7 +150,8 @@ class RecordedTables:
         if cells.get("trigger_id"):
             keys.append((f"trigger of camera {said['camera']}", cells["trigger_id"]))
         is_usable = (
-            is_inside(name)
+            ASIDE_FLAGS.isdisjoint(said["flags"])
+            and is_inside(name)
             and name not in OWN_NAMES
             and 0 <= said["camera"] < MOST_CAMERAS
             and self.checksums.get(name, facts["crc32"]) == facts["crc32"]

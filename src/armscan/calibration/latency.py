@@ -31,9 +31,9 @@ from armscan.records.recording import ArmTrack
 SEARCHED_NS = 300_000_000
 """Clocks that are said to be shared differ by less."""
 MOST_SEARCHED_NS = 1_800_000_000_000
-"""Separate clocks are searched over half an hour at most; that takes minutes."""
+"""Of separate clocks; that takes minutes."""
 SEARCH_STEP_NS = 4_000_000
-"""A hand reverses within 0.1 s at the fastest: in so short a time its speed hardly changes."""
+"""A hand reverses in 0.1 s at the fastest: its speed hardly changes meanwhile."""
 INSTRUMENT_NS = 20_000_000
 """Speeds are taken over twice as long, by samples that the pose itself does not rest on: the arm's
 noise would else make times in the middle between two samples look best."""
@@ -337,8 +337,7 @@ def _search(problem: _Problem, is_shared: bool) -> _State | FitFailure:
         high = int(problem.arm.t_ns[-1] - problem.t_ns[-1]) + span // 4
     if high - low > MOST_SEARCHED_NS:
         return FitFailure(
-            f"the clocks may differ by anything within {(high - low) * 1e-9:.0f} s, too long to be "
-            "searched",
+            f"{(high - low) * 1e-9:.0f} s are too long to be searched for the clocks' difference",
             f"give the arm's samples of {MOST_SEARCHED_NS * 1e-9:.0f} s about the exposures",
         )
     shifts = np.arange(low, high + 1, SEARCH_STEP_NS).tolist()
@@ -349,20 +348,15 @@ def _search(problem: _Problem, is_shared: bool) -> _State | FitFailure:
             "let the arm record before the camera starts and after it stops",
         )
     best, shift = min(tried)
-    at = shifts.index(shift)
-    if any(misfit == np.inf for misfit, _ in tried[max(at - 1, 0) : at + 2]) or not (
-        0 < at < len(tried) - 1
-    ):
+    beside = tried[max(shifts.index(shift) - 1, 0) :][:3]
+    if len(beside) < 3 or max(beside)[0] == np.inf or beside[1][1] != shift:
         return FitFailure(
-            "the plate is flattest at the end of what can be searched, "
-            f"{shift * 1e-6:.0f} ms between the clocks",
-            "say that the clocks are separate, if they are; else let the arm record before the "
-            "camera starts and after it stops",
+            f"the plate is flattest {shift * 1e-6:.0f} ms off, where the search ends",
+            "say that the clocks are separate, if they are; else let the arm record for longer",
         )
     far = [(misfit, at) for misfit, at in tried if abs(at - shift) > 0.1e9]
     # of a rough minimum between two steps the misfit is the way of half a step
-    lowest = best + 0.02
-    if far and min(far)[0] < SECOND_BEST * lowest:
+    if far and min(far)[0] < SECOND_BEST * (best + 0.02):
         return FitFailure(
             f"the plate is as flat with {min(far)[1] / 1e6:.0f} ms between the clocks "
             f"({min(far)[0]:.3g} mm rms) as with {shift / 1e6:.0f} ms ({best:.3g} mm)",

@@ -109,8 +109,8 @@ def record_scan(
     OptionError
         If the request contradicts itself.
     DeviceError
-        If a device does not answer at the start, no image came at all, or what arrived could not be
-        kept to the end; what came before is whole.
+        If a device does not answer at the start, no image came at all, what arrived could not be
+        kept to the end, or none of it can be used; what was written stays.
     OutputError
         If the file exists, or the disk is full; what was written stays.
     """
@@ -196,10 +196,22 @@ class _Recording:
         with _deaf():
             self._session.stop()
             self._close()
+        self._check_end(is_kept)
+
+    def _check_end(self, is_kept: bool) -> None:
+        """An error where there is nothing to go on with, or not all."""
         if not self._end.n_written:
             raise DeviceError(
                 f"no image came in {self._seconds:.1f} s",
                 remedy="check camera and trigger; `armscan devices` lists what answers",
+            )
+        if self._recorder.n_aside == self._end.n_written:
+            raise DeviceError(
+                f"none of {self._end.n_written} exposures can be used: parts of them were lost, or "
+                "their clock was not known",
+                where=str(self._output),
+                remedy="record longer or at a higher rate, or say that one trigger takes image and "
+                "pose (--common-trigger); the file keeps them",
             )
         if not is_kept:
             raise DeviceError(

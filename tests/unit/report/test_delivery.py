@@ -14,14 +14,23 @@ import numpy as np
 import pytest
 
 from armscan.cli import main
+from armscan.errors import OptionError
 from armscan.inspection.title_block import TitleBlock, calibration_state
 from armscan.records.cloud import CalibrationMark
 from armscan.report.drawing import _turned
-from armscan.report.inspection.delivery import calibration_warnings, pdf_bytes
+from armscan.report.inspection.delivery import calibration_warnings, pdf_bytes, require_pdf
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.documents import scanner_document
 from rigs.calibration_documents import scanner_calibration
 from rigs.inspection_clouds import cloud_of
+
+
+def skip_without_pdf() -> None:
+    try:
+        require_pdf()
+    except OptionError as error:
+        pytest.skip(f"no PDF here: {error.what}")
+
 
 NOW = datetime(2026, 11, 23, 12, tzinfo=UTC)
 MAY = CalibrationMark("may", "2026-05-27T12:00:00+00:00")
@@ -129,7 +138,7 @@ def test_a_pdf_without_a_page_is_refused(folder: Path, tmp_path: Path) -> None:
 
 
 def test_the_page_is_written_as_pdf(folder: Path, tmp_path: Path) -> None:
-    pytest.importorskip("weasyprint", reason="the extra pdf is not installed")
+    skip_without_pdf()
     page, pdf = tmp_path / "report.html", tmp_path / "report.pdf"
     words = ["inspect", "plane", str(folder / "plate.ply"), "-o", str(page), "--pdf", str(pdf)]
     assert main(words) == 0
@@ -138,7 +147,7 @@ def test_the_page_is_written_as_pdf(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_pdf_asks_no_other_host() -> None:
-    pytest.importorskip("weasyprint", reason="the extra pdf is not installed")
+    skip_without_pdf()
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.setblocking(False)
         address = f"http://127.0.0.1:{server.getsockname()[1]}/x"

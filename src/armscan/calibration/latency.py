@@ -534,7 +534,7 @@ def _solve(
     noise: tuple[ResidualNoise, ...] | None = None,
 ) -> _Solution | FitFailure:
     """Iterate from a start; each kind of residual has its robust sigma if the noise is None."""
-    state = start
+    state, reason = start, f"the time between the clocks did not settle within {STEPS} steps"
     for _ in range(STEPS):
         system, middle = _linearise(problem, state, kept)
         if len(system.rows) < FEWEST_EXPOSURES:
@@ -545,16 +545,14 @@ def _solve(
             )
         found = system.solve(noise)
         if found is None:
-            return _refused(system.motion) or FitFailure(
-                "time and plate cannot be told apart", MOVE
-            )
+            reason = "time and plate cannot be told apart"
+            break
         step, covariance, chi2 = found
         if abs(step[0]) < max(SETTLED_NS, 0.01 * np.sqrt(covariance[0, 0])):
             return _Solution(state, system, covariance, chi2, noise or ())
         state = _after(problem, state, step, middle)
-    return _refused(system.motion) or FitFailure(
-        f"the time between the clocks did not settle within {STEPS} steps", MOVE
-    )
+    refused = _refused(system.motion)
+    return FitFailure(reason, MOVE) if refused is None else refused
 
 
 def _after(problem: _Problem, state: _State, step: FloatArray, middle: FloatArray) -> _State:

@@ -11,6 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from armscan.calibration import latency
 from armscan.calibration.latency import (
     LatencyFit,
     calibrate_latency,
@@ -152,6 +153,21 @@ def test_a_motion_that_tells_nothing_is_refused_with_the_numbers(case, said):
     assert isinstance(failure, FitFailure)
     assert said in failure.reason or "as flat with" in failure.reason
     assert any(character.isdigit() for character in failure.reason)
+
+
+@pytest.mark.parametrize(
+    ("case", "said"),
+    [(LatencyCase(reversing_hz=0.03, speed_mm_s=8.0, rocking_deg=0.3), "reversed"),
+     (LatencyCase(), "did not settle within 1 steps")],
+)  # fmt: skip
+def test_what_does_not_settle_says_first_what_the_motion_lacks(case, said, monkeypatch):
+    monkeypatch.setattr(latency, "STEPS", 1)
+    monkeypatch.setattr(latency, "SECOND_BEST", 0.0)
+    monkeypatch.setattr(latency, "SETTLED_NS", 0.0)
+    looks, arm, hand_eye, _ = draw(replace(case, latency_ns=20_000_000), 31)
+    failure = calibrate_latency(looks, arm, hand_eye)
+    assert isinstance(failure, FitFailure)
+    assert said in failure.reason
 
 
 def test_constant_speed_tells_nothing():

@@ -9,7 +9,8 @@ would photograph, runs the commands that he would run, and compares what comes o
 which never lies beside the photographs. Of each stage it says
 
 * right: the error is within 4 of its own sigma,
-* refused: by the command, with its sentence; rightly if the set was degenerate by construction,
+* refused: by the command, with its sentence; rightly if the set was degenerate by construction, or
+  if the sentence says that the arm scatters too much and the drawn arm does,
 * wrong: beyond 4 sigma, silently or with a warning of this or an earlier stage that bears on it.
 
 Points are wrong if more than 2 % lie farther from the true surface than 4 of their own sigma.
@@ -82,6 +83,9 @@ HARMLESS = (
     "gave no point",
 )
 """Parts of warnings that say nothing of an error of what is written."""
+ARM_SCATTERS = "the arm would have to scatter by"
+LARGEST_SCATTER_MM = 0.25
+"""Of a point that the head sees; the software refuses hand-eyes of arms beyond it, and says so."""
 STAGES = ("camera", "laser", "sensor points", "probe", "hand-eye", "plate", "ball", "diameter")
 
 
@@ -115,10 +119,7 @@ class Chain:
         self.stages.append(stage)
         if code != 0:
             stage.sentence = err.getvalue().strip().splitlines()[-1]
-            rightly = self.drawn.degenerate in REFUSED_BY.get(name, set())
-            stage.outcome = "rightly refused" if rightly else "wrongly refused"
-            if code == 70:
-                stage.outcome = "bug"
+            stage.outcome = "bug" if code == 70 else refusal(self.drawn, name, stage.sentence)
             return stage, {}
         report = json.loads(out.getvalue())
         stage.warnings = [str(one) for one in report.get("warnings", [])]
@@ -133,6 +134,13 @@ class Chain:
     def path(self, name: str) -> str:
         """A place in the folder."""
         return str(self.folder / name)
+
+
+def refusal(drawn: DrawnInstrument, name: str, sentence: str) -> str:
+    """Whether a stage is rightly refused: degenerate, or an arm as bad as the sentence says."""
+    is_so = drawn.arm_scatter_mm() > LARGEST_SCATTER_MM and ARM_SCATTERS in sentence
+    rightly = is_so or drawn.degenerate in REFUSED_BY.get(name, set())
+    return "rightly refused" if rightly else "wrongly refused"
 
 
 def judge(chain: Chain, stage: Stage, ratio: float, limit: float) -> None:
@@ -391,7 +399,7 @@ def run_instrument(seed: int, folder: Path) -> dict[str, Any]:
         "boards": boards,
         "postures": postures,
         "stages": [vars_of(stage) for stage in chain.stages],
-        "outcome": overall(chain.stages),
+        "outcome": overall({stage.outcome for stage in chain.stages}),
         "images": shoot.n_images,
         "wall_s": round(time.perf_counter() - start, 1),
         "core_s": round(time.process_time() - cpu, 1),
@@ -417,9 +425,8 @@ def vars_of(stage: Stage) -> dict[str, Any]:
     return {name: getattr(stage, name) for name in Stage.__slots__}
 
 
-def overall(stages: list[Stage]) -> str:
-    """The worst of all stages."""
-    found = {stage.outcome for stage in stages}
+def overall(found: set[str]) -> str:
+    """The worst outcome of all stages."""
     for outcome in ("bug", "silently wrong", "wrong, warned", "wrongly refused", "rightly refused"):
         if outcome in found:
             return outcome
@@ -444,7 +451,13 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def print_table(lines: list[dict[str, Any]]) -> None:
-    """Outcomes by stage, then each instrument that is not right."""
+    """Outcomes by stage, then each instrument that is not right; refusals are judged anew."""
+    for line in lines:
+        drawn = draw_instrument(line["seed"])
+        for stage in line["stages"]:
+            if "refused" in stage["outcome"]:
+                stage["outcome"] = refusal(drawn, stage["name"], stage["sentence"])
+        line["outcome"] = overall({stage["outcome"] for stage in line["stages"]})
     counts = {name: Counter[str]() for name in STAGES}
     for line in lines:
         for stage in line["stages"]:

@@ -120,6 +120,12 @@ class DrawnInstrument:
         """Whether its cameras see colours."""
         return self.head.imaging.laser_colour is not None
 
+    def arm_scatter_mm(self) -> float:
+        """Rms an axis of what the arm's poses move a point at the working distance by."""
+        point = self.head.tool_from_sensor.apply(np.array([[0.0, 0.0, self.depth_mm]]))
+        away_mm = float(np.linalg.norm(point))
+        return float(np.hypot(self.arm_mm, np.sqrt(2.0 / 3.0) * self.arm_rad * away_mm))
+
 
 def draw_instrument(seed: int) -> DrawnInstrument:
     """Draw one instrument; everything follows from the seed."""

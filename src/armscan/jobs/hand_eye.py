@@ -6,6 +6,7 @@ Hand-eye first; then, from a plate and a stand-off that moves, the time between 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -566,9 +567,12 @@ def _shown_exposures(inputs: HandEyeInputs) -> dict[str, Exposure]:
 
 
 def _with_assumptions(failure: FitFailure, inputs: HandEyeInputs) -> FitFailure:
-    """A failure that also says what was assumed about the recordings: it may be the cause."""
+    """A failure that also says what may be its cause: exposures left out, and what was assumed."""
     assumed = dict.fromkeys(text for r in inputs.recordings for text in r.session.assumed)
-    reason = "; ".join((failure.reason, *(f"assumed: {text}" for text in assumed)))
+    not_used = Counter(reason for _, seen in inputs.groups for _, reason in seen.not_used)
+    left = ", ".join(f"{n} ({reason})" for reason, n in not_used.most_common(3))
+    of_scan = (f"exposures that were not used: {left}",) if left else ()
+    reason = "; ".join((failure.reason, *of_scan, *(f"assumed: {text}" for text in assumed)))
     return FitFailure(reason, failure.remedy)
 
 

@@ -28,7 +28,7 @@ from armscan.pipeline.measure import (
 )
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.scan import check_poses
-from armscan.reconstruction.labels import LabelledProfile
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.reconstruction.place import delivered_points
 from armscan.reconstruction.points import MeasuredProfile
 from armscan.reconstruction.sync import exposure_poses
@@ -132,7 +132,8 @@ def observe_stripes(
         for row, found in zip(instant.rows, one.profiles, strict=True):
             weak += found.warnings
             if len(found.points) < MIN_POINTS:
-                without_stripe[row] = "no stripe was measured in it"
+                if not _is_shared(found.labelled):
+                    without_stripe[row] = _why_without(found.labelled)
                 continue
             images.append(found.labelled)
             pose = poses.pose(instant.rows[0])
@@ -204,6 +205,20 @@ def observe_plate(
         found = [profile.points.points_mm for profile in one.profiles]
         points.append(np.concatenate([np.zeros((0, 3)), *found]))
     return plate_looks(times, points)
+
+
+def _is_shared(image: LabelledProfile) -> bool:
+    """Whether its points are measured as those of the other camera of the instant."""
+    return image.count(PointStatus.SHARED) >= MIN_POINTS
+
+
+def _why_without(image: LabelledProfile) -> str:
+    """What became of most of its stripe points, if there were any."""
+    lost = image.status[image.status != PointStatus.MEASURED]
+    if len(lost) < MIN_POINTS:
+        return "no stripe was measured in it"
+    most = PointStatus(int(np.bincount(lost).argmax()))
+    return f"most of its stripe points are {most.label}"
 
 
 def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:

@@ -290,3 +290,14 @@ def test_exposures_that_were_not_used_are_counted_beyond_those_named() -> None:
     (warning,) = _left_out(20, 20, [(f"image{k}", "dark") for k in range(12)])
     assert warning.startswith("12 exposures were not used: image0 (dark)")
     assert warning.endswith("image3 (dark), and 8 more")
+
+
+def test_a_stripe_outside_the_calibrated_depths_is_said_to_be_there():
+    """Not that there is no stripe: the user would look at the laser, and not at the depths."""
+    sensor = _sensor()
+    short = replace(sensor.sheets[0], depth_range_mm=(60.0, 70.0))
+    seen = observe_stripes(DrawnScan(), replace(sensor, sheets=(short,)))
+    assert not seen.stripes
+    assert {reason for _, reason in seen.not_used} == {
+        "most of its stripe points are too far outside the calibrated depths"
+    }

@@ -43,11 +43,15 @@ CORRELATION_ROUNDS = 20
 MAX_TAKEN = 0.5
 """Largest share of the noise that the cubic is believed to take."""
 BOARD_SHAPES = 3
-"""Offset, slope and curvature of a stripe; a board's pose makes the first two."""
+"""Offset, slope and curvature of a stripe."""
+POSE_SHAPES = 2
+"""The first two of them: what a board's pose makes."""
 LEAST_POINTS = 8
 """With fewer points left of it a stripe has no shape."""
 FACTORS = np.geomspace(1.0, 100.0, 81)
 """Scatter of the boards that is tried, in steps of 6 %."""
+FORMS_PX = np.append(0.0, np.geomspace(0.01, 10.0, 37))
+"""Form of the boards that is tried, in steps of 21 %."""
 FEWEST_BOARDS = 4
 """For an outlier among them: with fewer, two are left of which each explains the other."""
 
@@ -171,7 +175,10 @@ class BoardScatter:
     """Likeliest scatter of the boards under a model of the sheet.
 
     ``factor``, at least 1, is the standard deviations of the boards' poses over what is claimed for
-    them; ``log_likelihood`` that of the stripes' shapes, up to a constant that all models share.
+    them, by the offsets and slopes of the stripes. ``log_likelihood`` is that of the stripes'
+    shapes, curvature included, up to a constant that all models share: of poses that scatter, and
+    of what each board's own form, or the lens where it stands, adds to every shape term. A pose
+    does not curve a stripe, and a bend is not a pose that is known a hundred times worse.
     """
 
     factor: float
@@ -197,7 +204,8 @@ def board_scatter(
     stripes = [of for of in observations.each_stripe() if of.sum() >= LEAST_POINTS]
     n = BOARD_SHAPES * len(stripes)
     lost = np.sqrt(n / max(n - solution.n_parameters, 1.0))
-    log_likelihood = np.zeros(len(FACTORS))
+    log_likelihood = np.zeros((len(FORMS_PX), len(FACTORS)))
+    of_poses = np.zeros(len(FACTORS))
     for of in stripes:
         stripe = observations.select(of)
         design = _course(stripe, BOARD_SHAPES - 1)
@@ -205,19 +213,25 @@ def board_scatter(
         covariance = np.asarray(np.linalg.inv(weighted.T @ design), dtype=np.float64)
         gain = covariance @ weighted.T
         root = errors.pose_roots[int(stripe.board[0])]
-        log_likelihood += _log_likelihood(
-            gain @ (lost * residual[of]), covariance, gain @ by_pose[of] @ root
-        )
-    best = int(np.argmax(log_likelihood))
-    return BoardScatter(float(FACTORS[best]), float(log_likelihood[best]))
+        terms, follow = gain @ (lost * residual[of]), gain @ by_pose[of] @ root
+        log_likelihood += _log_likelihood(terms, covariance, follow, FORMS_PX)
+        by_a_pose = slice(0, POSE_SHAPES)
+        of_poses += _log_likelihood(
+            terms[by_a_pose], covariance[by_a_pose, by_a_pose], follow[by_a_pose], np.zeros(1)
+        )[0]
+    factor = float(FACTORS[int(np.argmax(of_poses))])
+    return BoardScatter(factor, float(log_likelihood.max()))
 
 
-def _log_likelihood(terms: FloatArray, noise: FloatArray, follow: FloatArray) -> FloatArray:
-    """Of one stripe's shape for every factor of the boards' scatter."""
-    total = noise + FACTORS[:, None, None] ** 2 * (follow @ follow.T)
+def _log_likelihood(
+    terms: FloatArray, noise: FloatArray, follow: FloatArray, forms_px: FloatArray
+) -> FloatArray:
+    """Of one stripe's shape for every form (rows) and factor of the boards' scatter."""
+    formed = noise + forms_px[:, None, None, None] ** 2 * np.eye(len(terms))
+    total = formed + FACTORS[:, None, None] ** 2 * (follow @ follow.T)
     _, log_determinant = np.linalg.slogdet(total)
-    solved = np.linalg.solve(total, np.broadcast_to(terms[:, None], (len(FACTORS), len(terms), 1)))
-    return np.asarray(-0.5 * (log_determinant + solved[:, :, 0] @ terms))
+    solved = np.linalg.solve(total, np.broadcast_to(terms[:, None], (*total.shape[:3], 1)))
+    return np.asarray(-0.5 * (log_determinant + solved[..., 0] @ terms))
 
 
 def find_outlier_view(
@@ -433,7 +447,10 @@ def _bow_or_boards(
     )
     if final.p_value >= LACK_OF_FIT_P:
         return model
-    return data.charged_to_boards(model, boards_bowed.factor)
+    charged = data.charged_to_boards(model, boards_bowed.factor)
+    if isinstance(charged, FitFailure):
+        return plane(f"a bow does better than a plane ({likelihood}), but {charged.reason}")
+    return charged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -505,6 +522,12 @@ class _OneSheet:
         solution = wider.solve(model.sheet, model.noise.sigma_factor, is_bowed=model.is_bowed)
         if isinstance(solution, FitFailure):
             return solution
+        if not solution.has_converged:
+            return FitFailure(
+                f"with boards that err {board_factor:.1f} times as much as their targets say the "
+                "sheet's shape did not settle",
+                "take more boards, farther apart, and check their poses",
+            )
         model = replace(
             model,
             sheet=solution.sheets[0],

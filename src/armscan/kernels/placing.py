@@ -550,29 +550,37 @@ def _covariance_of_distances(by_distance: Table, covariance: Floats, found: Tabl
 
 @compiled(error_model="numpy")
 def fuse_stripes(
+    chosen: Ints,
+    into: Ints,
+    at: Ints,
     points: Table,
     sheet: Ints,
     normals: Table,
     sigma: Table,
+    size_mm: Floats,
     missed: Floats,
-    by_right: Table,
-    by_second: Table,
+    by_point: Table,
+    by_errors: Table,
     camera: Floats,
     sheets: Table,
     covariance: Table,
     fused: TableOut,
-    moves: TableOut,
+    noise: TableOut,
+    shape: TableOut,
     by_sensor: TableOut,
 ) -> None:
     """Points of which two cameras and the sheet each tell a distance, weighed against each other.
 
-    ``points``: (N, 3) of left pixels on their sheets. ``sheet``, ``camera``, ``sheets``: As for
-    `meet_sheets`. ``normals``: (N, 4) across the left and the right stripe. ``sigma``: (N, 3) of
-    both and of the sheet's shape. ``missed``: (N,) distance across the right stripe. ``by_right``,
-    ``by_second``: (N, 6) and (N, 30), the rows' (2, 3) and (2, 15) derivatives of the right pixel.
-    ``covariance``: (S, 1024) of the left camera, a sheet, and the second camera. ``fused``: (N, 3)
-    output. ``moves``: (N, 9) output, the rows' (3, 3) moves by one sigma of the left stripe, the
-    right stripe, the shape. ``by_sensor``: (N, 96) output, the rows' (3, 32).
+    ``chosen``, ``into``: (M,) crossings whose points are asked for, and rows of the output. ``at``:
+    (F,) row of each crossing in ``points``, ``sheet`` and ``normals``: (H, 3), (H,) and (H, 2), of
+    left pixels on their sheets and across the left stripe. ``sigma``: (F, 2) of both stripes.
+    ``size_mm``: (S,) sigma of each sheet's shape. ``missed``: (F,)
+    distance across the right stripe. ``by_point``, ``by_errors``: (F, 3) and (F, 35) its
+    derivatives, from `cross_stripes`. ``camera``, ``sheets``: As for `meet_sheets`.
+    ``covariance``: (S, 1024) of the left camera, a sheet, and the second camera. ``fused``,
+    ``shape``: (N, 3) output, the latter the move by one sigma of the sheet's shape. ``noise``:
+    (N, 6) output, the rows' (3, 2) moves by one sigma of the left and of the right stripe.
+    ``by_sensor``: (N, 96) output, the rows' (3, 32).
     """
     second = N_CAMERA + N_SHEET
     lens = np.zeros(7)
@@ -582,7 +590,10 @@ def fuse_stripes(
     by_distance = np.zeros((4, 32))
     joint = np.zeros((3, 3))
     gain = np.zeros((3, 4))
-    for i in range(points.shape[0]):
+    for m in range(chosen.shape[0]):
+        f = chosen[m]
+        i = at[f]
+        o = into[m]
         z = points[i, 2]
         x = points[i, 0] / z
         y = points[i, 1] / z
@@ -610,25 +621,27 @@ def fuse_stripes(
             by_distance[k, 7] = across_x * (r2 + 2.0 * x * x) + across_y * 2.0 * x * y
             by_distance[k, 8] = radial * r2 * r2 * r2
         for a in range(3):
-            rest[1, a] = normals[i, 2] * by_right[i, a] + normals[i, 3] * by_right[i, 3 + a]
+            rest[1, a] = by_point[f, a]
             rest[2, a] = surface[1 + a]
-        for c in range(15):
-            both = normals[i, 2] * by_second[i, c] + normals[i, 3] * by_second[i, 15 + c]
-            by_distance[2, second + c] = both
+        for c in range(second, 32):
+            by_distance[2, c] = by_errors[f, c]
         for c in range(N_SHEET):
             by_distance[3, N_CAMERA + c] = -surface[4 + c]
         _covariance_of_distances(by_distance, covariance[sheet[i]], joint)
-        for a in range(3):
-            joint[a, a] += sigma[i, a] * sigma[i, a]
+        size = size_mm[sheet[i]]
+        joint[0, 0] += sigma[f, 0] * sigma[f, 0]
+        joint[1, 1] += sigma[f, 1] * sigma[f, 1]
+        joint[2, 2] += size * size
         _weigh(rest, joint, along, gain)
         for a in range(3):
-            fused[i, a] = points[i, a] - gain[a, 2] * missed[i]
-            for k in range(3):
-                moves[i, 3 * a + k] = gain[a, 1 + k] * sigma[i, k]
+            fused[o, a] = points[i, a] - gain[a, 2] * missed[f]
+            noise[o, 2 * a] = gain[a, 1] * sigma[f, 0]
+            noise[o, 2 * a + 1] = gain[a, 2] * sigma[f, 1]
+            shape[o, a] = gain[a, 3] * size
             for c in range(N_CAMERA):
                 change = gain[a, 0] * by_distance[0, c] + gain[a, 1] * by_distance[1, c]
-                by_sensor[i, 32 * a + c] = -change
+                by_sensor[o, 32 * a + c] = -change
             for c in range(N_CAMERA, second):
-                by_sensor[i, 32 * a + c] = -gain[a, 3] * by_distance[3, c]
+                by_sensor[o, 32 * a + c] = -gain[a, 3] * by_distance[3, c]
             for c in range(second, 32):
-                by_sensor[i, 32 * a + c] = -gain[a, 2] * by_distance[2, c]
+                by_sensor[o, 32 * a + c] = -gain[a, 2] * by_distance[2, c]

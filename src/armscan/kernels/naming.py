@@ -27,6 +27,10 @@ SECOND = N_CAMERA + N_SHEET
 DRIFT = SECOND + N_SECOND
 """Places, among what a residual depends on, of what a second camera adds and of the drift."""
 LEAST_LENGTH = 1e-12
+SPIRAL = np.array(
+    [[0, 0], [0, 1], [1, 0], [0, -1], [-1, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]], np.int64
+)
+"""A cell and those around it, rows and columns."""
 
 
 @compiled()
@@ -241,8 +245,15 @@ def find_nearest(asked: Table, points: Table, reach: float, nearest: IntsOut) ->
         column = math.floor((x - low_x) / reach)
         row = math.floor((y - low_y) / reach)
         best = reach * reach
-        for r in range(max(row - 1, 0), min(row + 2, rows)):
-            for c in range(max(column - 1, 0), min(column + 2, columns)):
+        for k in range(9):
+            # its own cell first, so that most of the others are too far away
+            r = row + SPIRAL[k, 0]
+            c = column + SPIRAL[k, 1]
+            if 0 <= r < rows and 0 <= c < columns:
+                far_x = max(low_x + c * reach - x, x - low_x - (c + 1) * reach, 0.0)
+                far_y = max(low_y + r * reach - y, y - low_y - (r + 1) * reach, 0.0)
+                if far_x * far_x + far_y * far_y > best:
+                    continue
                 j = head[r * columns + c]
                 while j >= 0:
                     dx = points[j, 0] - x
@@ -403,6 +414,17 @@ def cross_stripes(
     return count
 
 
+@compiled()
+def mark_beside(rows: Ints, chain: Ints, reach: int, is_beside: BytesOut) -> None:
+    """Mark points (N,) of a chain that lie within ``reach`` places of some rows (M,)."""
+    n = chain.shape[0]
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        for near in range(max(row - reach, 0), min(row + reach + 1, n)):
+            if chain[near] == chain[row]:
+                is_beside[near] = 1
+
+
 @compiled(fastmath=True)
 def explain_residuals(by_errors: Table, sheet: Ints, step: Table, found: FloatsOut) -> None:
     """What errors add to residuals, (H,) output.
@@ -443,6 +465,70 @@ def predict_residuals(
             variance += total * row[c]
         found[i, 0] = explained
         found[i, 1] = variance
+
+
+@compiled()
+def score_left(
+    sample: Ints,
+    sheet: Ints,
+    ratio: Floats,
+    is_match: Bytes,
+    is_alive: Bytes,
+    missing: float,
+    scores: TableOut,
+    is_beside: BytesOut,
+) -> None:
+    """Scores of left samples on sheets, and which lie on a right stripe that may be theirs.
+
+    ``sample``, ``sheet``, ``ratio``, ``is_match``, ``is_alive``: (H,) of each pair of sample and
+    sheet; one that is not alive has the score ``missing``. ``scores``, ``is_beside``: (S, K) and
+    (S K,), written where there is a pair.
+    """
+    k = scores.shape[1]
+    for i in range(sample.shape[0]):
+        is_ruled_out = is_match[i] != 0 and is_alive[i] == 0
+        scores[sample[i], sheet[i]] = missing if is_ruled_out else ratio[i]
+        is_beside[sample[i] * k + sheet[i]] = is_alive[i]
+
+
+@compiled()
+def score_right(
+    sample: Ints,
+    sheet: Ints,
+    ratio: Floats,
+    is_alive: Bytes,
+    scores: TableOut,
+    is_beside: BytesOut,
+) -> None:
+    """The same of right samples, -1 for none: each takes its best partner that is alive."""
+    k = scores.shape[1]
+    for i in range(sample.shape[0]):
+        at = sample[i]
+        if at >= 0 and is_alive[i] != 0:
+            scores[at, sheet[i]] = max(scores[at, sheet[i]], ratio[i])
+            is_beside[at * k + sheet[i]] = 1
+
+
+@compiled()
+def rule_out(
+    sample: Ints,
+    sheet: Ints,
+    state: Ints,
+    is_sure: Bytes,
+    is_match: Bytes,
+    is_strict: int,
+    is_alive: BytesOut,
+) -> None:
+    """Pairs that matches are left to be, given what is certain of the samples of one camera.
+
+    ``state``, ``is_sure``: (S,) sheet of each sample. ``is_strict``: 1 if the pair's sheet must be
+    certain, 0 if no other may be. ``is_alive``: (H,) output.
+    """
+    for i in range(sample.shape[0]):
+        at = sample[i]
+        is_known = at >= 0 and is_sure[at] != 0
+        is_left = state[at] == sheet[i] if is_known else is_strict == 0
+        is_alive[i] = 1 if is_left and is_match[i] != 0 else 0
 
 
 @compiled()
@@ -539,31 +625,36 @@ def sum_off_planes(
 
 
 @compiled(fastmath=True)
-def add_equations(
-    rows: Table, group: Ints, weight: Floats, wanted: Floats, matrix: TableOut, vector: TableOut
+def sum_moments(
+    rows: Ints,
+    segment: Ints,
+    moments: Table,
+    by_errors: Table,
+    missed: Floats,
+    variance: Floats,
+    asked: TableOut,
+    shapes: TableOut,
+    noise: TableOut,
 ) -> None:
-    """Add rows of equations to the normal equations of their groups.
+    """Moments of each segment's residuals, their derivatives, and their covariance by own noise.
 
-    ``rows``: (H, Q) derivatives. ``group``: (H,). ``weight``: (H,). ``wanted``: (H,) right-hand
-    side. ``matrix``: (G, Q Q) sums of weighted products. ``vector``: (G, Q) of each with what is
-    wanted.
+    ``rows``, ``segment``: (M,) residuals of segments, and the numbers of these. ``moments``: (M, 3)
+    share of each residual in the three moments of its segment. ``by_errors``, ``missed``,
+    ``variance``: (H, Q), (H,) and (H,) of all residuals. ``asked``, ``shapes``, ``noise``:
+    (B, 3 Q), (B, 3) and (B, 9), zeros.
     """
-    q = rows.shape[1]
-    for i in range(rows.shape[0]):
-        if weight[i] == 0.0:
-            continue
-        row = rows[i]
-        sums = vector[group[i]]
-        share = weight[i] * wanted[i]
-        for c in range(q):
-            sums[c] += share * row[c]
-        for c in range(q):
-            products = matrix[group[i], c * q : (c + 1) * q]
-            share = weight[i] * row[c]
-            if share == 0.0:
-                continue
-            for d in range(q):
-                products[d] += share * row[d]
+    q = by_errors.shape[1]
+    for m in range(rows.shape[0]):
+        i, b = rows[m], segment[m]
+        row = by_errors[i]
+        for k in range(3):
+            share = moments[m, k]
+            shapes[b, k] += share * missed[i]
+            for d in range(3):
+                noise[b, 3 * k + d] += share * moments[m, d] * variance[i]
+            sums = asked[b, k * q : (k + 1) * q]
+            for c in range(q):
+                sums[c] += share * row[c]
 
 
 @compiled()

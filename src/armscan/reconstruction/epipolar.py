@@ -13,7 +13,6 @@ from scipy.linalg import blas, lapack
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import square_root
 from armscan.kernels.naming import (
-    add_equations,
     combine_rows,
     cross_stripes,
     explain_residuals,
@@ -22,6 +21,7 @@ from armscan.kernels.naming import (
     list_possible,
     predict_residuals,
     see_points,
+    sum_moments,
 )
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import fold_radius
@@ -124,11 +124,15 @@ class RightStripes:
         (R,) the accepted ones.
     table
         (R, 5) their pixels, normals and sigmas.
+    low_px, high_px
+        Corners of the rectangle in which they are; infinite and reversed where there is none.
     """
 
     profile: Profile
     row: IntArray
     table: FloatArray
+    low_px: tuple[float, float]
+    high_px: tuple[float, float]
 
     @staticmethod
     def of(profile: Profile) -> RightStripes:
@@ -137,22 +141,23 @@ class RightStripes:
         table = np.zeros((len(row), 5))
         table[:, :2], table[:, 2:4] = profile.points_px[row], profile.normals_px[row]
         table[:, 4] = profile.sigma_px[row]
-        return RightStripes(profile, row, table)
+        x, y = table[:, 0], table[:, 1]
+        low = float(x.min(initial=np.inf)), float(y.min(initial=np.inf))
+        high = float(x.max(initial=-np.inf)), float(y.max(initial=-np.inf))
+        return RightStripes(profile, row, table, low, high)
 
     def spacing_px(self) -> float:
         """Mean distance between stripes: the picture's area over the stripes' length."""
         if len(self.row) < 2:
             return 1.0
-        size = np.ptp(self.table[:, :2], axis=0)
-        return max(float(size[0] * size[1]) / len(self.row), 1.0)
+        width, height = np.subtract(self.high_px, self.low_px)
+        return max(float(width * height) / len(self.row), 1.0)
 
     def covers(self, q_px: FloatArray) -> BoolArray:
         """(H,) True within the rectangle in which there are right stripes."""
-        points = self.table[:, :2]
-        if not len(points):
-            return np.zeros(len(q_px), dtype=np.bool_)
-        low, high = points.min(axis=0), points.max(axis=0)
-        return np.asarray(((q_px >= low) & (q_px <= high)).all(axis=1))
+        x, y = q_px[:, 0], q_px[:, 1]
+        inside = (x >= self.low_px[0]) & (x <= self.high_px[0])
+        return np.asarray(inside & (y >= self.low_px[1]) & (y <= self.high_px[1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,8 +228,9 @@ def find_crossings(
     nearest, at = np.zeros((2, n), np.int64)
     reach = float(np.hypot(reach_px, ALONG_PX))
     find_nearest(projected.q_px, np.ascontiguousarray(right.table[:, :2]), reach, nearest)
-    across, by_point = np.zeros((n, 4)), np.zeros((n, 3))
-    by_errors = np.zeros((n, len(error_columns(sensor)[0])))
+    n_near = int(np.count_nonzero(nearest >= 0))
+    across, by_point = np.zeros((n_near, 4)), np.zeros((n_near, 3))
+    by_errors = np.zeros((n_near, error_columns(sensor).shape[1]))
     count = cross_stripes(
         projected.points_mm,
         projected.sheet,
@@ -353,15 +359,20 @@ class Residuals:
     by_errors
         (H, Q + 3) derivative by what the points of one sheet depend on (`sensor_columns`) and by
         the drift's three numbers; by all else it is zero.
-    columns
-        (sheets, Q + 3) places of these among the sensor's P parameters and the drift.
+    sensor
+        Both cameras and all sheets.
     """
 
     px: FloatArray
     sigma_px: FloatArray
     sheet: IntArray
     by_errors: FloatArray
-    columns: IntArray
+    sensor: SensorCalibration
+
+    @property
+    def columns(self) -> IntArray:
+        """(sheets, Q + 3), from `error_columns`."""
+        return error_columns(self.sensor)
 
     @staticmethod
     def of(crossings: Crossings, sensor: SensorCalibration) -> Residuals:
@@ -371,7 +382,7 @@ class Residuals:
             sigma_px=crossings.sigma_px,
             sheet=crossings.sheet,
             by_errors=crossings.by_errors,
-            columns=error_columns(sensor),
+            sensor=sensor,
         )
 
     def explained(self, step: FloatArray) -> FloatArray:
@@ -388,16 +399,21 @@ class Residuals:
         ``weight``, ``wanted``: (H,).
         """
         q = self.by_errors.shape[1]
-        matrix, vector = np.zeros((n_groups, q * q)), np.zeros((n_groups, q))
-        add_equations(self.by_errors, group, weight, wanted, matrix, vector)
-        return matrix.reshape(-1, q, q), vector
+        matrix, vector = np.zeros((n_groups, q, q)), np.zeros((n_groups, q))
+        order = np.argsort(group, kind="stable")
+        bounds = np.searchsorted(group[order], np.arange(n_groups + 1))
+        rows, weight, wanted = self.by_errors[order], weight[order], wanted[order]
+        for k, (first, last) in enumerate(pairwise(bounds)):
+            weighted = rows[first:last].T * weight[first:last]
+            matrix[k], vector[k] = weighted @ rows[first:last], weighted @ wanted[first:last]
+        return matrix, vector
 
     def joined_equations(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Normal equations of all parameters, (P + 3, P + 3) and (P + 3,), to undo the residuals.
 
         ``weight``: (H,).
         """
-        n = int(self.columns.max()) + 1
+        n = len(self.sensor.covariance) + N_DRIFT
         matrix, vector = self.equations(weight, -self.px, self.sheet, len(self.columns))
         whole, side = np.zeros((n, n)), np.zeros(n)
         join_equations(matrix.reshape(len(matrix), -1), vector, self.columns, whole, side)
@@ -413,7 +429,7 @@ class Residuals:
     def weighted_sum(self, weight: FloatArray) -> FloatArray:
         """(P + 3,) derivative of the residuals' sum with weights (H,)."""
         of_sheet = np.arange(len(self.columns))[:, None] == self.sheet
-        total = np.zeros(int(self.columns.max()) + 1)
+        total = np.zeros(len(self.sensor.covariance) + N_DRIFT)
         np.add.at(total, self.columns, (of_sheet * weight) @ self.by_errors)
         return total
 
@@ -565,6 +581,8 @@ def left_out_scores(
         (B,) chi-square of mean, slope and bend of the segment's residuals, over their count.
     """
     n = int(segment.max(initial=-1)) + 1
+    if not n:
+        return np.zeros(0)
     order = np.argsort(segment, kind="stable")
     bounds = np.searchsorted(segment[order], np.arange(n + 1))
     sheet = np.zeros(n, dtype=np.int64)
@@ -576,19 +594,27 @@ def left_out_scores(
     unit = np.where(unit > 0.0, unit, 1.0)[columns]
     factor /= unit[:, :, None]
     covariance = (factor @ factor.transpose(0, 2, 1))[sheet]
-    weight, unit = np.zeros(len(residuals.px)), unit[sheet]
-    weight[rows] = equations.weight[rows] / equations.sigma[rows] ** 2
-    group = np.zeros(len(weight), np.int64)
-    group[rows] = segment
-    said, missed = residuals.equations(weight, equations.missed, group, n)
-    shapes, asked = np.zeros((n, 3)), np.zeros((n, columns.shape[1], 4))
-    noise = np.zeros((n, 3, 3))
-    for b, (first, last) in enumerate(pairwise(bounds)):
-        own, moments = rows[order[first:last]], _moments(last - first)
-        k = len(moments)
-        shapes[b, :k] = moments @ equations.missed[own]
-        asked[b, :, :k] = (moments @ residuals.by_errors[own]).T
-        noise[b, :k, :k] = (moments * equations.sigma[own] ** 2) @ moments.T
+    variance, unit = equations.sigma**2, unit[sheet]
+    own, n_errors = rows[order], columns.shape[1]
+    weight = (equations.weight / variance)[own]
+    chosen = replace(residuals, by_errors=residuals.by_errors[own])
+    said, missed = chosen.equations(weight, equations.missed[own], segment[order], n)
+    shapes, noise, by_shape = np.zeros((n, 3)), np.zeros((n, 9)), np.zeros((n, 3 * n_errors))
+    moments = np.concatenate([_moments(count) for count in np.diff(bounds).tolist()])
+    sum_moments(
+        own,
+        segment[order],
+        moments,
+        residuals.by_errors,
+        equations.missed,
+        variance,
+        by_shape,
+        shapes,
+        noise,
+    )
+    noise = noise.reshape(n, 3, 3)
+    asked = np.zeros((n, n_errors, 4))
+    asked[:, :, :3] = by_shape.reshape(n, 3, n_errors).transpose(0, 2, 1)
     asked[:, :, 3] = missed
     asked *= unit[:, :, None]
     said *= unit[:, :, None] * unit[:, None, :]
@@ -610,10 +636,11 @@ def left_out_scores(
 
 @cache
 def _moments(n: int) -> FloatArray:
-    """(3, n), or fewer rows of few samples: what takes (n,) to their mean, slope and bend."""
+    """(n, 3): what takes (n,) to their mean, slope and bend; zero for what few do not show."""
     place = np.linspace(-1.0, 1.0, n)
     shape = np.stack([np.ones(n), place, place**2], axis=1)[:, : min(n, 3)]
-    moments = np.asarray(np.linalg.pinv(shape))
+    moments = np.zeros((n, 3))
+    moments[:, : shape.shape[1]] = np.linalg.pinv(shape).T
     moments.setflags(write=False)
     return moments
 
@@ -639,11 +666,17 @@ def residual_and_sigma(
     residuals: Residuals, offset: EpipolarOffset
 ) -> tuple[FloatArray, FloatArray]:
     """Residual (H,) beyond what calibration errors and drift explain, and its sigma (H,), px."""
-    step = np.concatenate([offset.parameter_step, offset.drift])
-    factor = offset.factor[residuals.columns]
-    covariance = (factor @ factor.transpose(0, 2, 1)).reshape(len(factor), -1)
+    steps, covariances = _of_sheets(offset, residuals.sensor)
     found = np.zeros((len(residuals.px), 2))
-    steps = step[residuals.columns]
-    predict_residuals(residuals.by_errors, residuals.sheet, steps, covariance, found)
+    predict_residuals(residuals.by_errors, residuals.sheet, steps, covariances, found)
     variance = residuals.sigma_px**2 + np.maximum(found[:, 1], 0.0) + FLOOR_PX**2
     return residuals.px + found[:, 0], np.sqrt(variance)
+
+
+@lru_cache(maxsize=4)
+def _of_sheets(offset: EpipolarOffset, sensor: SensorCalibration) -> tuple[FloatArray, FloatArray]:
+    """(S, Q + 3) errors that each sheet's points depend on, and their covariance, in a row."""
+    columns = error_columns(sensor)
+    factor = offset.factor[columns]
+    covariance = (factor @ factor.transpose(0, 2, 1)).reshape(len(factor), -1)
+    return np.concatenate([offset.parameter_step, offset.drift])[columns], covariance

@@ -12,13 +12,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor
-from armscan.kernels.naming import choose_sheets, sum_off_planes
+from armscan.kernels.naming import (
+    choose_sheets,
+    rule_out,
+    score_left,
+    score_right,
+    sum_off_planes,
+)
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.epipolar import (
     EpipolarOffset,
@@ -43,6 +51,8 @@ from armscan.reconstruction.segments import (
 )
 from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange
 from armscan.records.profile import Profile
+
+BytesArray: TypeAlias = NDArray[np.uint8]
 
 SAMPLE_POINTS = 6
 """Every so many stripe points one is projected; the others follow it."""
@@ -278,7 +288,7 @@ class _Side:
         """(S,) row of each sample in the profile."""
         return self.segments.row[self.samples.at]
 
-    def assign(self, scores: FloatArray, is_match: BoolArray) -> SheetAssignment:
+    def assign(self, scores: FloatArray, is_match: BytesArray) -> SheetAssignment:
         """Most likely sheet of each segment, and how sure it is.
 
         A segment is one line of light, so it has one sheet. Where along it another sheet is far
@@ -290,7 +300,7 @@ class _Side:
         scores
             (S, K) log-likelihood ratio of each sheet at each sample.
         is_match
-            (S, K) True where the sheet puts the sample on a stripe of the other camera.
+            (S K,) 1 where the sheet puts the sample on a stripe of the other camera.
         """
         n, n_sheets = scores.shape
         number = self.segments.number[self.samples.at]
@@ -300,7 +310,7 @@ class _Side:
         is_candidate = np.zeros((n_segments, n_sheets), np.bool_)
         choose_sheets(
             scores,
-            is_match.view(np.uint8).reshape(-1),
+            is_match,
             self.samples.weight,
             number,
             LIMITS,
@@ -564,32 +574,38 @@ def _assign_both(
     pairs: _Pairs, sides: tuple[_Side, _Side], n_sheets: int
 ) -> tuple[SheetAssignment, SheetAssignment]:
     """Sheets of both cameras that agree with each other."""
-    alive_left = alive_right = pairs.is_match
+    match = pairs.is_match.view(np.uint8)
+    alive_left = alive_right = match
     for _ in range(EXCHANGES):
         left = _assign_left(pairs, alive_left, sides[0], n_sheets)
         right = _assign_right(pairs, alive_right, sides[1], n_sheets)
-        by_left, by_right = left.label[pairs.left], np.append(right.label, -1)[pairs.right]
-        alive_left = pairs.is_match & ((by_right == -1) | (by_right == pairs.sheet))
-        alive_right = pairs.is_match & ((by_left == -1) | (by_left == pairs.sheet))
+        alive_left = _alive(pairs, pairs.right, right)
+        alive_right = _alive(pairs, pairs.left, left)
     left = _assign_left(pairs, alive_left, sides[0], n_sheets)
-    agreed = alive_left & (left.label[pairs.left] == pairs.sheet)
+    agreed = alive_left & _alive(pairs, pairs.left, left, is_strict=True)
     return left, _assign_right(pairs, agreed, sides[1], n_sheets)
 
 
-def _assign_left(pairs: _Pairs, alive: BoolArray, side: _Side, n_sheets: int) -> SheetAssignment:
+def _alive(
+    pairs: _Pairs, sample: IntArray, found: SheetAssignment, *, is_strict: bool = False
+) -> BytesArray:
+    """(H,) 1 for matches whose samples are on no other sheet for certain, or are on this one."""
+    alive = np.zeros(len(sample), np.uint8)
+    match, is_sure = pairs.is_match.view(np.uint8), found.is_sure.view(np.uint8)
+    rule_out(sample, pairs.sheet, found.state, is_sure, match, int(is_strict), alive)
+    return alive
+
+
+def _assign_left(pairs: _Pairs, alive: BytesArray, side: _Side, n_sheets: int) -> SheetAssignment:
     scores = np.full((len(side), n_sheets), IMPOSSIBLE)
-    scores[pairs.left, pairs.sheet] = np.where(alive | ~pairs.is_match, pairs.ratio, MISSING)
-    is_match = np.zeros((len(side), n_sheets), dtype=np.bool_)
-    is_match[pairs.left, pairs.sheet] = alive
-    return side.assign(scores, is_match)
+    is_beside, match = np.zeros(scores.size, np.uint8), pairs.is_match.view(np.uint8)
+    score_left(pairs.left, pairs.sheet, pairs.ratio, match, alive, MISSING, scores, is_beside)
+    return side.assign(scores, is_beside)
 
 
-def _assign_right(pairs: _Pairs, alive: BoolArray, side: _Side, n_sheets: int) -> SheetAssignment:
+def _assign_right(pairs: _Pairs, alive: BytesArray, side: _Side, n_sheets: int) -> SheetAssignment:
     """The same pairs, seen from the right stripes: each sample takes its best partner."""
     scores = np.full((len(side), n_sheets), MISSING)
-    chosen = np.flatnonzero(alive & (pairs.right >= 0))
-    where = (pairs.right[chosen], pairs.sheet[chosen])
-    np.maximum.at(scores, where, pairs.ratio[chosen])
-    is_match = np.zeros((len(side), n_sheets), dtype=np.bool_)
-    is_match[where] = True
-    return side.assign(scores, is_match)
+    is_beside = np.zeros(scores.size, np.uint8)
+    score_right(pairs.right, pairs.sheet, pairs.ratio, alive, scores, is_beside)
+    return side.assign(scores, is_beside)

@@ -17,6 +17,7 @@ import numpy as np
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.rotations import skew
+from armscan.kernels.naming import mark_beside
 from armscan.kernels.placing import fuse_stripes
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import fold_radius
@@ -271,9 +272,7 @@ def _right_alone(
 def _beside(rows: IntArray, right: Profile) -> BoolArray:
     """(N,) right points that a left point fell beside, with those between them."""
     is_beside = np.zeros(len(right), dtype=np.bool_)
-    for step in range(-BESIDE_ROWS, BESIDE_ROWS + 1):
-        near = np.clip(rows + step, 0, len(right) - 1)
-        is_beside[near[right.segment[near] == right.segment[rows]]] = True
+    mark_beside(rows, right.segment, BESIDE_ROWS, is_beside.view(np.uint8))
     return is_beside
 
 

@@ -599,7 +599,7 @@ def left_out_scores(
     weight = (equations.weight / variance)[own]
     chosen = replace(residuals, by_errors=residuals.by_errors[own])
     said, missed = chosen.equations(weight, equations.missed[own], segment[order], n)
-    shapes, noise, by_shape = np.zeros((n, 3)), np.zeros((n, 9)), np.zeros((n, 3 * n_errors))
+    shapes, own_noise, by_shape = np.zeros((n, 3)), np.zeros((n, 9)), np.zeros((n, 3 * n_errors))
     moments = np.concatenate([_moments(count) for count in np.diff(bounds).tolist()])
     sum_moments(
         own,
@@ -610,9 +610,9 @@ def left_out_scores(
         variance,
         by_shape,
         shapes,
-        noise,
+        own_noise,
     )
-    noise = noise.reshape(n, 3, 3)
+    noise = own_noise.reshape(n, 3, 3)
     asked = np.zeros((n, n_errors, 4))
     asked[:, :, :3] = by_shape.reshape(n, 3, n_errors).transpose(0, 2, 1)
     asked[:, :, 3] = missed

@@ -131,11 +131,11 @@ def by_votes(left: Profile, right: Profile, sensor: SensorCalibration) -> IntArr
         left.normals_px[row[at]],
         left.sigma_px[row[at]],
         RightStripes.of(right),
-        RANGE_PX,
+        sensor,
+        reach_px=RANGE_PX,
     )
     votes = np.zeros((int(left.segment.max()) + 1, len(sensor.sheets)))
-    hit = beside.is_found
-    np.add.at(votes, (left.segment[row[at[hit]]], sheet[hit]), 1.0)
+    np.add.at(votes, (left.segment[row[at[beside.at]]], beside.sheet), 1.0)
     winner = np.where(votes.max(axis=1) > 0.0, votes.argmax(axis=1), -1)
     return np.where(left.is_accepted, winner[left.segment], -1)
 

@@ -469,14 +469,16 @@ def propagate_points(
 
 
 @compiled(error_model="numpy")
-def _weigh(rest: Table, covariance: Table, along: Floats, gain: TableOut) -> None:
+def _weigh(
+    rest: Table, covariance: Table, along: Floats, scratch: TableOut, gain: TableOut
+) -> None:
     """Least-squares change (3, 4) of a point by four distances, the first of which is exact.
 
     ``rest``: (3, 3) derivatives of the three others by the point. ``covariance``: (3, 3) theirs.
     ``along``: (3,) derivative of the first. Moving along the stripe changes the other distances
-    too, which the solution takes back.
+    too, which the solution takes back. ``scratch``: (6, 3) is written to.
     """
-    free = np.zeros((2, 3))
+    free, design, weighed = scratch[:2], scratch[2:4], scratch[4:]
     size = along[0] * along[0] + along[1] * along[1] + along[2] * along[2]
     for k in range(2):
         other = rest[0] if k == 0 else free[0]
@@ -493,12 +495,10 @@ def _weigh(rest: Table, covariance: Table, along: Floats, gain: TableOut) -> Non
     l11 = math.sqrt(covariance[1, 1] - l10 * l10)
     l21 = (covariance[2, 1] - l20 * l10) / l11
     l22 = math.sqrt(covariance[2, 2] - l20 * l20 - l21 * l21)
-    design = np.zeros((2, 3))
-    weighed = np.zeros((2, 3))
     for k in range(2):
         for r in range(3):
-            for a in range(3):
-                design[k, r] += rest[r, a] * free[k, a]
+            total = rest[r, 0] * free[k, 0] + rest[r, 1] * free[k, 1]
+            design[k, r] = total + rest[r, 2] * free[k, 2]
         y0 = design[k, 0] / l00
         y1 = (design[k, 1] - l10 * y0) / l11
         y2 = (design[k, 2] - l20 * y0 - l21 * y1) / l22
@@ -523,56 +523,94 @@ def _weigh(rest: Table, covariance: Table, along: Floats, gain: TableOut) -> Non
 
 
 @compiled(error_model="numpy", fastmath=FUSED)
-def _covariance_of_distances(by_distance: Table, covariance: Floats, found: TableOut) -> None:
+def _covariance_of_distances(
+    by_distance: Table, covariance: Floats, moved: FloatsOut, found: TableOut
+) -> None:
     """(3, 3) of distances across the left stripe, the right stripe and from the sheet.
 
     ``by_distance``: (4, 32) derivatives by the sensor, zero but for a distance's own parameters:
-    of the left camera, the second camera, the sheet. ``covariance``: (1024,) of these.
+    of the left camera, the second camera, the sheet. ``covariance``: (1024,) of these. ``moved``:
+    (32,) is written to.
     """
-    width = by_distance.shape[1]
-    second = N_CAMERA + N_SHEET
-    begin = (0, second, N_CAMERA)
-    end = (N_CAMERA, width, second)
-    moved = np.zeros(width)
-    for a in range(3):
-        moved[:] = 0.0
-        for c in range(begin[a], end[a]):
-            share = by_distance[1 + a, c]
-            row = covariance[c * width : (c + 1) * width]
-            for d in range(width):
-                moved[d] += share * row[d]
-        for b in range(3):
-            total = 0.0
-            for d in range(begin[b], end[b]):
-                total += moved[d] * by_distance[1 + b, d]
-            found[a, b] = total
+    left, right, own = by_distance[1], by_distance[2], by_distance[3]
+    for d in range(32):
+        moved[d] = 0.0
+    for c in range(9):
+        share = left[c]
+        row = covariance[32 * c : 32 * c + 32]
+        for d in range(32):
+            moved[d] += share * row[d]
+    both = beside = sheet = 0.0
+    for d in range(9):
+        both += moved[d] * left[d]
+    for d in range(8):
+        sheet += moved[9 + d] * own[9 + d]
+    for d in range(15):
+        beside += moved[17 + d] * right[17 + d]
+    found[0, 0] = both
+    found[0, 1] = found[1, 0] = beside
+    found[0, 2] = found[2, 0] = sheet
+    # of the other two distances only what is not known yet
+    for d in range(24):
+        moved[8 + d] = 0.0
+    for c in range(15):
+        share = right[17 + c]
+        row = covariance[32 * (17 + c) + 8 : 32 * (17 + c) + 32]
+        for d in range(24):
+            moved[8 + d] += share * row[d]
+    both = sheet = 0.0
+    for d in range(15):
+        both += moved[17 + d] * right[17 + d]
+    for d in range(8):
+        sheet += moved[9 + d] * own[9 + d]
+    found[1, 1] = both
+    found[1, 2] = found[2, 1] = sheet
+    for d in range(8):
+        moved[d] = 0.0
+    for c in range(8):
+        share = own[9 + c]
+        row = covariance[32 * (9 + c) + 9 : 32 * (9 + c) + 17]
+        for d in range(8):
+            moved[d] += share * row[d]
+    both = 0.0
+    for d in range(8):
+        both += moved[d] * own[9 + d]
+    found[2, 2] = both
 
 
 @compiled(error_model="numpy")
 def fuse_stripes(
+    chosen: Ints,
+    into: Ints,
+    at: Ints,
     points: Table,
     sheet: Ints,
     normals: Table,
     sigma: Table,
+    size_mm: Floats,
     missed: Floats,
-    by_right: Table,
-    by_second: Table,
+    by_point: Table,
+    by_errors: Table,
     camera: Floats,
     sheets: Table,
     covariance: Table,
     fused: TableOut,
-    moves: TableOut,
+    noise: TableOut,
+    shape: TableOut,
     by_sensor: TableOut,
 ) -> None:
     """Points of which two cameras and the sheet each tell a distance, weighed against each other.
 
-    ``points``: (N, 3) of left pixels on their sheets. ``sheet``, ``camera``, ``sheets``: As for
-    `meet_sheets`. ``normals``: (N, 4) across the left and the right stripe. ``sigma``: (N, 3) of
-    both and of the sheet's shape. ``missed``: (N,) distance across the right stripe. ``by_right``,
-    ``by_second``: (N, 6) and (N, 30), the rows' (2, 3) and (2, 15) derivatives of the right pixel.
-    ``covariance``: (S, 1024) of the left camera, a sheet, and the second camera. ``fused``: (N, 3)
-    output. ``moves``: (N, 9) output, the rows' (3, 3) moves by one sigma of the left stripe, the
-    right stripe, the shape. ``by_sensor``: (N, 96) output, the rows' (3, 32).
+    ``chosen``, ``into``: (M,) crossings whose points are asked for, and rows of the output. ``at``:
+    (F,) row of each crossing in ``points``, ``sheet`` and ``normals``: (H, 3), (H,) and (H, 2), of
+    left pixels on their sheets and across the left stripe. ``sigma``: (F, 2) of both stripes.
+    ``size_mm``: (S,) sigma of each sheet's shape. ``missed``: (F,)
+    distance across the right stripe. ``by_point``, ``by_errors``: (F, 3) and (F, 35) its
+    derivatives, from `cross_stripes`. ``camera``, ``sheets``: As for `meet_sheets`.
+    ``covariance``: (S, 1024) of the left camera, a sheet, and the second camera. ``fused``,
+    ``shape``: (N, 3) output, the latter the move by one sigma of the sheet's shape. ``noise``:
+    (N, 6) output, the rows' (3, 2) moves by one sigma of the left and of the right stripe.
+    ``by_sensor``: (N, 96) output, the rows' (3, 32).
     """
     second = N_CAMERA + N_SHEET
     lens = np.zeros(7)
@@ -582,7 +620,12 @@ def fuse_stripes(
     by_distance = np.zeros((4, 32))
     joint = np.zeros((3, 3))
     gain = np.zeros((3, 4))
-    for i in range(points.shape[0]):
+    scratch = np.zeros((6, 3))
+    moved = np.zeros(32)
+    for m in range(chosen.shape[0]):
+        f = chosen[m]
+        i = at[f]
+        o = into[m]
         z = points[i, 2]
         x = points[i, 0] / z
         y = points[i, 1] / z
@@ -610,25 +653,27 @@ def fuse_stripes(
             by_distance[k, 7] = across_x * (r2 + 2.0 * x * x) + across_y * 2.0 * x * y
             by_distance[k, 8] = radial * r2 * r2 * r2
         for a in range(3):
-            rest[1, a] = normals[i, 2] * by_right[i, a] + normals[i, 3] * by_right[i, 3 + a]
+            rest[1, a] = by_point[f, a]
             rest[2, a] = surface[1 + a]
-        for c in range(15):
-            both = normals[i, 2] * by_second[i, c] + normals[i, 3] * by_second[i, 15 + c]
-            by_distance[2, second + c] = both
+        for c in range(second, 32):
+            by_distance[2, c] = by_errors[f, c]
         for c in range(N_SHEET):
             by_distance[3, N_CAMERA + c] = -surface[4 + c]
-        _covariance_of_distances(by_distance, covariance[sheet[i]], joint)
+        _covariance_of_distances(by_distance, covariance[sheet[i]], moved, joint)
+        size = size_mm[sheet[i]]
+        joint[0, 0] += sigma[f, 0] * sigma[f, 0]
+        joint[1, 1] += sigma[f, 1] * sigma[f, 1]
+        joint[2, 2] += size * size
+        _weigh(rest, joint, along, scratch, gain)
         for a in range(3):
-            joint[a, a] += sigma[i, a] * sigma[i, a]
-        _weigh(rest, joint, along, gain)
-        for a in range(3):
-            fused[i, a] = points[i, a] - gain[a, 2] * missed[i]
-            for k in range(3):
-                moves[i, 3 * a + k] = gain[a, 1 + k] * sigma[i, k]
+            fused[o, a] = points[i, a] - gain[a, 2] * missed[f]
+            noise[o, 2 * a] = gain[a, 1] * sigma[f, 0]
+            noise[o, 2 * a + 1] = gain[a, 2] * sigma[f, 1]
+            shape[o, a] = gain[a, 3] * size
             for c in range(N_CAMERA):
                 change = gain[a, 0] * by_distance[0, c] + gain[a, 1] * by_distance[1, c]
-                by_sensor[i, 32 * a + c] = -change
+                by_sensor[o, 32 * a + c] = -change
             for c in range(N_CAMERA, second):
-                by_sensor[i, 32 * a + c] = -gain[a, 3] * by_distance[3, c]
+                by_sensor[o, 32 * a + c] = -gain[a, 3] * by_distance[3, c]
             for c in range(second, 32):
-                by_sensor[i, 32 * a + c] = -gain[a, 2] * by_distance[2, c]
+                by_sensor[o, 32 * a + c] = -gain[a, 2] * by_distance[2, c]

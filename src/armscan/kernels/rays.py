@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From pixels to points: rays on light sheets with their derivatives, planes, covariances."""
+"""From pixels to points: rays on light sheets, with their derivatives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from armscan.kernels.arrays import (
     Four,
     Ints,
     IntsOut,
-    IntTable,
     Table,
     TableOut,
     Three,
@@ -50,7 +49,7 @@ def distort(x: float, y: float, camera: Floats, out: FloatsOut) -> None:
 
 
 @compiled(error_model="numpy")
-def _undistort(u: float, v: float, camera: Floats, out: FloatsOut) -> bool:
+def undistort(u: float, v: float, camera: Floats, out: FloatsOut) -> bool:
     """Newton's inverse of `distort`: x and y into ``out`` (7,) behind its five numbers."""
     x = u
     y = v
@@ -285,7 +284,7 @@ def meet_sheets(
         u = (pixels[2 * i] - camera[2]) / camera[0]
         v = (pixels[2 * i + 1] - camera[3]) / camera[1]
         depth = 0.0
-        if _undistort(u, v, camera, lens):
+        if undistort(u, v, camera, lens):
             depth = _meet(lens[5], lens[6], sheets[sheet[i]], surface)
         is_met[i] = 1 if depth > 0.0 else 0
         for a in range(3):
@@ -358,30 +357,6 @@ def differentiate_sheets(
 
 
 @compiled(error_model="numpy")
-def sum_off_planes(
-    samples: Table, key: Ints, planes: Table, scale_px: float, off: TableOut, sigma: TableOut
-) -> None:
-    """Sums, over the samples of each key, of the size and sigma of their depths off planes.
-
-    ``samples``: (H, 3) pixel and depth. ``key``: (H,) column of the output. ``planes``: (B, 14)
-    middle, inverse depth and its slopes, their covariance. ``off``, ``sigma``: (B, K) zeros.
-    """
-    for b in range(planes.shape[0]):
-        plane = planes[b]
-        for i in range(samples.shape[0]):
-            x = (samples[i, 0] - plane[0]) / scale_px
-            y = (samples[i, 1] - plane[1]) / scale_px
-            depth = samples[i, 2]
-            square = depth * depth
-            expected = plane[2] + x * plane[3] + y * plane[4]
-            variance = plane[5] + x * x * plane[9] + y * y * plane[13]
-            variance += x * (plane[6] + plane[8]) + y * (plane[7] + plane[11])
-            variance += x * y * (plane[10] + plane[12])
-            off[b, key[i]] += abs(expected - 1.0 / depth) * square
-            sigma[b, key[i]] += math.sqrt(variance) * square
-
-
-@compiled(error_model="numpy")
 def sheet_gradients(points: Table, sheet: Ints, sheets: Table, gradients: TableOut) -> None:
     """Gradients (N, 3) of the distance from their sheets at points (N, 3); as `meet_sheets`."""
     surface = np.zeros(12)
@@ -389,68 +364,3 @@ def sheet_gradients(points: Table, sheet: Ints, sheets: Table, gradients: TableO
         height_of(points[i, 0], points[i, 1], points[i, 2], sheets[sheet[i]], surface)
         for a in range(3):
             gradients[i, a] = surface[1 + a]
-
-
-@compiled(fastmath=True)
-def add_equations(
-    rows: Table, group: Ints, weight: Floats, wanted: Floats, matrix: TableOut, vector: TableOut
-) -> None:
-    """Add rows of equations to the normal equations of their groups.
-
-    ``rows``: (H, Q) derivatives. ``group``: (H,). ``weight``: (H,). ``wanted``: (H,) right-hand
-    side. ``matrix``: (G, Q Q) sums of weighted products. ``vector``: (G, Q) of each with what is
-    wanted.
-    """
-    q = rows.shape[1]
-    for i in range(rows.shape[0]):
-        if weight[i] == 0.0:
-            continue
-        row = rows[i]
-        sums = vector[group[i]]
-        share = weight[i] * wanted[i]
-        for c in range(q):
-            sums[c] += share * row[c]
-        for c in range(q):
-            products = matrix[group[i], c * q : (c + 1) * q]
-            share = weight[i] * row[c]
-            if share == 0.0:
-                continue
-            for d in range(q):
-                products[d] += share * row[d]
-
-
-@compiled()
-def join_equations(
-    matrix: Table, vector: Table, columns: IntTable, whole: TableOut, side: FloatsOut
-) -> None:
-    """Add normal equations of groups, (G, Q Q) and (G, Q), to those of all parameters.
-
-    ``columns``: (G, Q) places of a group's parameters. ``whole``: (P, P). ``side``: (P,).
-    """
-    q = columns.shape[1]
-    for g in range(columns.shape[0]):
-        for c in range(q):
-            row = whole[columns[g, c]]
-            side[columns[g, c]] += vector[g, c]
-            for d in range(q):
-                row[columns[g, d]] += matrix[g, c * q + d]
-
-
-@compiled(fastmath=True)
-def combine_rows(
-    rows: Table, group: Ints, columns: IntTable, factor: Table, combined: TableOut
-) -> None:
-    """Multiply rows (H, Q) by what a factor (P, K) has of their groups' parameters; (H, K) zeros.
-
-    ``group``: (H,). ``columns``: (G, Q) places of a group's parameters.
-    """
-    k = factor.shape[1]
-    for i in range(rows.shape[0]):
-        total = combined[i]
-        for c in range(rows.shape[1]):
-            share = rows[i, c]
-            if share == 0.0:
-                continue
-            own = factor[columns[group[i], c]]
-            for j in range(k):
-                total[j] += share * own[j]

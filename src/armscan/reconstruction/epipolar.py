@@ -3,24 +3,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, lru_cache
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.spatial import cKDTree
+from scipy.linalg import blas, lapack
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, homogeneous
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import square_root
-from armscan.kernels.rays import add_equations, combine_rows, join_equations
+from armscan.kernels.naming import (
+    combine_rows,
+    cross_stripes,
+    explain_residuals,
+    find_nearest,
+    join_equations,
+    list_possible,
+    predict_residuals,
+    see_points,
+    sum_moments,
+)
 from armscan.models.calibration import SensorCalibration
+from armscan.models.camera import fold_radius
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.triangulate import (
     DepthRange,
-    intersect_with_jacobian,
+    lens_numbers,
+    meet,
     sensor_columns,
+    sheet_numbers,
 )
 from armscan.records.profile import Profile
 
@@ -48,22 +59,12 @@ class Projections:
         (H, 2) pixels of the right image (eqs. 4.17 and 4.18).
     is_met
         (H,) False where the ray does not meet the sheet in front of both cameras.
-    dpoint_dpx, dpoint_dsensor
-        (H, 3, 2) and (H, 3, 17) derivatives of the point by the left pixel, and by the left camera
-        and the sheet.
-    dq_dpoint, dq_dsecond
-        (H, 2, 3) and (H, 2, 15) derivatives of the right pixel by the point, and by what the second
-        camera adds, at a fixed point.
     """
 
     sheet: IntArray
     points_mm: FloatArray
     q_px: FloatArray
     is_met: BoolArray
-    dpoint_dpx: FloatArray
-    dpoint_dsensor: FloatArray
-    dq_dpoint: FloatArray
-    dq_dsecond: FloatArray
 
     def select(self, rows: BoolArray | IntArray) -> Projections:
         """Those that a mask or an index names."""
@@ -78,39 +79,37 @@ def possible_sheets(
     Returns
     -------
     point, sheet
-        (H,) indices, ordered by point.
+        (H,) indices, ordered by sheet.
     """
-    xy, is_valid = sensor.camera.camera.undistort(points_px)
-    rays = homogeneous(xy)
-    planes = np.stack([s.sheet.plane for s in sensor.sheets])
-    slope = rays @ planes[:, :3].T
-    depth = -planes[:, 3] / np.where(np.abs(slope) > 1e-9, slope, np.nan)
-    low, high = np.array([depths.limits_mm(s) for s in sensor.sheets]).T
-    with np.errstate(invalid="ignore"):
-        inside = (depth >= low * (1.0 - BOW_DEPTH_SHARE)) & (
-            depth <= high * (1.0 + BOW_DEPTH_SHARE)
-        )
-    point, sheet = np.nonzero(inside & is_valid[:, None])
-    return point, sheet
+    sheets = sheet_numbers(sensor)
+    limits = np.array([depths.limits_mm(one) for one in sensor.sheets])
+    limits *= [1.0 - BOW_DEPTH_SHARE, 1.0 + BOW_DEPTH_SHARE]
+    point, sheet = np.zeros((2, len(points_px) * len(sheets)), np.int64)
+    pixels = np.ascontiguousarray(points_px)
+    count = list_possible(pixels, lens_numbers(sensor), sheets, limits, point, sheet)
+    return point[:count], sheet[:count]
+
+
+@lru_cache(maxsize=8)
+def _second_numbers(sensor: SensorCalibration) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The right camera as kernels read it (10,), its pose (12,), and half of its image (2,)."""
+    views = TwoViews.of_sensor(sensor)
+    camera, pose = views.right, views.right_from_left
+    lens = np.append(camera.parameters, fold_radius(camera.distortion))
+    turn = np.column_stack([pose.rotation, pose.translation_mm]).ravel()
+    return lens, turn, 0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64)
 
 
 def project_on_sheets(
     points_px: FloatArray, sheet: IntArray, sensor: SensorCalibration
 ) -> Projections:
     """Put each left pixel (H, 2) on its sheet (H,) and project it into the right camera."""
-    met = intersect_with_jacobian(points_px, sheet, sensor)
-    views = TwoViews.of_sensor(sensor)
-    q, dq_dpoint, dq_dsecond = views.project_right_with_jacobian(met.points_mm)
-    return Projections(
-        sheet=sheet,
-        points_mm=met.points_mm,
-        q_px=q,
-        is_met=met.is_met & np.isfinite(q).all(axis=1),
-        dpoint_dpx=met.dpoint_dpx,
-        dpoint_dsensor=met.dpoint_dsensor,
-        dq_dpoint=dq_dpoint,
-        dq_dsecond=dq_dsecond,
-    )
+    own = np.ascontiguousarray(sheet, dtype=np.int64)
+    points, is_met = meet(points_px, own, lens_numbers(sensor), sheet_numbers(sensor))
+    camera, turn, _ = _second_numbers(sensor)
+    q = np.zeros((len(points), 2))
+    see_points(points, is_met.astype(np.int64), camera, turn, q)
+    return Projections(own, points, q, np.asarray(np.isfinite(q).all(axis=1)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,61 +122,78 @@ class RightStripes:
         Stripe points of the right camera.
     row
         (R,) the accepted ones.
-    tree
-        Of their pixels.
+    table
+        (R, 5) their pixels, normals and sigmas.
+    low_px, high_px
+        Corners of the rectangle in which they are; infinite and reversed where there is none.
     """
 
     profile: Profile
     row: IntArray
-    tree: cKDTree
+    table: FloatArray
+    low_px: tuple[float, float]
+    high_px: tuple[float, float]
 
     @staticmethod
     def of(profile: Profile) -> RightStripes:
-        """Index the accepted points."""
+        """Gather the accepted points."""
         row = np.flatnonzero(profile.is_accepted)
-        return RightStripes(profile, row, cKDTree(profile.points_px[row]))
+        table = np.zeros((len(row), 5))
+        table[:, :2], table[:, 2:4] = profile.points_px[row], profile.normals_px[row]
+        table[:, 4] = profile.sigma_px[row]
+        x, y = table[:, 0], table[:, 1]
+        low = float(x.min(initial=np.inf)), float(y.min(initial=np.inf))
+        high = float(x.max(initial=-np.inf)), float(y.max(initial=-np.inf))
+        return RightStripes(profile, row, table, low, high)
 
     def spacing_px(self) -> float:
         """Mean distance between stripes: the picture's area over the stripes' length."""
         if len(self.row) < 2:
             return 1.0
-        size = np.ptp(self.profile.points_px[self.row], axis=0)
-        return max(float(size[0] * size[1]) / len(self.row), 1.0)
+        width, height = np.subtract(self.high_px, self.low_px)
+        return max(float(width * height) / len(self.row), 1.0)
 
     def covers(self, q_px: FloatArray) -> BoolArray:
         """(H,) True within the rectangle in which there are right stripes."""
-        points = self.profile.points_px[self.row]
-        if not len(points):
-            return np.zeros(len(q_px), dtype=np.bool_)
-        low, high = points.min(axis=0), points.max(axis=0)
-        return np.asarray(((q_px >= low) & (q_px <= high)).all(axis=1))
+        x, y = q_px[:, 0], q_px[:, 1]
+        inside = (x >= self.low_px[0]) & (x <= self.high_px[0])
+        return np.asarray(inside & (y >= self.low_px[1]) & (y <= self.high_px[1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crossings:
-    """The right stripe beside each projected point.
+    """Right stripes beside projected points.
 
     Parameters
     ----------
+    at
+        (F,) the projected points that have one, in their order.
     row
-        (H,) index of the nearest point in the right profile; -1 where no stripe is within reach.
+        (F,) index of the nearest point in the right profile.
+    sheet
+        (F,) index into the sensor's sheets.
     residual_px
-        (H,) signed distance of the projected point across that stripe, along its normal.
+        (F,) signed distance of the projected point across that stripe, along its normal.
     sigma_px
-        (H,) standard deviation of the residual from the noise of both stripes alone.
+        (F,) standard deviation of the residual from the noise of both stripes alone.
     normal
-        (H, 2) across the right stripe.
+        (F, 2) across the right stripe.
+    by_point
+        (F, 3) derivative of the residual by the point in Sensor, px/mm.
+    by_errors
+        (F, Q + 3) by what the points of one sheet depend on (`sensor_columns`), the point lying on
+        its sheet, and by the drift's three numbers: offset of the right picture across the epipolar
+        line in the image's middle, and its change to the right and lower rim.
     """
 
+    at: IntArray
     row: IntArray
+    sheet: IntArray
     residual_px: FloatArray
     sigma_px: FloatArray
     normal: FloatArray
-
-    @property
-    def is_found(self) -> BoolArray:
-        """(H,) True where there is a stripe within reach."""
-        return np.asarray(self.row >= 0)
+    by_point: FloatArray
+    by_errors: FloatArray
 
     def select(self, rows: BoolArray | IntArray) -> Crossings:
         """Those that a mask or an index names."""
@@ -189,6 +205,8 @@ def find_crossings(
     normals_px: FloatArray,
     sigma_px: FloatArray,
     right: RightStripes,
+    sensor: SensorCalibration,
+    *,
     reach_px: float = REACH_PX,
 ) -> Crossings:
     """Find the right stripe that runs beside each projected point, and the distance across it.
@@ -201,36 +219,58 @@ def find_crossings(
         (H, 2) and (H,) of the left stripe.
     right
         The right profile.
+    sensor
+        Both cameras and all sheets.
     reach_px
         Largest distance.
     """
-    n = len(projected.sheet)
-    row = np.full(n, -1)
-    residual, sigma, normal = np.zeros(n), np.ones(n), np.zeros((n, 2))
-    asked = np.flatnonzero(projected.is_met)
-    if not len(right.row) or not len(asked):
-        return Crossings(row, residual, sigma, normal)
-    distance, nearest = right.tree.query(
-        projected.q_px[asked], distance_upper_bound=float(np.hypot(reach_px, ALONG_PX))
+    n, (camera, turn, half_image) = len(projected.sheet), _second_numbers(sensor)
+    nearest, at = np.zeros((2, n), np.int64)
+    reach = float(np.hypot(reach_px, ALONG_PX))
+    find_nearest(projected.q_px, np.ascontiguousarray(right.table[:, :2]), reach, nearest)
+    n_near = int(np.count_nonzero(nearest >= 0))
+    across, by_point = np.zeros((n_near, 4)), np.zeros((n_near, 3))
+    by_errors = np.zeros((n_near, error_columns(sensor).shape[1]))
+    count = cross_stripes(
+        projected.points_mm,
+        projected.sheet,
+        projected.q_px,
+        np.column_stack([normals_px, sigma_px]),
+        nearest,
+        right.table,
+        lens_numbers(sensor),
+        sheet_numbers(sensor),
+        camera,
+        turn,
+        np.array([reach_px, ALONG_PX, SINE_OF_SAME_DIRECTION, *half_image]),
+        at,
+        across,
+        by_point,
+        by_errors,
     )
-    is_near = np.isfinite(distance)
-    asked, nearest = asked[is_near], np.asarray(nearest)[is_near]
-    found = right.row[nearest]
-    n_right = right.profile.normals_px[found]
-    away = projected.q_px[asked] - right.profile.points_px[found]
-    across = np.sum(away * n_right, axis=1)
-    along = away[:, 0] * -n_right[:, 1] + away[:, 1] * n_right[:, 0]
-    dq_dleft = projected.dq_dpoint[asked] @ projected.dpoint_dpx[asked]
-    tangent = np.stack([-normals_px[asked, 1], normals_px[asked, 0]], axis=1)
-    runs = np.einsum("nij,nj->ni", dq_dleft, tangent)
-    sine = np.abs(np.sum(runs * n_right, axis=1)) / np.maximum(np.linalg.norm(runs, axis=1), 1e-12)
-    good = (np.abs(along) <= ALONG_PX) & (np.abs(across) <= reach_px)
-    good &= sine <= SINE_OF_SAME_DIRECTION
-    gain = np.einsum("ni,nij,nj->n", n_right, dq_dleft, normals_px[asked])
-    at = asked[good]
-    row[at], residual[at], normal[at] = found[good], across[good], n_right[good]
-    sigma[at] = np.hypot(gain * sigma_px[asked], right.profile.sigma_px[found])[good]
-    return Crossings(row, residual, sigma, normal)
+    at, across = at[:count], across[:count]
+    return Crossings(
+        at=at,
+        row=right.row[nearest[at]],
+        sheet=projected.sheet[at],
+        residual_px=np.ascontiguousarray(across[:, 0]),
+        sigma_px=np.ascontiguousarray(across[:, 1]),
+        normal=across[:, 2:],
+        by_point=by_point[:count],
+        by_errors=by_errors[:count],
+    )
+
+
+@lru_cache(maxsize=8)
+def error_columns(sensor: SensorCalibration) -> IntArray:
+    """(sheets, Q + 3) places of what each sheet's points depend on, and of the drift.
+
+    They are places among the sensor's P parameters with the drift's three behind them.
+    """
+    n = len(sensor.covariance)
+    return np.stack(
+        [np.r_[sensor_columns(sensor, k), n : n + N_DRIFT] for k in range(len(sensor.sheets))]
+    )
 
 
 FLOOR_PX = 0.06
@@ -303,22 +343,6 @@ class EpipolarOffset:
         )
 
 
-def drift_directions(projected: Projections, sensor: SensorCalibration) -> FloatArray:
-    """(H, 2, 3) how the drift's three numbers move the right picture of each point.
-
-    The move is across the epipolar line, which is where the point's picture goes with its depth.
-    """
-    along = np.einsum("nij,nj->ni", projected.dq_dpoint, projected.points_mm)
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    across *= np.where(across[:, 1] < 0.0, -1.0, 1.0)[:, None]
-    camera = TwoViews.of_sensor(sensor).right
-    size = np.array([camera.width_px, camera.height_px], dtype=np.float64)
-    place = (projected.q_px - 0.5 * size) / (HALF_IMAGE * size)
-    basis = np.concatenate([np.ones((len(place), 1)), place], axis=1)
-    return np.asarray(across[:, :, None] * basis[:, None, :])
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
     """Distances of projected points from the stripes beside them, and what moves them.
@@ -335,58 +359,37 @@ class Residuals:
     by_errors
         (H, Q + 3) derivative by what the points of one sheet depend on (`sensor_columns`) and by
         the drift's three numbers; by all else it is zero.
-    columns
-        (sheets, Q + 3) places of these among the sensor's P parameters and the drift.
+    sensor
+        Both cameras and all sheets.
     """
 
     px: FloatArray
     sigma_px: FloatArray
     sheet: IntArray
     by_errors: FloatArray
-    columns: IntArray
+    sensor: SensorCalibration
+
+    @property
+    def columns(self) -> IntArray:
+        """(sheets, Q + 3), from `error_columns`."""
+        return error_columns(self.sensor)
 
     @staticmethod
-    def of(projected: Projections, crossings: Crossings, sensor: SensorCalibration) -> Residuals:
-        """Of the same (H,) points."""
-        normal = crossings.normal[:, None, :]
-        by_point = normal @ projected.dq_dpoint
-        by_errors = [
-            by_point @ projected.dpoint_dsensor,
-            normal @ projected.dq_dsecond,
-            normal @ drift_directions(projected, sensor),
-        ]
-        n = len(sensor.covariance)
-        columns = [
-            np.r_[sensor_columns(sensor, k), n : n + N_DRIFT] for k in range(len(sensor.sheets))
-        ]
+    def of(crossings: Crossings, sensor: SensorCalibration) -> Residuals:
+        """Of the stripes that were found."""
         return Residuals(
             px=crossings.residual_px,
             sigma_px=crossings.sigma_px,
-            sheet=projected.sheet,
-            by_errors=np.concatenate(by_errors, axis=2)[:, 0],
-            columns=np.stack(columns),
+            sheet=crossings.sheet,
+            by_errors=crossings.by_errors,
+            sensor=sensor,
         )
-
-    def select(self, rows: BoolArray | IntArray) -> Residuals:
-        """Those that a mask or an index names."""
-        return replace(
-            self,
-            px=self.px[rows],
-            sigma_px=self.sigma_px[rows],
-            sheet=self.sheet[rows],
-            by_errors=self.by_errors[rows],
-        )
-
-    def by_sheet(self) -> Iterator[tuple[IntArray, IntArray]]:
-        """Rows of each sheet that has some, and its columns."""
-        for k, columns in enumerate(self.columns):
-            rows = np.flatnonzero(self.sheet == k)
-            if len(rows):
-                yield rows, columns
 
     def explained(self, step: FloatArray) -> FloatArray:
         """(H,) what a step (P + 3,) of all parameters and the drift adds to the residuals."""
-        return np.asarray(np.einsum("hq,hq->h", self.by_errors, step[self.columns][self.sheet]))
+        found = np.zeros(len(self.px))
+        explain_residuals(self.by_errors, self.sheet, step[self.columns], found)
+        return found
 
     def equations(
         self, weight: FloatArray, wanted: FloatArray, group: IntArray, n_groups: int
@@ -396,17 +399,21 @@ class Residuals:
         ``weight``, ``wanted``: (H,).
         """
         q = self.by_errors.shape[1]
-        matrix, vector = np.zeros((n_groups, q * q)), np.zeros((n_groups, q))
-        rows = np.ascontiguousarray(self.by_errors)
-        add_equations(rows, group.astype(np.int64), weight, wanted, matrix, vector)
-        return matrix.reshape(-1, q, q), vector
+        matrix, vector = np.zeros((n_groups, q, q)), np.zeros((n_groups, q))
+        order = np.argsort(group, kind="stable")
+        bounds = np.searchsorted(group[order], np.arange(n_groups + 1))
+        rows, weight, wanted = self.by_errors[order], weight[order], wanted[order]
+        for k, (first, last) in enumerate(pairwise(bounds)):
+            weighted = rows[first:last].T * weight[first:last]
+            matrix[k], vector[k] = weighted @ rows[first:last], weighted @ wanted[first:last]
+        return matrix, vector
 
     def joined_equations(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Normal equations of all parameters, (P + 3, P + 3) and (P + 3,), to undo the residuals.
 
         ``weight``: (H,).
         """
-        n = int(self.columns.max()) + 1
+        n = len(self.sensor.covariance) + N_DRIFT
         matrix, vector = self.equations(weight, -self.px, self.sheet, len(self.columns))
         whole, side = np.zeros((n, n)), np.zeros(n)
         join_equations(matrix.reshape(len(matrix), -1), vector, self.columns, whole, side)
@@ -421,9 +428,9 @@ class Residuals:
 
     def weighted_sum(self, weight: FloatArray) -> FloatArray:
         """(P + 3,) derivative of the residuals' sum with weights (H,)."""
-        total = np.zeros(int(self.columns.max()) + 1)
-        for rows, columns in self.by_sheet():
-            total[columns] += weight[rows] @ self.by_errors[rows]
+        of_sheet = np.arange(len(self.columns))[:, None] == self.sheet
+        total = np.zeros(len(self.sensor.covariance) + N_DRIFT)
+        np.add.at(total, self.columns, (of_sheet * weight) @ self.by_errors)
         return total
 
 
@@ -445,7 +452,7 @@ def no_offset(sensor: SensorCalibration) -> EpipolarOffset:
 
 
 def estimate_offset(
-    residuals: Residuals, sensor: SensorCalibration, prior: EpipolarOffset
+    residuals: Residuals, sensor: SensorCalibration, equations: OffsetEquations
 ) -> EpipolarOffset:
     """Most likely errors of the calibration and drift, given the residuals of labelled samples.
 
@@ -454,21 +461,20 @@ def estimate_offset(
     Parameters
     ----------
     residuals
-        (H,) of samples whose sheet is certain.
+        (H,) of samples; those used are of a sheet that is certain.
     sensor
         Cameras and sheets.
-    prior
-        From `no_offset`.
+    equations
+        Of these residuals.
     """
-    if not len(residuals.px):
-        return prior
-    equations = _Equations.of(residuals, prior)
+    if not equations.is_used.any():
+        return equations.prior
     step, n = equations.step, len(sensor.covariance)
     offset_px, sigma_px, allowed_px = _mean_offset(equations, residuals, sensor)
     return EpipolarOffset(
         parameter_step=step[:n],
         drift=step[n:],
-        factor=equations.factor(prior),
+        factor=equations.factor,
         offset_px=offset_px,
         sigma_px=sigma_px,
         allowed_px=allowed_px,
@@ -476,34 +482,53 @@ def estimate_offset(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Equations:
+class OffsetEquations:
     """Weighted linear equations of the residuals in whitened errors, and their solution.
 
-    ``sigma``, ``weight``: (H,) of the residuals. ``step``: (P + 3,) of the errors themselves.
-    ``missed``: (H,) what it leaves. ``information``: (K, K) that of all equations with the prior's
-    unit matrix. Points of a sheet depend on few parameters: the sums are taken over these.
+    Points of a sheet depend on few parameters: the sums are taken over these.
+
+    Parameters
+    ----------
+    prior
+        What is known without the residuals, from `no_offset`.
+    is_used
+        (H,) True for residuals that have a say.
+    sigma, weight
+        (H,) of the residuals; the weight is Huber's.
+    step
+        (P + 3,) most likely errors.
+    missed
+        (H,) what they leave.
+    information
+        (K, K) of all equations with the prior's unit matrix.
+    factor
+        (P + 3, K) of the covariance of all errors, the residuals being known.
     """
 
+    prior: EpipolarOffset
+    is_used: BoolArray
     sigma: FloatArray
     weight: FloatArray
     step: FloatArray
     missed: FloatArray
     information: FloatArray
+    factor: FloatArray
 
     @staticmethod
-    def of(
-        residuals: Residuals, prior: EpipolarOffset, is_used: BoolArray | None = None
-    ) -> _Equations:
+    def of(residuals: Residuals, prior: EpipolarOffset, is_used: BoolArray) -> OffsetEquations:
+        """Set up and solve them."""
         sigma = CORRELATION * np.hypot(residuals.sigma_px, FLOOR_PX)
-        wanted = -residuals.px
-        used = np.ones(len(wanted)) if is_used is None else is_used.astype(np.float64)
-        weight = used
-        matrix, vector = residuals.joined_equations(weight / sigma**2)
+        wanted, precision = -residuals.px, 1.0 / sigma**2
+        weight = used = is_used.astype(np.float64)
+        matrix, vector = residuals.joined_equations(weight * precision)
         information = prior.factor.T @ (matrix @ prior.factor)
-        information += np.eye(len(information))
+        information[np.diag_indices_from(information)] += 1.0
         right_side = vector @ prior.factor
         for k in range(ROUNDS):
-            step = prior.factor @ np.linalg.solve(information, right_side)
+            lower, solved, defect = lapack.dposv(information, right_side, lower=1)
+            if defect:
+                raise np.linalg.LinAlgError("equations of the epipolar offset are not definite")
+            step = prior.factor @ solved
             missed = wanted - residuals.explained(step)
             if k == ROUNDS - 1:
                 break
@@ -514,20 +539,25 @@ class _Equations:
             if not len(rows):
                 break
             design = residuals.whitened(rows, prior.factor)
-            change = (next_weight - weight)[rows] / sigma[rows] ** 2
-            information += (design * change[:, None]).T @ design
-            right_side += (change * wanted[rows]) @ design
+            change = ((next_weight - weight) * precision)[rows]
+            information = information + (design * change[:, None]).T @ design
+            right_side = right_side + (change * wanted[rows]) @ design
             weight = next_weight
-        return _Equations(sigma, weight, step, missed, information)
-
-    def factor(self, prior: EpipolarOffset) -> FloatArray:
-        """(P + 3, K) factor of the covariance of all errors, the residuals being known."""
-        lower = np.linalg.cholesky(self.information)
-        return np.asarray(solve_triangular(lower, prior.factor.T, lower=True, check_finite=False).T)
+        factor = blas.dtrsm(1.0, lower, prior.factor, side=1, lower=1, trans_a=1)
+        return OffsetEquations(
+            prior=prior,
+            is_used=is_used,
+            sigma=sigma,
+            weight=weight,
+            step=step,
+            missed=missed,
+            information=information,
+            factor=np.ascontiguousarray(factor),
+        )
 
 
 def left_out_scores(
-    residuals: Residuals, prior: EpipolarOffset, segment: IntArray, is_used: BoolArray
+    residuals: Residuals, equations: OffsetEquations, rows: IntArray, segment: IntArray
 ) -> FloatArray:
     """How badly each segment's residuals fit what all the others say of the offset.
 
@@ -538,41 +568,53 @@ def left_out_scores(
 
     Parameters
     ----------
-    residuals, prior
-        (H,), and what is known without them, as for `estimate_offset`.
+    residuals, equations
+        (H,), and their equations; segments that are not used are asked but have no say.
+    rows
+        (M,) residuals of the segments that are asked.
     segment
-        (H,) number of the segment of stripe, counted from 0; each lies on one sheet.
-    is_used
-        (H,) False for segments that are asked but have no say.
+        (M,) number of the segment of stripe, counted from 0; each lies on one sheet.
 
     Returns
     -------
     FloatArray
         (B,) chi-square of mean, slope and bend of the segment's residuals, over their count.
     """
-    equations = _Equations.of(residuals, prior, is_used)
     n = int(segment.max(initial=-1)) + 1
+    if not n:
+        return np.zeros(0)
     order = np.argsort(segment, kind="stable")
     bounds = np.searchsorted(segment[order], np.arange(n + 1))
     sheet = np.zeros(n, dtype=np.int64)
-    sheet[segment] = residuals.sheet
+    sheet[segment] = residuals.sheet[rows]
     columns = residuals.columns
-    factor = equations.factor(prior)[columns]
+    factor = equations.factor[columns]
     # in units of what was known before, which all are near 1
-    unit = np.linalg.norm(prior.factor, axis=1)
+    unit = np.linalg.norm(equations.prior.factor, axis=1)
     unit = np.where(unit > 0.0, unit, 1.0)[columns]
     factor /= unit[:, :, None]
     covariance = (factor @ factor.transpose(0, 2, 1))[sheet]
-    weight, unit = equations.weight / equations.sigma**2, unit[sheet]
-    said, missed = residuals.equations(weight, equations.missed, segment, n)
-    shapes, asked = np.zeros((n, 3)), np.zeros((n, columns.shape[1], 4))
-    noise = np.zeros((n, 3, 3))
-    for b, (first, last) in enumerate(pairwise(bounds)):
-        rows, moments = order[first:last], _moments(last - first)
-        k = len(moments)
-        shapes[b, :k] = moments @ equations.missed[rows]
-        asked[b, :, :k] = (moments @ residuals.by_errors[rows]).T
-        noise[b, :k, :k] = (moments * equations.sigma[rows] ** 2) @ moments.T
+    variance, unit = equations.sigma**2, unit[sheet]
+    own, n_errors = rows[order], columns.shape[1]
+    weight = (equations.weight / variance)[own]
+    chosen = replace(residuals, by_errors=residuals.by_errors[own])
+    said, missed = chosen.equations(weight, equations.missed[own], segment[order], n)
+    shapes, own_noise, by_shape = np.zeros((n, 3)), np.zeros((n, 9)), np.zeros((n, 3 * n_errors))
+    moments = np.concatenate([_moments(count) for count in np.diff(bounds).tolist()])
+    sum_moments(
+        own,
+        segment[order],
+        moments,
+        residuals.by_errors,
+        equations.missed,
+        variance,
+        by_shape,
+        shapes,
+        own_noise,
+    )
+    noise = own_noise.reshape(n, 3, 3)
+    asked = np.zeros((n, n_errors, 4))
+    asked[:, :, :3] = by_shape.reshape(n, 3, n_errors).transpose(0, 2, 1)
     asked[:, :, 3] = missed
     asked *= unit[:, :, None]
     said *= unit[:, :, None] * unit[:, None, :]
@@ -585,25 +627,26 @@ def left_out_scores(
     scores = np.zeros(n)
     count = np.minimum(np.diff(bounds), 3)
     for k in (1, 2, 3):
-        rows = np.flatnonzero(count == k)
-        own = shapes[rows, :k]
-        solved = np.linalg.solve(noise[rows, :k, :k], own[:, :, None])[:, :, 0]
-        scores[rows] = np.sum(own * solved, axis=1) / k
+        own = np.flatnonzero(count == k)
+        shape = shapes[own, :k]
+        solved = np.linalg.solve(noise[own, :k, :k], shape[:, :, None])[:, :, 0]
+        scores[own] = np.sum(shape * solved, axis=1) / k
     return scores
 
 
 @cache
 def _moments(n: int) -> FloatArray:
-    """(3, n), or fewer rows of few samples: what takes (n,) to their mean, slope and bend."""
+    """(n, 3): what takes (n,) to their mean, slope and bend; zero for what few do not show."""
     place = np.linspace(-1.0, 1.0, n)
     shape = np.stack([np.ones(n), place, place**2], axis=1)[:, : min(n, 3)]
-    moments = np.asarray(np.linalg.pinv(shape))
+    moments = np.zeros((n, 3))
+    moments[:, : shape.shape[1]] = np.linalg.pinv(shape).T
     moments.setflags(write=False)
     return moments
 
 
 def _mean_offset(
-    equations: _Equations, residuals: Residuals, sensor: SensorCalibration
+    equations: OffsetEquations, residuals: Residuals, sensor: SensorCalibration
 ) -> tuple[float, float, float]:
     """Weighted mean of the residuals across the epipolar lines, its sigma, and that allowed."""
     unit = residuals.by_errors[:, -N_DRIFT]
@@ -623,11 +666,17 @@ def residual_and_sigma(
     residuals: Residuals, offset: EpipolarOffset
 ) -> tuple[FloatArray, FloatArray]:
     """Residual (H,) beyond what calibration errors and drift explain, and its sigma (H,), px."""
-    step = np.concatenate([offset.parameter_step, offset.drift])
-    explained, variance = np.zeros((2, len(residuals.px)))
-    for rows, columns in residuals.by_sheet():
-        by_errors, factor = residuals.by_errors[rows], offset.factor[columns]
-        explained[rows] = by_errors @ step[columns]
-        variance[rows] = np.sum((by_errors @ (factor @ factor.T)) * by_errors, axis=1)
-    sigma = np.sqrt(residuals.sigma_px**2 + np.maximum(variance, 0.0) + FLOOR_PX**2)
-    return residuals.px + explained, sigma
+    steps, covariances = _of_sheets(offset, residuals.sensor)
+    found = np.zeros((len(residuals.px), 2))
+    predict_residuals(residuals.by_errors, residuals.sheet, steps, covariances, found)
+    variance = residuals.sigma_px**2 + np.maximum(found[:, 1], 0.0) + FLOOR_PX**2
+    return residuals.px + found[:, 0], np.sqrt(variance)
+
+
+@lru_cache(maxsize=4)
+def _of_sheets(offset: EpipolarOffset, sensor: SensorCalibration) -> tuple[FloatArray, FloatArray]:
+    """(S, Q + 3) errors that each sheet's points depend on, and their covariance, in a row."""
+    columns = error_columns(sensor)
+    factor = offset.factor[columns]
+    covariance = (factor @ factor.transpose(0, 2, 1)).reshape(len(factor), -1)
+    return np.concatenate([offset.parameter_step, offset.drift])[columns], covariance

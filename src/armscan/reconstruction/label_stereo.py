@@ -12,18 +12,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor
-from armscan.kernels.chains import best_states
-from armscan.kernels.rays import sum_off_planes
+from armscan.kernels.naming import (
+    choose_sheets,
+    rule_out,
+    score_left,
+    score_right,
+    sum_off_planes,
+)
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.epipolar import (
-    Crossings,
     EpipolarOffset,
+    OffsetEquations,
     Projections,
     Residuals,
     RightStripes,
@@ -44,6 +51,8 @@ from armscan.reconstruction.segments import (
 )
 from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange
 from armscan.records.profile import Profile
+
+BytesArray: TypeAlias = NDArray[np.uint8]
 
 SAMPLE_POINTS = 6
 """Every so many stripe points one is projected; the others follow it."""
@@ -213,6 +222,8 @@ CHANGE_COST = 20.0
 """Against the sheet changing along a segment: once in a thousand million samples."""
 LEAST_SCORE = 5.0
 """Least log-likelihood ratio to a stripe on no sheet that makes a label certain."""
+LIMITS = np.array([INDEPENDENT_SHARE, RUNNER_UP, LEAST_SCORE, LEAST_MATCHES, CHANGE_COST])
+"""As `choose_sheets` takes them."""
 
 
 def log_ratio(residual_px: FloatArray, sigma_px: FloatArray, spacing_px: float) -> FloatArray:
@@ -277,7 +288,7 @@ class _Side:
         """(S,) row of each sample in the profile."""
         return self.segments.row[self.samples.at]
 
-    def assign(self, scores: FloatArray, is_match: BoolArray) -> SheetAssignment:
+    def assign(self, scores: FloatArray, is_match: BytesArray) -> SheetAssignment:
         """Most likely sheet of each segment, and how sure it is.
 
         A segment is one line of light, so it has one sheet. Where along it another sheet is far
@@ -289,35 +300,26 @@ class _Side:
         scores
             (S, K) log-likelihood ratio of each sheet at each sample.
         is_match
-            (S, K) True where the sheet puts the sample on a stripe of the other camera.
+            (S K,) 1 where the sheet puts the sample on a stripe of the other camera.
         """
         n, n_sheets = scores.shape
-        if n == 0:
-            none, empty = np.zeros(0, dtype=np.bool_), np.zeros(0, dtype=np.int64)
-            return SheetAssignment(
-                empty, none, none, empty, np.zeros((0, n_sheets), dtype=np.bool_)
-            )
-        weight = self.samples.weight[:, None]
-        weighted = scores * (INDEPENDENT_SHARE * weight)
-        is_first = np.diff(self.segments.number[self.samples.at], prepend=-1) != 0
-        first, number = np.flatnonzero(is_first), np.cumsum(is_first) - 1
-        total = np.add.reduceat(weighted, first, axis=0)
-        matches = np.add.reduceat(is_match * weight, first, axis=0)
-        rows, winner = np.arange(len(first)), total.argmax(axis=1)
-        best = total[rows, winner]
-        others = total.copy()
-        others[rows, winner] = 0.0
-        is_candidate = (total > RUNNER_UP * best[:, None]) & (total >= LEAST_SCORE)
-        is_sure = (others.max(axis=1) <= RUNNER_UP * best) & (best >= LEAST_SCORE)
-        is_sure &= matches[rows, winner] >= LEAST_MATCHES
-        # the most likely sheets if they may change along a segment, or none
-        table = np.ascontiguousarray(np.concatenate([weighted, np.zeros((n, 1))], axis=1))
-        path = np.zeros(n, dtype=np.int64)
-        best_states(table, np.where(is_first, 0.0, CHANGE_COST), path)
-        state = winner[number]
-        is_other = (path < n_sheets) & (path != state)
-        is_tied = (~is_sure & (best > 0.0))[number] | is_other
-        return SheetAssignment(state, is_sure[number] & ~is_other, is_tied, number, is_candidate)
+        number = self.segments.number[self.samples.at]
+        state = np.zeros(n, np.int64)
+        is_sure, is_tied = np.zeros((2, n), np.bool_)
+        n_segments = int(number[-1]) + 1 if n else 0
+        is_candidate = np.zeros((n_segments, n_sheets), np.bool_)
+        choose_sheets(
+            scores,
+            is_match,
+            self.samples.weight,
+            number,
+            LIMITS,
+            state,
+            is_sure.view(np.uint8),
+            is_tied.view(np.uint8),
+            is_candidate.view(np.uint8).reshape(-1),
+        )
+        return SheetAssignment(state, is_sure, is_tied, number, is_candidate)
 
     def labelled(
         self, found: SheetAssignment, withdrawn: IntArray, doubted: IntArray
@@ -405,18 +407,26 @@ class StereoLabeller:
             If the sensor has one camera.
         """
         sides = _Side.of(profiles[0]), _Side.of(profiles[1])
-        prior = offset = self._prior
-        found = _Hypotheses.of(sides, self.sensor, self.depths, prior)
+        offset = self._prior
+        found = _Hypotheses.of(sides, self.sensor, self.depths)
         at, projected = found.sample, found.projected
         doubt = ever = np.zeros(len(at), dtype=np.bool_)
+        judged: tuple[BoolArray, BoolArray] | None = None
+        equations: OffsetEquations | None = None
         for _ in range(ROUNDS):
             pairs = found.pairs(doubt, offset)
             left, right = _assign_both(pairs, sides, len(self.sensor.sheets))
             used = pairs.is_match & (left.label[at] == projected.sheet)
             asked = used | doubt | _is_tied(pairs, left)
-            doubt = found.doubtful(used, asked, left.segment[at])
+            if judged is not None and _are_same(judged, (used, asked)):
+                # the same question has the same answer, and so have all rounds to come
+                break
+            judged = used, asked
+            equations = found.equations(used, self._prior, equations)
+            doubt = found.doubtful(used, asked, left.segment[at], equations)
             ever = ever | doubt
-            offset = estimate_offset(found.residuals_of(used & ~doubt), self.sensor, prior)
+            equations = found.equations(used & ~doubt, self._prior, equations)
+            offset = estimate_offset(found.residuals, self.sensor, equations)
         withdrawn = used & doubt
         labelled = (
             side.labelled(assigned, sample[withdrawn], sample[ever])
@@ -440,80 +450,88 @@ class _Hypotheses:
 
     ``beside`` (H,) is the right sample of the stripe beside each, -1 for none, ``is_covered`` (H,)
     True where the right camera sees stripes around. ``residuals`` are those of the F pairs found,
-    which each round takes anew, ``prior`` what is known without them; ``place`` (H,) is the row of
-    each pair in them.
+    which each round takes anew; ``found`` (F,) are these pairs, and ``place`` (H,) the row of each
+    pair in them, -1 for none.
     """
 
     sides: tuple[_Side, _Side]
     sensor: SensorCalibration
     sample: IntArray
     projected: Projections
-    crossings: Crossings
     spacing_px: float
     beside: IntArray
     is_covered: BoolArray
     residuals: Residuals
-    prior: EpipolarOffset
+    found: IntArray
     place: IntArray
 
     @staticmethod
     def of(
-        sides: tuple[_Side, _Side],
-        sensor: SensorCalibration,
-        depths: DepthRange,
-        prior: EpipolarOffset,
+        sides: tuple[_Side, _Side], sensor: SensorCalibration, depths: DepthRange
     ) -> _Hypotheses:
         left, row = sides[0].profile, sides[0].row
-        at, sheet = possible_sheets(left.points_px[row], sensor, depths)
-        projected = project_on_sheets(left.points_px[row[at]], sheet, sensor)
+        pixels = left.points_px[row]
+        at, sheet = possible_sheets(pixels, sensor, depths)
+        projected = project_on_sheets(pixels[at], sheet, sensor)
         kept = projected.is_met & depths.holds(projected.points_mm, sheet, sensor)
         at, projected = at[kept], projected.select(kept)
-        right = sides[1]
+        right, own = sides[1], row[at]
         stripes = RightStripes.of(right.profile)
         crossings = find_crossings(
-            projected, left.normals_px[row[at]], left.sigma_px[row[at]], stripes
+            projected, left.normals_px[own], left.sigma_px[own], stripes, sensor
         )
-        found = np.flatnonzero(crossings.is_found)
-        residuals = Residuals.of(projected.select(found), crossings.select(found), sensor)
+        found = crossings.at
         sample_of_row = np.full(len(right.profile), -1)
         sample_of_row[right.segments.row] = right.samples.nearest
         beside, place = np.full((2, len(at)), -1)
-        beside[found], place[found] = sample_of_row[crossings.row[found]], np.arange(len(found))
+        beside[found], place[found] = sample_of_row[crossings.row], np.arange(len(found))
         return _Hypotheses(
             sides=sides,
             sensor=sensor,
             sample=at,
             projected=projected,
-            crossings=crossings,
             spacing_px=stripes.spacing_px(),
             beside=beside,
             is_covered=stripes.covers(projected.q_px),
-            residuals=residuals,
-            prior=prior,
+            residuals=Residuals.of(crossings, sensor),
+            found=found,
             place=place,
         )
 
-    def residuals_of(self, chosen: BoolArray | IntArray) -> Residuals:
-        """Residuals of pairs that were found."""
-        return self.residuals.select(self.place[chosen])
+    def equations(
+        self, used: BoolArray, prior: EpipolarOffset, known: OffsetEquations | None
+    ) -> OffsetEquations:
+        """Equations of the pairs used, of those found; ``known`` if these are of the same."""
+        is_used = used[self.found]
+        if known is not None and np.array_equal(known.is_used, is_used):
+            return known
+        return OffsetEquations.of(self.residuals, prior, is_used)
 
     def pairs(self, doubted: BoolArray, offset: EpipolarOffset) -> _Pairs:
         """Log-likelihood ratio of each left sample on each sheet, given the offset so far."""
-        found = np.flatnonzero(self.place >= 0)
+        found = self.found
         ratio = np.where(self.is_covered, MISSING, 0.0)
         is_match = np.zeros(len(self.sample), dtype=np.bool_)
         residual, sigma = residual_and_sigma(self.residuals, offset)
-        ratio[found] = log_ratio(residual, sigma, self.spacing_px)
-        is_match[found] = (np.abs(residual) < MATCH_SIGMAS * sigma) & (ratio[found] > 0.0)
-        ratio = np.where(doubted, MISSING, ratio)
-        return _Pairs(self.sample, self.beside, self.projected.sheet, ratio, is_match & ~doubted)
+        likely = log_ratio(residual, sigma, self.spacing_px)
+        ratio[found] = likely
+        is_match[found] = (np.abs(residual) < MATCH_SIGMAS * sigma) & (likely > 0.0)
+        ratio[doubted] = MISSING
+        is_match[doubted] = False
+        return _Pairs(self.sample, self.beside, self.projected.sheet, ratio, is_match)
 
-    def doubtful(self, used: BoolArray, asked: BoolArray, segment: IntArray) -> BoolArray:
+    def doubtful(
+        self,
+        used: BoolArray,
+        asked: BoolArray,
+        segment: IntArray,
+        equations: OffsetEquations,
+    ) -> BoolArray:
         """(H,) segments on sheets that do not fit the others, by their offset or by the surface.
 
         ``used`` pairs are those of certain sheets; ``asked`` ones are also those in doubt before,
         now that the others may be known better, and the candidates of segments that several sheets
-        explain.
+        explain. ``equations`` are those of the pairs used.
         """
         doubt = np.zeros(len(used), dtype=np.bool_)
         at = np.flatnonzero(asked)
@@ -521,9 +539,11 @@ class _Hypotheses:
             return doubt
         projected, n_sheets = self.projected, len(self.sensor.sheets)
         keys, key_of = np.unique(segment[at] * n_sheets + projected.sheet[at], return_inverse=True)
-        scores = left_out_scores(self.residuals_of(at), self.prior, key_of, used[at])
+        scores = left_out_scores(self.residuals, equations, self.place[at], key_of)
         is_bad = scores > OFFSET_CHI_SQUARE
         known = at[used[at] & ~is_bad[key_of]]
+        # along the stripes
+        known = known[np.argsort(self.sample[known], kind="stable")]
         left = self.sides[0]
         pixels, depth = left.profile.points_px[left.row[self.sample]], projected.points_mm[:, 2]
         planes = fit_planes(pixels[known], depth[known], segment[known])
@@ -538,6 +558,10 @@ class _Hypotheses:
         return doubt
 
 
+def _are_same(first: tuple[BoolArray, ...], second: tuple[BoolArray, ...]) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+
+
 def _is_tied(pairs: _Pairs, found: SheetAssignment) -> BoolArray:
     """(H,) pairs of segments that several sheets explain, on one of these sheets."""
     is_open = (~found.is_sure & found.is_tied)[pairs.left]
@@ -550,32 +574,38 @@ def _assign_both(
     pairs: _Pairs, sides: tuple[_Side, _Side], n_sheets: int
 ) -> tuple[SheetAssignment, SheetAssignment]:
     """Sheets of both cameras that agree with each other."""
-    alive_left = alive_right = pairs.is_match
+    match = pairs.is_match.view(np.uint8)
+    alive_left = alive_right = match
     for _ in range(EXCHANGES):
         left = _assign_left(pairs, alive_left, sides[0], n_sheets)
         right = _assign_right(pairs, alive_right, sides[1], n_sheets)
-        by_left, by_right = left.label[pairs.left], np.append(right.label, -1)[pairs.right]
-        alive_left = pairs.is_match & ((by_right == -1) | (by_right == pairs.sheet))
-        alive_right = pairs.is_match & ((by_left == -1) | (by_left == pairs.sheet))
+        alive_left = _alive(pairs, pairs.right, right)
+        alive_right = _alive(pairs, pairs.left, left)
     left = _assign_left(pairs, alive_left, sides[0], n_sheets)
-    agreed = alive_left & (left.label[pairs.left] == pairs.sheet)
+    agreed = alive_left & _alive(pairs, pairs.left, left, is_strict=True)
     return left, _assign_right(pairs, agreed, sides[1], n_sheets)
 
 
-def _assign_left(pairs: _Pairs, alive: BoolArray, side: _Side, n_sheets: int) -> SheetAssignment:
+def _alive(
+    pairs: _Pairs, sample: IntArray, found: SheetAssignment, *, is_strict: bool = False
+) -> BytesArray:
+    """(H,) 1 for matches whose samples are on no other sheet for certain, or are on this one."""
+    alive = np.zeros(len(sample), np.uint8)
+    match, is_sure = pairs.is_match.view(np.uint8), found.is_sure.view(np.uint8)
+    rule_out(sample, pairs.sheet, found.state, is_sure, match, int(is_strict), alive)
+    return alive
+
+
+def _assign_left(pairs: _Pairs, alive: BytesArray, side: _Side, n_sheets: int) -> SheetAssignment:
     scores = np.full((len(side), n_sheets), IMPOSSIBLE)
-    scores[pairs.left, pairs.sheet] = np.where(alive | ~pairs.is_match, pairs.ratio, MISSING)
-    is_match = np.zeros((len(side), n_sheets), dtype=np.bool_)
-    is_match[pairs.left, pairs.sheet] = alive
-    return side.assign(scores, is_match)
+    is_beside, match = np.zeros(scores.size, np.uint8), pairs.is_match.view(np.uint8)
+    score_left(pairs.left, pairs.sheet, pairs.ratio, match, alive, MISSING, scores, is_beside)
+    return side.assign(scores, is_beside)
 
 
-def _assign_right(pairs: _Pairs, alive: BoolArray, side: _Side, n_sheets: int) -> SheetAssignment:
+def _assign_right(pairs: _Pairs, alive: BytesArray, side: _Side, n_sheets: int) -> SheetAssignment:
     """The same pairs, seen from the right stripes: each sample takes its best partner."""
     scores = np.full((len(side), n_sheets), MISSING)
-    chosen = np.flatnonzero(alive & (pairs.right >= 0))
-    where = (pairs.right[chosen], pairs.sheet[chosen])
-    np.maximum.at(scores, where, pairs.ratio[chosen])
-    is_match = np.zeros((len(side), n_sheets), dtype=np.bool_)
-    is_match[where] = True
-    return side.assign(scores, is_match)
+    is_beside = np.zeros(scores.size, np.uint8)
+    score_right(pairs.right, pairs.sheet, pairs.ratio, alive, scores, is_beside)
+    return side.assign(scores, is_beside)

@@ -17,17 +17,18 @@ import numpy as np
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.rotations import skew
+from armscan.kernels.naming import mark_beside
 from armscan.kernels.placing import fuse_stripes
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import fold_radius
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.epipolar import (
+    N_DRIFT,
     Crossings,
     EpipolarOffset,
     Projections,
     Residuals,
     RightStripes,
-    drift_directions,
     find_crossings,
     project_on_sheets,
     residual_and_sigma,
@@ -201,32 +202,45 @@ def measure_stereo(
     InputError
         If the sensor has one camera.
     """
-    row = np.flatnonzero(left.sheet >= 0)
-    profile = left.profile
+    row, profile = np.flatnonzero(left.sheet >= 0), left.profile
     projected = project_on_sheets(profile.points_px[row], left.sheet[row], sensor)
-    row, projected = row[projected.is_met], projected.select(projected.is_met)
+    if not projected.is_met.all():
+        row, projected = row[projected.is_met], projected.select(projected.is_met)
     crossings = find_crossings(
-        projected, profile.normals_px[row], profile.sigma_px[row], RightStripes.of(right.profile)
+        projected,
+        profile.normals_px[row],
+        profile.sigma_px[row],
+        RightStripes.of(right.profile),
+        sensor,
     )
-    other = np.where(crossings.is_found, right.sheet[crossings.row], -1)
-    is_pair = crossings.is_found & ((other == projected.sheet) | (other == -1))
-    residual, sigma = residual_and_sigma(Residuals.of(projected, crossings, sensor), offset)
+    other = right.sheet[crossings.row]
+    is_pair = (other == crossings.sheet) | (other == -1)
+    residual, sigma = residual_and_sigma(Residuals.of(crossings, sensor), offset)
     is_fused = is_pair & (np.abs(residual) <= CONSISTENCY_SIGMAS * sigma)
-    is_inside = depths.holds(projected.points_mm, projected.sheet, sensor)
-    is_alone = ~is_pair & is_inside
+    is_alone = depths.holds(projected.points_mm, projected.sheet, sensor)
+    is_alone[crossings.at[is_pair]] = False
     left_status = np.where(left.sheet >= 0, PointStatus.NO_RAY, left.status)
-    left_status[row] = np.where(is_pair, PointStatus.INCONSISTENT, PointStatus.OUT_OF_DEPTH)
-    left_status[row[is_fused | is_alone]] = PointStatus.MEASURED
-    seen = projected.select(is_fused), crossings.select(is_fused)
-    both = _fused(row[is_fused], *seen, profile, right.profile, sensor=sensor, offset=offset)
-    single = _left_alone(row[is_alone], projected.select(is_alone), profile, sensor)
+    left_status[row] = PointStatus.OUT_OF_DEPTH
+    left_status[row[crossings.at[is_pair]]] = PointStatus.INCONSISTENT
+    left_status[row[crossings.at[is_fused]]] = PointStatus.MEASURED
+    left_status[row[is_alone]] = PointStatus.MEASURED
+    left_points = _left_points(
+        row,
+        projected,
+        crossings,
+        is_fused,
+        is_alone,
+        profiles=(profile, right.profile),
+        sensor=sensor,
+        offset=offset,
+    )
     right_points, right_status = _right_alone(
         right, crossings.row[is_pair], crossings.row[is_fused], sensor, depths
     )
+    left_status.setflags(write=False)
+    right_status.setflags(write=False)
     return (
-        MeasuredProfile(
-            replace(left, status=left_status), _in_order(both, single), offset.warnings
-        ),
+        MeasuredProfile(replace(left, status=left_status), left_points, offset.warnings),
         MeasuredProfile(replace(right, status=right_status), right_points),
     )
 
@@ -258,47 +272,112 @@ def _right_alone(
 def _beside(rows: IntArray, right: Profile) -> BoolArray:
     """(N,) right points that a left point fell beside, with those between them."""
     is_beside = np.zeros(len(right), dtype=np.bool_)
-    for step in range(-BESIDE_ROWS, BESIDE_ROWS + 1):
-        near = np.clip(rows + step, 0, len(right) - 1)
-        is_beside[near[right.segment[near] == right.segment[rows]]] = True
+    mark_beside(rows, right.segment, BESIDE_ROWS, is_beside.view(np.uint8))
     return is_beside
 
 
-def _in_order(both: StripePoints, single: StripePoints) -> StripePoints:
-    """Both kinds in the order of the profile."""
-    joined = StripePoints.concat([both, single])
-    return joined.select(np.argsort(joined.row, kind="stable"))
-
-
-def _fused(
+def _left_points(
     row: IntArray,
     projected: Projections,
     crossings: Crossings,
-    left: Profile,
-    right: Profile,
+    is_fused: BoolArray,
+    is_alone: BoolArray,
     *,
+    profiles: tuple[Profile, Profile],
     sensor: SensorCalibration,
     offset: EpipolarOffset,
 ) -> StripePoints:
-    """Points that both cameras see."""
-    shift = np.zeros(len(row))
+    """Points (M,) of the left profile's rows: fused (F,) with crossings, or alone (M,) on a sheet.
+
+    In the order of the profile; rows that are neither are left out.
+    """
+    left, right = profiles
+    chosen, alone = np.flatnonzero(is_fused), np.flatnonzero(is_alone)
+    is_kept = is_alone.copy()
+    is_kept[crossings.at[chosen]] = True
+    kept, place = np.flatnonzero(is_kept), np.cumsum(is_kept) - 1
+    shift = np.zeros(len(crossings.at))
     if offset.is_beyond_calibration:
-        moved = drift_directions(projected, sensor) @ offset.drift
-        shift = -np.sum(crossings.normal * moved, axis=1)
-    sigma = np.stack([left.sigma_px[row], right.sigma_px[crossings.row]], axis=1)
-    points = fuse_points(
-        row, projected, crossings, left.normals_px[row], sigma, sensor=sensor, shift_px=shift
+        shift -= crossings.by_errors[:, -N_DRIFT:] @ offset.drift
+    found = SpreadPoints.empty(len(kept))
+    into, into_alone = place[crossings.at[chosen]], place[alone]
+    sigma = np.column_stack([left.sigma_px[row[crossings.at]], right.sigma_px[crossings.row]])
+    fuse_points(
+        projected,
+        crossings,
+        left.normals_px[row],
+        sigma,
+        sensor=sensor,
+        shift_px=shift,
+        chosen=chosen,
+        into=into,
+        found=found,
     )
-    if left.noise_length is None or right.noise_length is None:
-        return points
-    length = np.stack([left.noise_length[row], right.noise_length[crossings.row]], axis=1)
-    variance = np.maximum((points.noise_mm**2).sum(axis=1), np.finfo(np.float64).tiny)
-    mean = (length * variance).sum(axis=1) / variance.sum(axis=1)
-    return replace(points, noise_length=mean)
+    _spread_alone(row[alone], projected.select(alone), left, sensor, into_alone, found=found)
+    length = None
+    if left.noise_length is not None and (right.noise_length is not None or not len(chosen)):
+        length = left.noise_length[row[kept]]
+        if right.noise_length is not None and len(chosen):
+            pair = right.noise_length[crossings.row[chosen]]
+            length[into] = _mean_length(length[into], pair, found.noise_mm[into])
+        length.setflags(write=False)
+    return found.stripe_points(row[kept], projected.sheet[kept], length)
+
+
+def _mean_length(left: FloatArray, right: FloatArray, noise_mm: FloatArray) -> FloatArray:
+    """(M,) mean by variance of the noise's lengths (M,) of both cameras; noises (M, 3, 2)."""
+    variance = np.maximum((noise_mm**2).sum(axis=1), np.finfo(np.float64).tiny)
+    total = left * variance[:, 0] + right * variance[:, 1]
+    return np.asarray(total / variance.sum(axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpreadPoints:
+    """Points of two cameras with what moves them, as `StripePoints` has them; they are written to.
+
+    Parameters
+    ----------
+    points_mm, shape_mm
+        (M, 3).
+    noise_mm
+        (M, 3, 2) by the left stripe and by the right stripe.
+    by_sensor
+        (M, 3, 32).
+    """
+
+    points_mm: FloatArray
+    noise_mm: FloatArray
+    shape_mm: FloatArray
+    by_sensor: FloatArray
+
+    @staticmethod
+    def empty(n: int) -> SpreadPoints:
+        """Nothing is known of ``n`` points yet."""
+        return SpreadPoints(
+            points_mm=np.zeros((n, 3)),
+            noise_mm=np.zeros((n, 3, N_STRIPES)),
+            shape_mm=np.zeros((n, 3)),
+            by_sensor=np.zeros((n, 3, N_COLUMNS)),
+        )
+
+    def stripe_points(
+        self, row: IntArray, sheet: IntArray, noise_length: FloatArray | None
+    ) -> StripePoints:
+        """All of them, which are not written to any more."""
+        for array in (self.points_mm, self.noise_mm, self.shape_mm, self.by_sensor, row, sheet):
+            array.setflags(write=False)
+        return StripePoints(
+            row=row,
+            points_mm=self.points_mm,
+            noise_mm=self.noise_mm,
+            shape_mm=self.shape_mm,
+            dpoint_dsensor=self.by_sensor,
+            sheet=sheet,
+            noise_length=noise_length,
+        )
 
 
 def fuse_points(
-    row: IntArray,
     projected: Projections,
     crossings: Crossings,
     normals_px: FloatArray,
@@ -306,7 +385,10 @@ def fuse_points(
     *,
     sensor: SensorCalibration,
     shift_px: FloatArray,
-) -> StripePoints:
+    chosen: IntArray,
+    into: IntArray,
+    found: SpreadPoints,
+) -> None:
     """Weigh left stripe, right stripe and sheet against each other (eqs. 4.7, 4.11, 4.17).
 
     A point has three unknowns. Its place along the left stripe is a choice of where to sample, so
@@ -318,76 +400,73 @@ def fuse_points(
 
     Parameters
     ----------
-    row
-        (M,) rows of the left profile.
     projected
-        (M,) these points on their sheets.
+        (H,) left points on their sheets.
     crossings
-        (M,) the right stripes beside them; all found.
+        (F,) the right stripes beside them.
     normals_px
-        (M, 2) across the left stripe.
+        (H, 2) across the left stripe.
     sigma_px
-        (M, 2) of the left stripe's point and of the right stripe's.
+        (F, 2) of the left stripe's point and of the right stripe's.
     sensor
         Both cameras and all sheets, with their joint covariance.
     shift_px
-        (M,) known part of the residuals, to be taken off: of a camera that has moved.
-
-    Returns
-    -------
-    StripePoints
-        The noises are those of the left stripe and of the right stripe.
+        (F,) known part of the residuals, to be taken off: of a camera that has moved.
+    chosen
+        (M,) crossings whose points are asked for.
+    into
+        (M,) their places in ``found``.
+    found
+        Receives them.
     """
-    n = len(projected.sheet)
-    sigma = np.column_stack([sigma_px, np.maximum(shapes_mm(sensor)[projected.sheet], 1e-6)])
-    covariances = [sensor_covariance(sensor, k).ravel() for k in range(len(sensor.sheets))]
-    points, moves, by_sensor = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, N_COLUMNS))
+    n = len(found.points_mm)
     fuse_stripes(
-        np.ascontiguousarray(projected.points_mm),
-        np.ascontiguousarray(projected.sheet),
-        np.column_stack([normals_px, crossings.normal]),
-        sigma,
-        np.ascontiguousarray(crossings.residual_px - shift_px),
-        np.ascontiguousarray(projected.dq_dpoint).reshape(n, 6),
-        np.ascontiguousarray(projected.dq_dsecond).reshape(n, 2 * projected.dq_dsecond.shape[2]),
+        chosen,
+        into,
+        crossings.at,
+        projected.points_mm,
+        projected.sheet,
+        normals_px,
+        sigma_px,
+        np.maximum(shapes_mm(sensor), 1e-6),
+        crossings.residual_px - shift_px,
+        crossings.by_point,
+        crossings.by_errors,
         lens_numbers(sensor),
         sheet_numbers(sensor),
-        np.stack(covariances),
-        points,
-        moves.reshape(n, 9),
-        by_sensor.reshape(n, 3 * N_COLUMNS),
-    )
-    for array in (points, by_sensor):
-        array.setflags(write=False)
-    return StripePoints(
-        row=row,
-        points_mm=points,
-        noise_mm=moves[:, :, :N_STRIPES],
-        shape_mm=moves[:, :, N_STRIPES],
-        dpoint_dsensor=by_sensor,
-        sheet=projected.sheet,
+        _covariances(sensor),
+        found.points_mm,
+        found.noise_mm.reshape(n, 3 * N_STRIPES),
+        found.shape_mm,
+        found.by_sensor.reshape(n, 3 * N_COLUMNS),
     )
 
 
-def _left_alone(
-    row: IntArray, projected: Projections, left: Profile, sensor: SensorCalibration
-) -> StripePoints:
-    """Points on their sheet by the left camera alone (eq. 4.11)."""
-    noise = np.zeros((len(row), 3, N_STRIPES))
-    across = np.einsum("nij,nj->ni", projected.dpoint_dpx, left.normals_px[row])
-    noise[:, :, 0] = across * left.sigma_px[row, None]
-    length = left.noise_length
-    second = np.zeros((len(row), 3, projected.dq_dsecond.shape[2]))
-    by_sensor = np.concatenate([projected.dpoint_dsensor, second], axis=2)
-    return StripePoints(
-        row=row,
-        points_mm=projected.points_mm,
-        noise_mm=noise,
-        shape_mm=moved_by_shape(projected.points_mm, projected.points_mm, projected.sheet, sensor),
-        dpoint_dsensor=by_sensor,
-        sheet=projected.sheet,
-        noise_length=None if length is None else length[row],
-    )
+@lru_cache(maxsize=8)
+def _covariances(sensor: SensorCalibration) -> FloatArray:
+    """(S, 1024) covariance of what the points of each sheet depend on."""
+    return np.stack([sensor_covariance(sensor, k).ravel() for k in range(len(sensor.sheets))])
+
+
+def _spread_alone(
+    row: IntArray,
+    projected: Projections,
+    left: Profile,
+    sensor: SensorCalibration,
+    into: IntArray,
+    *,
+    found: SpreadPoints,
+) -> None:
+    """Points (M,) on their sheet by the left camera alone (eq. 4.11), into places of ``found``."""
+    points, sheet = projected.points_mm, projected.sheet
+    by_px, by_sensor = differentiated(points, sheet, lens_numbers(sensor), sheet_numbers(sensor))
+    across = np.einsum("nij,nj->ni", by_px, left.normals_px[row])
+    found.points_mm[into] = points
+    found.noise_mm[into, :, 0] = across * left.sigma_px[row, None]
+    found.noise_mm[into, :, 1] = 0.0
+    found.shape_mm[into] = moved_by_shape(points, points, sheet, sensor)
+    found.by_sensor[into, :, : N_CAMERA + N_SHEET] = by_sensor
+    found.by_sensor[into, :, N_CAMERA + N_SHEET :] = 0.0
 
 
 def triangulate_right(

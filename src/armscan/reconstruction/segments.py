@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.kernels.naming import find_steps, number_segments, take_every
 from armscan.records.profile import Profile, StripeFlag
 
 GAP_PX, GAP_STEPS = 6.0, 3.0
@@ -54,47 +55,23 @@ def cut_segments(profile: Profile) -> StripeSegments:
     row = np.flatnonzero(profile.is_accepted)
     if not len(row):
         return StripeSegments(row, row)
-    points = profile.points_px[row]
-    n_beside = _count_beside(profile)[row]
-    is_cut = (np.diff(profile.segment[row]) != 0) | (np.diff(n_beside) > 0)
-    step = np.hypot(*np.diff(points, axis=0).T)
-    usual = float(np.median(step[~is_cut])) if not is_cut.all() else 0.0
-    is_cut |= step > max(GAP_PX, GAP_STEPS * usual)
-    is_start = np.concatenate([[True], is_cut])
+    points, n = profile.points_px, len(row)
+    step, is_cut, number = np.zeros(n), np.zeros(n, np.uint8), np.zeros(n, np.int64)
+    find_steps(points, row, profile.segment, _is_beside(profile).view(np.uint8), step, is_cut)
+    linked = step[is_cut == 0]
+    usual = float(np.median(linked)) if len(linked) else 0.0
+    is_cut[step > max(GAP_PX, GAP_STEPS * usual)] = 1
     jump_px = max(JUMP_PX, JUMP_SIGMAS * float(np.median(profile.sigma_px[row])))
-    is_start |= _is_kink(points, profile.normals_px[row], np.cumsum(is_start), jump_px)
-    return StripeSegments(row, np.cumsum(is_start) - 1)
+    normals = profile.normals_px
+    if n < len(points):
+        points, normals = points[row], normals[row]
+    number_segments(points, normals, is_cut, KINK_POINTS, float(KINK_RAD), jump_px, number)
+    return StripeSegments(row, number)
 
 
-def _count_beside(profile: Profile) -> IntArray:
-    """(N,) points with another line beside them, up to each."""
-    return np.cumsum((profile.flags & int(StripeFlag.NEIGHBOUR)) != 0)
-
-
-def _is_kink(
-    points: FloatArray, normals: FloatArray, segment: IntArray, jump_px: float
-) -> BoolArray:
-    """(A,) True for the first point beyond a kink or a step of its segment."""
-    m, n = KINK_POINTS, len(points)
-    found = np.zeros(n, dtype=np.bool_)
-    if n < 2 * m:
-        return found
-    index = np.arange(m, dtype=np.float64)
-    ahead = np.linalg.pinv(np.stack([np.ones(m), index - (m - 0.5)], axis=1))
-    windows = np.lib.stride_tricks.sliding_window_view(points, m, axis=0)
-    before, after = windows[: n - 2 * m + 1] @ ahead.T, windows[m:, :, ::-1] @ ahead.T
-    middle = slice(m, n - m + 1)
-    is_whole = segment[: n - 2 * m + 1] == segment[2 * m - 1 :]
-    step = np.abs(np.sum((after[:, :, 0] - before[:, :, 0]) * normals[middle], axis=1))
-    first, then = before[:, :, 1], -after[:, :, 1]
-    cross = first[:, 0] * then[:, 1] - first[:, 1] * then[:, 0]
-    turn = np.abs(np.arctan2(cross, np.sum(first * then, axis=1)))
-    size = np.where(is_whole, np.maximum(turn / KINK_RAD, step / jump_px), 0.0)
-    # of neighbouring places that exceed the limit, the largest is the kink
-    padded = np.pad(size, m)
-    largest = np.lib.stride_tricks.sliding_window_view(padded, 2 * m + 1).max(axis=1)
-    found[middle] = (size > 1.0) & (size >= largest)
-    return found
+def _is_beside(profile: Profile) -> BoolArray:
+    """(N,) True for points with another line beside them."""
+    return np.asarray((profile.flags & int(StripeFlag.NEIGHBOUR)) != 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,18 +95,11 @@ class Samples:
 
 def take_samples(segments: StripeSegments, every: int) -> Samples:
     """Every so many points of each long segment, more densely on short ones."""
-    number, n = segments.number, len(segments.row)
-    if not n:
-        return Samples(segments.row, np.zeros(0), segments.row)
-    start = np.flatnonzero(np.diff(number, prepend=-1))
-    length = np.diff(np.append(start, n))[number]
-    step = np.clip(length // 4, 1, every)
-    place = np.arange(n) - start[number]
-    cell = np.minimum(place // step, np.maximum(length // step - 1, 0))
-    is_first = np.diff(number * (n + 1) + cell, prepend=-1) != 0
-    first = np.flatnonzero(is_first)
-    count = np.diff(np.append(first, n))
-    return Samples(first + count // 2, count / every, np.cumsum(is_first) - 1)
+    n = len(segments.row)
+    at, nearest = np.zeros((2, n), np.int64)
+    weight = np.zeros(n)
+    count = take_every(segments.number, every, at, weight, nearest)
+    return Samples(at[:count], weight[:count], nearest)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +162,8 @@ def cut_pieces(profile: Profile) -> Pieces:
     of_point[rows] = piece
     sample = np.flatnonzero(np.diff(_renumbered(piece, np.floor(along / SAMPLE_PX)), prepend=-1))
     starts = np.flatnonzero(np.diff(piece, prepend=-1))
-    is_apart = (np.diff(profile.segment[rows]) != 0) | (np.diff(_count_beside(profile)[rows]) > 0)
+    n_beside = np.cumsum(_is_beside(profile))[rows]
+    is_apart = (np.diff(profile.segment[rows]) != 0) | (np.diff(n_beside) > 0)
     return Pieces(
         of_point=of_point,
         segment=number[starts],

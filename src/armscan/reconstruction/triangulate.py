@@ -129,49 +129,6 @@ def lens_numbers(sensor: SensorCalibration) -> FloatArray:
     return np.append(camera.parameters, fold_radius(camera.distortion))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SheetPoints:
-    """Rays of the left camera or the only one, intersected with their sheets.
-
-    Parameters
-    ----------
-    points_mm
-        (N, 3) in the Sensor frame (eq. 4.11); (0, 0, 1) where there is none.
-    is_met
-        (N,) False where the lens model has no inverse or the ray misses the sheet.
-    dpoint_dpx
-        (N, 3, 2) derivative by the pixel.
-    dpoint_dsensor
-        (N, 3, 17) derivative by the camera's 9 parameters and the sheet's 8.
-    """
-
-    points_mm: FloatArray
-    is_met: BoolArray
-    dpoint_dpx: FloatArray
-    dpoint_dsensor: FloatArray
-
-
-def intersect_with_jacobian(
-    points_px: FloatArray, sheet_of_point: IntArray, sensor: SensorCalibration
-) -> SheetPoints:
-    """Intersect the rays of pixels (N, 2) with their sheets (N,), -1 for none; differentiate."""
-    points, is_met = np.zeros((len(points_px), 3)), np.zeros(len(points_px), dtype=np.bool_)
-    # pixels on one sheet are met together, so they are brought together
-    order = np.argsort(sheet_of_point, kind="stable")
-    points[order], is_met[order] = intersect_sheets(points_px[order], sheet_of_point[order], sensor)
-    points[~is_met] = (0.0, 0.0, 1.0)
-    by_px, by_sensor = differentiated(
-        points,
-        np.where(is_met, sheet_of_point, -1),
-        lens_numbers(sensor),
-        sheet_numbers(sensor),
-    )
-    # read-only and their own, so that records take them as they are
-    for array in (points, by_px, by_sensor):
-        array.setflags(write=False)
-    return SheetPoints(points, is_met, by_px, by_sensor)
-
-
 def differentiated(
     points_mm: FloatArray, sheet: IntArray, lens: FloatArray, sheets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

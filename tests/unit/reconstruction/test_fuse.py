@@ -13,7 +13,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
-from armscan.reconstruction.points import fuse_points, triangulate_right
+from armscan.reconstruction.points import SpreadPoints, fuse_points, triangulate_right
 from armscan.reconstruction.triangulate import (
     StripePoints,
     noise_size_mm,
@@ -61,37 +61,47 @@ def fused(
     right = RightStripes.of(make_profile("right", [(right_px, right_normals)], right_sigma_px))
     there = project_on_sheets(left_px, np.full(len(left_px), SHEET), sensor)
     n = len(left_px)
-    beside = find_crossings(there, normals, np.full(n, SIGMA_PX), right, 30.0)
+    beside = find_crossings(there, normals, np.full(n, SIGMA_PX), right, sensor, reach_px=30.0)
+    assert (beside.at == np.arange(n)).all()
     assert (beside.row == np.arange(n)).all()
-    return fuse_points(
-        np.arange(n),
+    found = SpreadPoints.empty(n)
+    fuse_points(
         there,
         beside,
         normals,
         np.column_stack([np.full(n, SIGMA_PX), np.full(n, right_sigma_px)]),
         sensor=sensor,
         shift_px=np.zeros(n),
+        chosen=np.arange(n),
+        into=np.arange(n),
+        found=found,
     )
+    return found.stripe_points(np.arange(n), there.sheet, None)
 
 
 def test_a_pair_without_points_has_none() -> None:
     sensor, (left, normals, _) = head().calibration(), pixels()
     there = project_on_sheets(left, np.full(len(left), SHEET), sensor)
     right = RightStripes.of(make_profile("right", [(left + 1000.0, normals)], SIGMA_PX))
-    beside = find_crossings(there, normals, np.full(len(left), SIGMA_PX), right, 3.0)
-    assert (beside.row == -1).all()
-    none = np.zeros(0, dtype=np.int64)
-    found = fuse_points(
-        none,
-        there.select(none),
-        beside.select(none),
-        np.zeros((0, 2)),
+    beside = find_crossings(
+        there, normals, np.full(len(left), SIGMA_PX), right, sensor, reach_px=3.0
+    )
+    assert len(beside.at) == len(beside.by_errors) == 0
+    none, found = np.zeros(0, dtype=np.int64), SpreadPoints.empty(0)
+    fuse_points(
+        there,
+        beside,
+        normals,
         np.zeros((0, 2)),
         sensor=sensor,
         shift_px=np.zeros(0),
+        chosen=none,
+        into=none,
+        found=found,
     )
-    assert found.points_mm.shape == (0, 3)
-    assert noise_size_mm(found.noise_mm).shape == (0,)
+    points = found.stripe_points(none, none, None)
+    assert points.points_mm.shape == (0, 3)
+    assert noise_size_mm(points.noise_mm).shape == (0,)
 
 
 def parameter_error(column: int, size: float) -> FloatArray:
@@ -244,6 +254,7 @@ def test_fusing_solves_the_weighted_equations_with_the_place_along_the_stripe_he
     across_right = np.full(2, np.sqrt(0.5))
     _, by_point, by_camera = sensor.camera.camera.project_with_jacobian(there.points_mm)
     _, gradient, by_sheet = sensor.sheets[SHEET].sheet.height_with_jacobian(there.points_mm)
+    _, by_right, by_second = TwoViews.of_sensor(sensor).project_right_with_jacobian(there.points_mm)
     sigma = np.array([SIGMA_PX, 0.11, max(shape_mm(sensor, SHEET), 1e-6)])
     joint = sensor_covariance(sensor, SHEET)
     for i, normal in enumerate(normals):
@@ -252,13 +263,13 @@ def test_fusing_solves_the_weighted_equations_with_the_place_along_the_stripe_he
             [
                 along @ by_point[i],
                 normal @ by_point[i],
-                across_right @ there.dq_dpoint[i],
+                across_right @ by_right[i],
                 gradient[i],
             ]
         )
         by_sensor = np.zeros((4, 32))
         by_sensor[0, :9], by_sensor[1, :9] = along @ by_camera[i], normal @ by_camera[i]
-        by_sensor[2, 17:] = across_right @ there.dq_dsecond[i]
+        by_sensor[2, 17:] = across_right @ by_second[i]
         by_sensor[3, 9:17] = by_sheet[i]
         weight = np.linalg.inv(by_sensor[1:] @ joint @ by_sensor[1:].T + np.diag(sigma**2))
         whole = np.zeros((4, 4))

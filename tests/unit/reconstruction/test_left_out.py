@@ -12,6 +12,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.reconstruction import epipolar
 from armscan.reconstruction.epipolar import (
     FLOOR_PX,
+    OffsetEquations,
     Residuals,
     RightStripes,
     find_crossings,
@@ -42,28 +43,29 @@ def test_scores_are_those_of_solving_without_each_segment() -> None:
         left.profile.normals_px[rows],
         left.profile.sigma_px[rows],
         RightStripes.of(right.profile),
+        sensor,
     )
+    rows = rows[crossings.at]
     _, segment = np.unique(left.profile.segment[rows], return_inverse=True)
     counts = np.cumsum(segment[:, None] == segment, axis=0)[
         np.arange(len(rows)), np.arange(len(rows))
     ]
     most = np.array([1, 2])
-    is_kept = crossings.is_found & ((segment > 1) | (counts <= most[np.minimum(segment, 1)]))
-    kept = np.flatnonzero(is_kept)
-    projected, crossings, segment = projected.select(kept), crossings.select(kept), segment[kept]
+    kept = np.flatnonzero((segment > 1) | (counts <= most[np.minimum(segment, 1)]))
+    crossings, segment = crossings.select(kept), segment[kept]
     off = segment == 3
     crossings = replace(crossings, residual_px=crossings.residual_px + SHIFTED_PX * off)
     is_used = segment % 4 != 2
-    residuals = Residuals.of(projected, crossings, sensor)
+    residuals = Residuals.of(crossings, sensor)
     prior = no_offset(sensor)
-    scores = left_out_scores(residuals, prior, segment, is_used)
+    equations = OffsetEquations.of(residuals, prior, is_used)
+    scores = left_out_scores(residuals, equations, np.arange(len(segment)), segment)
 
     whitened = np.zeros((len(segment), prior.factor.shape[1]))
     for row, (sheet, by_errors) in enumerate(
         zip(residuals.sheet, residuals.by_errors, strict=True)
     ):
         whitened[row] = by_errors @ prior.factor[residuals.columns[sheet]]
-    equations = epipolar._Equations.of(residuals, prior, is_used)
     wanted_all = -residuals.px
     all_weight = equations.weight / equations.sigma**2
     whole = np.eye(whitened.shape[1]) + (whitened.T * all_weight) @ whitened

@@ -23,8 +23,10 @@ from armscan.reconstruction.place import (
     propagate_to_base,
 )
 from armscan.reconstruction.triangulate import (
+    differentiated,
     intersect_sheets,
-    intersect_with_jacobian,
+    lens_numbers,
+    sheet_numbers,
     triangulate_stripe,
 )
 from armscan.records.profile import PointProfile
@@ -319,8 +321,11 @@ def test_derivatives_made_on_the_way_give_the_covariance_of_derivatives_that_are
     np.testing.assert_allclose(made.points_mm, known.points_mm, rtol=1e-12)
     size = np.abs(known.covariance_mm2).max(axis=(1, 2), keepdims=True)
     assert np.all(np.abs(made.covariance_mm2 - known.covariance_mm2) <= 1e-9 * size)
-    found = intersect_with_jacobian(places[stripe.row], sheet[stripe.row], scanner.sensor)
-    np.testing.assert_allclose(found.points_mm, stripe.points_mm, rtol=1e-12)
+    sensor = scanner.sensor
+    points, is_met = intersect_sheets(places[stripe.row], sheet[stripe.row], sensor)
+    assert is_met.all()
+    np.testing.assert_allclose(points, stripe.points_mm, rtol=1e-12)
+    by_px, _ = differentiated(points, stripe.sheet, lens_numbers(sensor), sheet_numbers(sensor))
     across = (profile.normals_px * profile.sigma_px[:, None])[stripe.row]
-    expected = np.einsum("nij,nj->ni", found.dpoint_dpx, across)
+    expected = np.einsum("nij,nj->ni", by_px, across)
     np.testing.assert_allclose(stripe.noise_mm[:, :, 0], expected, rtol=1e-9, atol=1e-12)

@@ -13,8 +13,10 @@ from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.place import merge_clouds
 from armscan.reconstruction.triangulate import (
+    differentiated,
     intersect_sheets,
-    intersect_with_jacobian,
+    lens_numbers,
+    sheet_numbers,
     triangulate,
 )
 from armscan.records.profile import Profile
@@ -269,23 +271,23 @@ def test_rays_meet_sheets_as_in_the_models_of_camera_and_sheet() -> None:
     pixels = np.concatenate([rng.uniform(-0.2, 1.2, (300, 2)) * size, [[np.nan, 5.0], [1e7, 1e7]]])
     sheet = np.tile(np.arange(-1, n_sheets), len(pixels))
     pixels = np.repeat(pixels, n_sheets + 1, axis=0)
-    found = intersect_with_jacobian(pixels, sheet, head)
     points, is_met = intersect_sheets(pixels, sheet, head)
+    by_px, by_parameters = differentiated(
+        points, np.where(is_met, sheet, -1), lens_numbers(head), sheet_numbers(head)
+    )
     xy, has_ray, dxy_dpx, dxy_dcamera = camera.undistort_with_jacobian(pixels)
-    assert not found.is_met[sheet < 0].any()
-    assert not found.is_met[~has_ray].any()
-    np.testing.assert_array_equal(found.is_met, is_met)
-    np.testing.assert_array_equal(found.points_mm[is_met], points[is_met])
+    assert not is_met[sheet < 0].any()
+    assert not is_met[~has_ray].any()
     for k, one in enumerate(head.sheets):
         rows = np.flatnonzero(has_ray & (sheet == k))
         expected, met, by_xy, by_sheet = one.sheet.intersect_with_jacobian(xy[rows])
-        np.testing.assert_array_equal(found.is_met[rows], met)
+        np.testing.assert_array_equal(is_met[rows], met)
         rows, by_xy = rows[met], by_xy[met]
         np.testing.assert_allclose(points[rows], expected[met], rtol=1e-10)
         by_sensor = np.concatenate([by_xy @ dxy_dcamera[rows], by_sheet[met]], axis=2)
         for have, want in (
-            (found.dpoint_dpx[rows], by_xy @ dxy_dpx[rows]),
-            (found.dpoint_dsensor[rows], by_sensor),
+            (by_px[rows], by_xy @ dxy_dpx[rows]),
+            (by_parameters[rows], by_sensor),
         ):
             largest = np.abs(want).max(axis=1, keepdims=True)
             assert np.all(np.abs(have - want) <= 1e-8 * largest)

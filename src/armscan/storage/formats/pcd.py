@@ -192,10 +192,10 @@ def _unpacked(data: bytes, header: _Header, where: str) -> NDArray[Any]:
             remedy="copy the file again",
         )
     # numba is asked for only here: it takes a second to load
-    from armscan.kernels.lzf import decompress
+    from armscan.kernels.decoding import decompress_lzf
 
     plain = np.zeros(size, np.uint8)
-    if decompress(np.frombuffer(data, np.uint8, packed, start), plain) != size:
+    if decompress_lzf(np.frombuffer(data, np.uint8, packed, start), plain) != size:
         raise FileFormatError(
             "the compressed points of the PCD file are damaged", where=where, remedy=DAMAGED
         )

@@ -9,8 +9,8 @@ from armscan.errors import OptionError, OutputError
 from armscan.report.quantity import Quantity, Summary
 from armscan.storage.files import check_outputs, is_folder, scratch_folder
 from armscan.storage.recording import is_recording, read_recording
+from armscan.storage.recording_session import has_band
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording, record_folder
-from armscan.storage.recordings.write_mcap import has_band
 
 SUFFIX = ".mcap"
 

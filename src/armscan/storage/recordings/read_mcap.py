@@ -46,13 +46,19 @@ from armscan.storage.recording_session import (
     EXPOSURES_FILE,
     SESSION_FILE,
     exposure_columns,
+    has_band,
     is_inside,
     session_toml,
 )
 from armscan.storage.recordings.mcap_folder import (
+    ARM_TOPIC,
     CAMERA_TOPICS,
     DAMAGE,
+    DOCUMENT_TOPIC,
+    EVENT_TOPIC,
     EVENTS_FILE,
+    EXPOSURE_TOPIC,
+    NS_PER_S,
     RECOVER_REMEDY,
     TABLES,
     Damage,
@@ -65,17 +71,7 @@ from armscan.storage.recordings.mcap_folder import (
     read_summary,
     stored_image,
 )
-from armscan.storage.recordings.write_mcap import (
-    ARM_TOPIC,
-    DOCUMENT_TOPIC,
-    EVENT_TOPIC,
-    EXPOSURE_TOPIC,
-    NS_PER_S,
-    RecordingWriter,
-    WriterOptions,
-    WriterStatus,
-    has_band,
-)
+from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions, WriterStatus
 from armscan.storage.tables import read_csv
 
 ARM_BATCH = 1000

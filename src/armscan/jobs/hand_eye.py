@@ -363,7 +363,7 @@ def calibrate_latency(
             where=str(scan),
             remedy=f"record the arm's poses in {ARM_FILE}",
         )
-    is_shared = recording.session.clock == "shared"
+    is_shared = recording.session.clock != "separate"
     measure = MeasureOptions(stripes=stripe_options)
     looks = observe_plate(recording, before.sensor, measure, progress=job.progress)
     fit = solved(

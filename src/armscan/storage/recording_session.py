@@ -162,6 +162,8 @@ EXPOSURES_FILE = "exposures.csv"
 MOST_CAMERAS = 100
 REQUIRED = ("index", "t_ns", "camera", "file", "lasers")
 OPTIONAL = ("trigger_id", "view")
+FLAGS = "flags"
+"""Marks that a live recording gives its exposures, joined by +; kept, and read by nobody."""
 DRIVE = re.compile(r"[A-Za-z]:")
 
 Columns = Mapping[str, tuple[str, ...]]

@@ -7,7 +7,14 @@ from pathlib import Path
 
 from armscan.errors import OptionError, OutputError
 from armscan.report.quantity import Quantity, Summary
-from armscan.storage.files import check_outputs, is_folder, scratch_folder
+from armscan.storage.clouds import CLOUD_SUFFIXES
+from armscan.storage.files import (
+    check_outputs,
+    is_folder,
+    packed_notes,
+    path_text,
+    scratch_folder,
+)
 from armscan.storage.recording import is_recording, read_recording
 from armscan.storage.recording_session import has_band
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording, record_folder
@@ -44,6 +51,7 @@ def convert_recording(
             where="--stripe-band",
             remedy=f"end the new name in {SUFFIX}, or leave it out",
         )
+    _refuse_points(output, source)
     if source.suffix.lower() == SUFFIX and output.suffix.lower() != SUFFIX:
         return _summary("Converted: recording to a folder.", extract_recording(source, output),
                         output)  # fmt: skip
@@ -62,6 +70,7 @@ def convert_recording(
     )
     return Summary(
         title="Converted: recording to one file.",
+        warnings=packed_notes(source),
         quantities=(
             Quantity("exposures", "exposures", status.n_written),
             *((Quantity("with_band", "of these as a band", n_banded),) if is_stripe_band else ()),
@@ -83,6 +92,7 @@ def recover_recording(source: Path, output: Path, *, is_overwriting: bool = Fals
         If the output exists or cannot be written.
     """
     title = "Recovered."
+    _refuse_points(output, source)
     if output.exists() and output.samefile(source):
         raise OutputError(
             "this is the damaged file itself", where=f"-o {output}", remedy="name another file"
@@ -97,13 +107,18 @@ def recover_recording(source: Path, output: Path, *, is_overwriting: bool = Fals
     return _summary(title, found, output)
 
 
+def _refuse_points(output: Path, source: Path) -> None:
+    """Raise if a recording is to become a cloud: it holds images."""
+    if output.suffix.lower() in CLOUD_SUFFIXES:
+        raise OptionError(
+            f"'{output.name}' is the name of a cloud, and a recording holds images",
+            where=path_text(source),
+            remedy=f"measure its points: armscan reconstruct {source} --scanner scanner.json "
+            f"-o {output}",
+        )
+
+
 def _summary(title: str, found: ReadBack, output: Path) -> Summary:
-    aside = (
-        (f"{found.n_aside} exposures or samples were set aside: parts or times of them "
-         "are missing, times or numbers repeat or go back, or names cannot be used",)
-        if found.n_aside
-        else ()
-    )  # fmt: skip
     is_file = output.suffix.lower() == SUFFIX
     return Summary(
         title=title,
@@ -115,7 +130,7 @@ def _summary(title: str, found: ReadBack, output: Path) -> Summary:
             Quantity("lost_exposures", "lost exposures", found.n_lost),
             Quantity("seconds", "duration", found.seconds, unit="s"),
         ),
-        warnings=(*(f"lost: {text}" for text in found.lost), *aside, *found.warnings),
+        warnings=(*(f"lost: {text}" for text in found.lost), *found.aside, *found.warnings),
         written=(output,),
         next_step=f"armscan convert {output} FOLDER" if is_file else f"armscan info {output}",
         extra={"kind": "recording", "lost": list(found.lost)},

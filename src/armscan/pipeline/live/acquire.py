@@ -37,6 +37,9 @@ MOST_AHEAD = 16
 LATEST_NS = 100_000_000
 """An instant that waited for longer gives way to newer ones with other lasers."""
 
+RECORDER, MATCHING, MEASURING = OWN_PARTS = ("recorder", "matching", "measuring")
+"""Named in events in the place of a device."""
+
 EventKind = Literal["state", "pass", "fault", "recovered", "button", "warning", "setting"]
 
 
@@ -51,7 +54,7 @@ class LiveEvent:
     text
         In words.
     device
-        Name of the device that it concerns; empty for none.
+        Name of the device, or of one of `OWN_PARTS`, that it concerns; empty for none.
     """
 
     kind: EventKind
@@ -279,7 +282,7 @@ class Acquisition:
                 self._arrived.put((what, k, found), timeout=READ_S)
             except queue.Full:
                 if not is_told:
-                    self._tell(LiveEvent("warning", BEHIND, "recorder"))
+                    self._tell(LiveEvent("warning", BEHIND, RECORDER))
                 is_told = True
             else:
                 return
@@ -291,7 +294,7 @@ class Acquisition:
         except Exception as error:  # any fault of it must not hang those that wait
             self._is_broken.set()
             text = f"the images are no longer matched: {type(error).__name__}: {error}"
-            self._tell(LiveEvent("fault", text))
+            self._tell(LiveEvent("fault", text, MATCHING))
 
     def _match_all(self) -> None:
         readers = self._threads[:-1] if self._threads else []
@@ -358,7 +361,7 @@ class Acquisition:
                 if self._recording is recording:
                     self._recording = None
                 fact = error if isinstance(error, ArmscanError) else repr(error)
-                self._tell(LiveEvent("warning", f"the recording ended: {fact}", "recorder"))
+                self._tell(LiveEvent("warning", f"the recording ended: {fact}", RECORDER))
 
     def _press(self, samples: tuple[ArmSample, ...]) -> None:
         for sample in samples:

@@ -23,6 +23,7 @@ from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.instants import Instant, InstantImages
 from armscan.pipeline.live.acquire import (
+    MEASURING,
     Acquisition,
     LiveEvent,
     Recorder,
@@ -594,7 +595,7 @@ class LiveSession:
         self._count(LiveStatus.FAILED)
         is_new, self._told = fact != self._told, fact
         if is_new:
-            self._tell(LiveEvent("warning", text))
+            self._tell(LiveEvent("warning", text, MEASURING))
 
     def _place(
         self, one: MeasuredInstant, waiting: WaitingInstant, transform: BaseTransform

@@ -8,7 +8,7 @@ import re
 import struct
 import threading
 import zlib
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -63,8 +63,14 @@ MOST_RECORD_BYTES, MOST_OTHER_BYTES = 1 << 31, 1 << 28
 LONGEST_NAME = 4
 """Of a compression: zstd."""
 MOST_OPCODE = 15
-ASIDE_FLAGS = frozenset({"incomplete", "no-time", "back"})
-"""A frame that lacks parts, or has no time or one that goes back: in the file, used by none."""
+ASIDE_FLAGS = {
+    "incomplete": "lack parts",
+    "no-time": "have no time that is known",
+    "back": "have a time that goes back",
+    "late": "came after newer ones",
+}
+"""Why a frame is in the file and used by none."""
+REPEATED = "repeat or go back"
 NS_PER_S = 1_000_000_000
 UNKNOWN_SIZE = zstandard.CONTENTSIZE_UNKNOWN
 LISTED_KINDS = frozenset({EXPOSURE_TOPIC, ARM_TOPIC, EVENT_TOPIC})
@@ -116,15 +122,17 @@ class FileSummary:
 class RecordedTables:
     """The tables of a recording as its messages are read, one after the other.
 
-    ``exposures``, ``samples``: their lines. ``events``: as they were recorded. ``n_aside``: lines
-    that the tables' parsers would refuse.
+    ``exposures``, ``samples``: their lines. ``events``: as they were recorded. ``aside``: counts of
+    exposures that no table lists, by reason. ``n_samples_aside``: samples that the table's parser
+    would refuse.
     """
 
     exposures: list[dict[str, str]] = field(default_factory=list)
     samples: list[dict[str, str]] = field(default_factory=list)
     events: list[bytes] = field(default_factory=list)
     times: list[int] = field(default_factory=list)
-    n_aside: int = 0
+    aside: Counter[str] = field(default_factory=Counter)
+    n_samples_aside: int = 0
     latest: dict[str, int] = field(default_factory=dict)
     ids: set[tuple[str, str]] = field(default_factory=set)
     checksums: dict[str, int] = field(default_factory=dict)
@@ -149,15 +157,16 @@ class RecordedTables:
         keys = [("index", cells["index"])]
         if cells.get("trigger_id"):
             keys.append((f"trigger of camera {said['camera']}", cells["trigger_id"]))
+        fault = next((text for flag, text in ASIDE_FLAGS.items() if flag in said["flags"]), "")
         is_usable = (
-            ASIDE_FLAGS.isdisjoint(said["flags"])
+            not fault
             and is_inside(name)
             and name not in OWN_NAMES
             and 0 <= said["camera"] < MOST_CAMERAS
             and self.checksums.get(name, facts["crc32"]) == facts["crc32"]
         )
         if not (is_usable and self._is_next(f"camera {said['camera']}", said["t_ns"], keys)):
-            self.n_aside += 1
+            self.aside[fault or REPEATED] += 1
             return None
         self.checksums[name] = facts["crc32"]
         if said["flags"]:
@@ -171,7 +180,21 @@ class RecordedTables:
         if self._is_next("arm", int(cells["t_ns"]), [("arm", number)] if number else []):
             self.samples.append(cells)
         else:
-            self.n_aside += 1
+            self.n_samples_aside += 1
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the file holds and the tables do not, in words."""
+        found = []
+        if self.aside:
+            why = ", ".join(f"{n} {text}" for text, n in self.aside.items())
+            found.append((self.aside.total(), len(self.exposures), "exposures", why))
+        if n := self.n_samples_aside:
+            found.append((n, len(self.samples), "samples of the arm", f"{n} {REPEATED}"))
+        return tuple(
+            f"{n} of {n + n_used} {what} in the file are set aside: {why}"
+            for n, n_used, what, why in found
+        )
 
     def _is_next(self, source: str, t_ns: int, ids: list[tuple[str, str]]) -> bool:
         """False for what the tables' parsers refuse."""
@@ -515,6 +538,11 @@ class McapFolder:
     ------
     FileFormatError
         If it is no recording of armscan, unfinished or damaged.
+
+    Attributes
+    ----------
+    notes
+        What is set aside in it, in words.
     """
 
     def __init__(self, path: Path) -> None:
@@ -523,6 +551,7 @@ class McapFolder:
         self._kept: OrderedDict[int, bytes] = OrderedDict()
         self._lock = threading.Lock()
         self._images: dict[str, _ImagePlace] = {}
+        self.notes: tuple[str, ...] = ()
         try:
             with opened(path) as file:
                 self._files = self._read_files(file)
@@ -619,6 +648,7 @@ class McapFolder:
                     self._images[name] = _ImagePlace(chunk, offset, message.number, said)
         if n_exposures != self._summary.n_exposures:
             raise ValueError(f"{n_exposures} exposures of {self._summary.n_exposures} are there")
+        self.notes = tables.notes
         return files | tables.contents()
 
 

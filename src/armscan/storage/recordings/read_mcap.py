@@ -95,6 +95,8 @@ class ReadBack:
         Exposures that were recorded and are not whole.
     seconds
         From the first exposure to the last.
+    aside
+        What was set aside and why, in words.
     lost
         What the file does not give any more, in words; empty for nothing.
     warnings
@@ -107,6 +109,7 @@ class ReadBack:
     n_aside: int = 0
     n_lost: int = 0
     seconds: float = 0.0
+    aside: tuple[str, ...] = ()
     lost: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -168,7 +171,8 @@ class _Folder:
             n_exposures=len(tables.exposures),
             n_samples=len(tables.samples),
             n_events=len(tables.events),
-            n_aside=tables.n_aside,
+            n_aside=tables.aside.total() + tables.n_samples_aside,
+            aside=tables.notes,
             n_lost=self.n_lost(n_stated),
             seconds=1e-9 * (max(times) - min(times)) if times else 0.0,
             lost=self._lost(n_stated),
@@ -359,7 +363,7 @@ def _stored(
 
 def _span(arm: ArmTrack, rows: Sequence[ExposureRow], session: Session) -> slice:
     """Samples a second before to a second after exposures; all where the clocks differ."""
-    if session.clock != "shared":
+    if session.clock == "separate":
         return slice(None)
     times = [row.t_ns for row in rows]
     low, high = min(times) - NS_PER_S, max(times) + NS_PER_S

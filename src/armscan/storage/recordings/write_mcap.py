@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live recording written to one MCAP file by a thread of its own and packed by another; a killed
-run loses at most what was still waiting and the open chunks.
-"""
+"""A live recording written to one MCAP file by a thread of its own, whole but for what waits."""
 
 from __future__ import annotations
 
@@ -442,7 +440,7 @@ class RecordingWriter:
         except BaseException as error:  # nobody else sees what a thread raises
             self._stop(error)
         finally:
-            self._packing.shutdown(wait=False, cancel_futures=True)
+            self._packing.shutdown(cancel_futures=True)
 
     def _fill_chunks(self) -> None:
         """Fill chunks, close them when they are full or old, write them."""

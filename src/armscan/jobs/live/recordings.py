@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings from a folder to one file and back, and what is whole of a broken file."""
+"""Recordings from a folder to one file and back, what is whole of a broken file, and which there
+are in a folder.
+"""
 
 from __future__ import annotations
 
+from hashlib import sha256
 from pathlib import Path
 
-from armscan.errors import OptionError, OutputError
+from armscan.errors import FileFormatError, OptionError, OutputError
 from armscan.report.quantity import Quantity, Summary
 from armscan.storage.clouds import CLOUD_SUFFIXES
 from armscan.storage.files import (
@@ -13,13 +16,51 @@ from armscan.storage.files import (
     is_folder,
     packed_notes,
     path_text,
+    read_bytes,
     scratch_folder,
 )
-from armscan.storage.recording import is_recording, read_recording
-from armscan.storage.recording_session import has_band
+from armscan.storage.image_paths import IMAGE_SUFFIXES
+from armscan.storage.recording import is_recording, read_recording, recording_tables
+from armscan.storage.recording_session import EXPOSURES_FILE, has_band
+from armscan.storage.recordings.mcap_folder import read_summary
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording, record_folder
 
 SUFFIX = ".mcap"
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    """Recordings in a folder that is none itself and holds no images, by name."""
+    if not is_folder(folder) or is_recording(folder):
+        return []
+    there = sorted(folder.iterdir())
+    if any(path.suffix.lower() in IMAGE_SUFFIXES for path in there):
+        return []
+    return [path for path in there if is_recording(path)]
+
+
+def count_exposures(recording: Path) -> int:
+    """Exposures that a recording lists, without a look at them; 0 if it cannot be read."""
+    try:
+        if not is_folder(recording):
+            return read_summary(recording).n_exposures
+        lines = read_bytes(recording / EXPOSURES_FILE).splitlines()
+    except FileFormatError:
+        return 0
+    return max(sum(bool(line) and not line.startswith(b"#") for line in lines) - 1, 0)
+
+
+def recording_mark(recording: Path, given: str) -> str:
+    """Hash of what a result follows from: a recording's tables, or its file's size and time, and
+    what else was ``given``.
+    """
+    mark = sha256(given.encode())
+    if is_folder(recording):
+        for path in recording_tables(recording):
+            mark.update(path.name.encode() + read_bytes(path))
+    else:
+        facts = recording.stat()
+        mark.update(f"{facts.st_size} {facts.st_mtime_ns}".encode())
+    return mark.hexdigest()
 
 
 def convert_recording(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -97,7 +98,13 @@ def test_after_an_interrupt_what_is_done_is_not_done_again(
     week: Path, run: Run, measured: list[str]
 ) -> None:
     measured.append("interrupted")
-    assert run()[0] == 130
+    with pytest.MonkeyPatch.context() as patch:
+        said: list[str] = []
+        patch.setattr("armscan.cli.reconstruct.typer.echo", lambda line, **_: said.append(line))
+        assert run()[0] == 130
+    told_first, told_last = (line for line in said if " of 3 " in line)
+    assert re.fullmatch(r"1 of 3  a: done  \([\d.]+ exposures/s, [\d.]+ min left\)", told_first)
+    assert told_last == "1 of 3 were made; the same command goes on"
     code, told = run()
     assert code == 2 and measured == ["b", "c"]
     assert told["scans"]["a"]["is_old"] and "is_old" not in told["scans"]["b"]

@@ -195,7 +195,7 @@ class BatchItem:
     mark
         Hash of all that the result follows from.
     n_steps
-        Steps of its work, as its progress counts them.
+        Exposures that it is made of.
     work
         Makes it, as a job of its own.
     """
@@ -258,16 +258,23 @@ class Batch:
         for item in items:
             if item not in waiting:
                 found[item.name] = {**self._ledger[item.name], "is_old": True}
-        total, start = sum(item.n_steps for item in waiting), time.monotonic()
+        total, made = sum(item.n_steps for item in waiting), (0, 0.0)
         for k, item in enumerate(waiting):
-            found[item.name] = entry = self._result(item, total)
+            try:
+                found[item.name] = entry = self._result(item, total)
+            except KeyboardInterrupt:
+                self._tell(f"{k} of {len(waiting)} were made; the same command goes on")
+                raise
             self._n_before += item.n_steps
             self._write(item.name, {**entry, "mark": item.mark})
-            seconds = time.monotonic() - start
-            rate = self._n_before / max(seconds, 1e-3)
-            left = f"{rate:.1f}/s, {(total - self._n_before) / max(rate, 1e-3) / 60.0:.1f} min left"
             what = f"failed: {entry['failed']}" if "failed" in entry else "done"
-            self._tell(f"{k + 1} of {len(waiting)}  {item.name}: {what}  ({left})")
+            if "seconds" in entry:
+                made = made[0] + item.n_steps, made[1] + entry["seconds"]
+            rest = total - self._n_before
+            if rest and made[0]:
+                minutes = rest * made[1] / made[0] / 60.0
+                what += f"  ({made[0] / made[1]:.1f} exposures/s, {minutes:.1f} min left)"
+            self._tell(f"{k + 1} of {len(waiting)}  {item.name}: {what}")
         return found
 
     def _open(self) -> None:

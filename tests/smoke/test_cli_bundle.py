@@ -14,6 +14,7 @@ from armscan.jobs.live import bundle
 from armscan.jobs.live.bundle import without_secrets
 from armscan.storage.documents import read_camera_calibration
 from armscan.storage.recording import read_recording
+from armscan.storage.recordings.read_mcap import record_folder
 from rigs.drawn_bench import Bench
 from rigs.recording_folders import lab_folder
 
@@ -82,6 +83,26 @@ def test_a_bundle_says_what_is_inside_and_keeps_secrets(
     assert "the file exists" in capsys.readouterr().err
     assert main(["doctor", "--with", str(log)]) == 2
     assert main(["doctor", "--bundle", str(tmp_path / "q.tar")]) == 2
+
+
+def test_a_recording_that_cannot_be_read_goes_in_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, place = tmp_path / "whole.mcap", tmp_path / "q.zip"
+    record_folder(lab_folder(tmp_path / "scan"), whole)
+    broken = tmp_path / "killed.mcap"
+    broken.write_bytes(whole.read_bytes()[:-30])
+    words = ["doctor", "--bundle", str(place), "--with", str(broken), "--json", "--force"]
+    assert main(words) == 0
+    said = json.loads(capsys.readouterr().out)
+    with zipfile.ZipFile(place) as archive:
+        assert archive.read("killed.mcap") == broken.read_bytes()
+        listed = archive.read("README.txt").decode()
+    assert said["warnings"] == [] and "it cannot be read (the recording is unfinished" in listed
+    monkeypatch.setattr(bundle, "MOST_BYTES", 1000)
+    assert main(words) == 0
+    with zipfile.ZipFile(place) as archive:
+        assert archive.read("killed.mcap") == broken.read_bytes()[:1000]
 
 
 def test_doctor_tells_of_drivers(capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from armscan.cli.run import main
 from armscan.storage.clouds import read_ply
-from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.documents import observations_of, read_scanner_calibration
 from rigs.drawn_arm import LATENCY_NS, PLANE, draw_bounce, draw_postures
 from rigs.drawn_bench import Bench
 
@@ -59,6 +59,8 @@ def test_the_latency_is_found_and_used(
     assert after.latency_sigma_ns == data["latency_sigma_ns"]
     assert after.provenance.parent_ids == (before.provenance.document_id,)
     assert output.with_suffix(".html").stat().st_size > 10_000
+    # what the hand-eye rests on goes with the new document
+    assert observations_of(output).read_bytes() == observations_of(scanner).read_bytes()
     flat = []
     for document in (scanner, output):
         cloud = tmp_path / f"cloud-{document.stem}.ply"

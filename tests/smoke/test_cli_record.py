@@ -11,12 +11,14 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from armscan.cli import main
 from armscan.errors import DeviceError, OutputError
-from armscan.jobs.live.record import RecordRequest, record_scan
+from armscan.jobs.live.record import RecordRequest, _Recording, record_scan
+from armscan.pipeline.live.acquire import MATCHING, LiveEvent
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.storage.recordings.write_mcap import RecordingWriter
@@ -92,7 +94,7 @@ def test_a_full_disk_ends_it_and_says_what_is_safe(
     output = rig.parent / "scan.mcap"
     told: list[str] = []
     with pytest.raises(DeviceError, match="no space"):
-        record_scan(RecordRequest(rig, seconds=60.0), output, told.append)
+        record_scan(RecordRequest(str(rig), seconds=60.0), output, told.append)
     assert any("no space" in line for line in told)
     assert extract_recording(output, rig.parent / "scan").n_exposures == 5
 
@@ -130,7 +132,7 @@ def test_what_arrives_and_cannot_be_matched_is_no_success(
     monkeypatch.setattr(RecordingWriter, "add_exposure", broken)
     output = rig.parent / "scan.mcap"
     assert main(["record", str(rig), "--seconds", "60", "-o", str(output)]) == 2
-    assert "no longer matched" in capsys.readouterr().err
+    assert "the recording ended: ValueError" in capsys.readouterr().err
     assert extract_recording(output, rig.parent / "scan").n_exposures == 5
 
 
@@ -141,7 +143,12 @@ def test_what_arrives_and_cannot_be_matched_is_no_success(
         (["--camera", "webcam:0", "-o", "x.ply"], "end it in .mcap"),
         (["nothing.toml"], "no such file"),
         (["--camera", "twin:none", "-o", "x.mcap"], "no simulated head"),
-        (["--camera", "webcam:0", "--seconds", "-1"], "negative"),
+        (["--camera", "webcam:0", "--seconds", "-1"], "--seconds"),
+        (["--camera", "webcam:0", "--seconds", "nan"], "--seconds: nan"),
+        (["--camera", "webcam:0", "--seconds", "inf"], "--seconds: inf"),
+        (["--camera", "webcam:0", "--exposures", "0"], "--exposures: 0"),
+        (["--camera", "webcam:0", "--rate", "nan"], "--rate: nan"),
+        (["twin:none", "-o", "x.mcap"], "no simulated head"),
     ],
 )
 def test_what_cannot_be_recorded_is_refused(
@@ -149,6 +156,46 @@ def test_what_cannot_be_recorded_is_refused(
 ) -> None:
     assert main(["record", *given]) == 2
     assert words in capsys.readouterr().err
+
+
+def test_options_beside_a_description_count(rig: Path) -> None:
+    rig.write_text(RIG.replace("is_common_trigger = true\n", ""))
+    asked = RecordRequest(str(rig), rate_hz=12.5, is_common_trigger=True).description()
+    assert (asked.rate_hz, asked.is_common_trigger) == (12.5, True)
+    as_it_is = RecordRequest(str(rig)).description()
+    assert (as_it_is.rate_hz, as_it_is.is_common_trigger) == (25.0, False)
+
+
+@pytest.mark.parametrize(
+    ("address", "cameras", "is_common"),
+    [
+        ("twin:thesis-single?seed=1", ("twin:thesis-single?seed=1",), True),
+        ("twin:thesis-multi", ("twin:thesis-multi", "twin:thesis-multi?camera=1"), True),
+        ("twin:thesis-single?wired=0", ("twin:thesis-single?wired=0",), False),
+    ],
+)
+def test_an_address_of_the_simulator_is_a_rig(
+    address: str, cameras: tuple[str, ...], is_common: bool
+) -> None:
+    found = RecordRequest(address).description()
+    assert found.cameras == cameras and found.is_common_trigger == is_common
+    assert found.arm == found.lasers == address
+
+
+def test_a_stripe_band_is_recorded_and_said(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = rig.parent / "scan.mcap"
+    words = ["record", str(rig), "--exposures", "4", "--stripe-band", "-o", str(output)]
+    assert main(words) == 0
+    assert read_recording(output).session.is_stripe_band
+
+
+def test_faults_of_this_program_are_no_device_s() -> None:
+    run: Any = _Recording.__new__(_Recording)
+    run._n_faults, run._last_fault, run._tell = 0, "", lambda _: None
+    run._hear(LiveEvent("fault", "the images are no longer matched", MATCHING))
+    assert run._n_faults == 0 and "no longer matched" in run._last_fault
+    run._hear(LiveEvent("fault", "unplugged", "camera 0"))
+    assert run._n_faults == 1
 
 
 @pytest.mark.parametrize(

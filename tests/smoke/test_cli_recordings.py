@@ -56,6 +56,15 @@ def test_a_simulated_file_is_the_simulated_folder(
     assert main(["simulate", "thesis-single", "probing", "-o", str(tmp_path / "touches.mcap")]) == 2
     assert "name a folder" in capsys.readouterr().err
     assert not (tmp_path / "touches.mcap").exists()
+    for command in (["convert"], ["recover", "-o"]):
+        cloud = tmp_path / "scan.ply"
+        words = [*command, str(cloud), str(tmp_path / "b/scan.mcap")]
+        if command == ["convert"]:
+            words[1:] = words[:0:-1]
+        assert main(words) == 2
+        said = capsys.readouterr().err
+        assert "holds images" in said and "armscan reconstruct" in said
+        assert not cloud.exists()
 
 
 @pytest.mark.parametrize(

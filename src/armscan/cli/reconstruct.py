@@ -26,6 +26,7 @@ from armscan.cli.options import (
     run,
 )
 
+EXIT_INPUT = 2
 OF_IMAGES = (
     "background right right_background sheet depth_margin arm "
     "method stripe_method laser_colour bits_used bits_align cache profile cluster"
@@ -37,6 +38,7 @@ RECONSTRUCT_EXAMPLE = (
     "      --sheet A -o cloud.ply\n"
     "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply\n"
     "  armscan reconstruct scan --scanner scanner.json --voxel 0.2 -o thin.ply\n"
+    "  armscan reconstruct week --scanner scanner.json -o clouds\n"
     "  armscan reconstruct 'p*.yml' --poses RobPoses.rob --scanner scanner.json -o cloud.ply"
 )
 FUSE_EXAMPLE = "\b\nExample:\n  armscan fuse monday.ply tuesday.ply --voxel 0.2 -o fused.ply"
@@ -63,7 +65,8 @@ ProfilePoses = Annotated[
 Images = Annotated[
     list[str],
     typer.Argument(
-        help="A recording, folder or .mcap; or images with the laser on: files, folders, patterns.",
+        help="A recording, folder or .mcap; a folder of recordings; or images with the laser on: "
+        "files, folders, patterns.",
         show_default=False,
     ),
 ]
@@ -123,7 +126,10 @@ def reconstruct(
     poses: ProfilePoses = None,
     euler: EulerAngles = None,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Cloud to write: .ply, or as `convert`.")
+        Path,
+        typer.Option(
+            "-o", "--output", help="Cloud to write: .ply, or as `convert`; a folder for many."
+        ),
     ] = Path("cloud.ply"),
     method: MethodOption = None,
     stripe_method: StripeMethodOption = None,
@@ -153,7 +159,7 @@ def reconstruct(
         sheet=sheet,
         is_by_thesis=method is Method.THESIS,
     )
-    run(
+    summary = run(
         lambda job: reconstruct_points(
             job,
             sensor,
@@ -166,12 +172,15 @@ def reconstruct(
             is_profiled=profile,
             cluster=None if cluster is None else ClusterAddress(cluster),
             voxel_mm=voxel,
+            tell=lambda line: typer.echo(line, err=True),
         ),
         as_json=as_json,
         output=output,
         force=force,
         cache=cache,
     )
+    if summary.extra.get("n_failed"):
+        raise typer.Exit(EXIT_INPUT)
 
 
 def fuse(

@@ -26,12 +26,12 @@ T = TypeVar("T")
 
 PATIENCE_NS = 500_000_000
 """An instant waits so long after its last frame for what belongs to it, then goes without."""
-TRACK_NS = 10_000_000_000
-"""Samples of the arm are kept so long."""
+TRACK_NS = 60_000_000_000
+"""Samples of the arm are kept so long: frames lie behind where a disk keeps all waiting."""
 USUAL_STEPS = 256
 """The arm's usual step is the median of its last ones."""
-REMEMBERED_TRIGGERS = 4096
-"""Frames may lie behind by so many triggers, where a disk keeps the recording waiting."""
+REMEMBERED_NS = TRACK_NS
+"""And what was told of a trigger."""
 LASER_BOUND_NS = 50_000_000
 """Without trigger ids a frame may be so much later than its laser event: transport delays differ.
 Its lasers are known only if all events that near agree."""
@@ -219,7 +219,7 @@ class InstantMatcher:
         Parameters
         ----------
         now_ns
-            Time now by this computer's monotonic clock.
+            All that arrived before this time, by this computer's monotonic clock, was added.
         """
         done: list[MatchedInstant] = []
         while self._open:
@@ -417,8 +417,9 @@ def _common_ns(monitor: StreamMonitor, t_device_ns: int) -> int | None:
 
 def _remember(of_trigger: dict[int, _Told[T]], trigger_id: int, value: _Told[T]) -> None:
     """Keep the last triggers only; a count that began anew forgets the old ones."""
+    # by arrival: a device's own clock may jump
     if of_trigger and trigger_id < next(reversed(of_trigger)):
         of_trigger.clear()
     of_trigger[trigger_id] = value
-    if len(of_trigger) > REMEMBERED_TRIGGERS:
-        del of_trigger[next(iter(of_trigger))]
+    while of_trigger[first := next(iter(of_trigger))].t_host_ns < value.t_host_ns - REMEMBERED_NS:
+        del of_trigger[first]

@@ -24,7 +24,7 @@ from armscan.calibration.hand_eye.probed_plate import (
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.latency import calibrate_latency as fit_latency
-from armscan.errors import InputError, OptionError
+from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool
@@ -56,10 +56,12 @@ from armscan.report.photographs import MAX_PICTURES, TriedImage, evenly_chosen, 
 from armscan.report.quantity import Summary, Table, fact, sentences, significant
 from armscan.storage.arm import ARM_FILE, read_arm_model
 from armscan.storage.documents import (
+    observations_of,
     read_scanner_calibration,
     read_sensor_calibration,
     scanner_document,
 )
+from armscan.storage.files import read_bytes
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.observations import pack_posed_stripes
 from armscan.storage.points import (
@@ -349,7 +351,7 @@ def calibrate_latency(
         If a file is unreadable, or the motion does not tell the time; nothing is written then.
     """
     stripe_options = stripe_options or StripeOptions()
-    places = job.places(".json", beside=(".html",))
+    places = job.places(".json", beside=(".npz", ".html"))
     before = read_scanner_calibration(scanner)
     if before.sensor is None:
         raise InputError(
@@ -364,7 +366,7 @@ def calibrate_latency(
             where=str(scan),
             remedy=f"record the arm's poses in {ARM_FILE}",
         )
-    is_shared = recording.session.clock == "shared"
+    is_shared = recording.session.clock != "separate"
     measure = MeasureOptions(stripes=stripe_options)
     looks = observe_plate(recording, before.sensor, measure, progress=job.progress)
     fit = solved(
@@ -390,8 +392,11 @@ def calibrate_latency(
             latency_sigma_ns=fit.sigma_ns,
         )
         page = latency_page(fit, provenance, warnings=odd, is_simulated=is_simulated)
-        contents = (scanner_document(timed), page)
-        written = job.write(dict(zip(places, contents, strict=True)))
+        # the hand-eye's own evidence goes with it
+        data = _evidence(scanner)
+        beside = None if data is None else (places[1].name, data)
+        kept = {} if data is None else {places[1]: data}
+        written = job.write({places[0]: scanner_document(timed, beside), **kept, places[2]: page})
     done = "Latency calibrated" if written else "Clocks of this recording compared"
     return Summary(
         title=done + (" from simulated images." if is_simulated else "."),
@@ -404,6 +409,14 @@ def calibrate_latency(
         extra={"kind": "latency calibration", "simulated": is_simulated},
         forced=provenance.forced,
     )
+
+
+def _evidence(document: Path) -> bytes | None:
+    """Observations that a document was solved from; None where it has none any more."""
+    try:
+        return read_bytes(observations_of(document))
+    except FileFormatError:
+        return None
 
 
 def _beside_thesis(

@@ -8,25 +8,28 @@ document, and the next run that writes a document removes it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from armscan.errors import EstimationError, OptionError, OutputError
+from armscan.errors import ArmscanError, EstimationError, OptionError, OutputError
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.title_block import TitleBlock, calibration_state
 from armscan.models.calibration import Provenance
-from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.cloud import PointCloud
 from armscan.report.inspection.delivery import Delivery, delivery_of, pdf_bytes, require_pdf
 from armscan.report.page import Page, render_page
-from armscan.report.quantity import sentences
+from armscan.report.quantity import Summary, sentences, summary_json
+from armscan.storage.codec import parse_json
 from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.documents import new_provenance
-from armscan.storage.files import Content, check_outputs, write_files
+from armscan.storage.files import Content, check_outputs, read_bytes, write_files
 
 T = TypeVar("T")
 
@@ -175,6 +178,167 @@ class Job:
         """Refuse a result that is there and makes no sense, unless it is forced."""
         if reasons and not self.is_forced:
             self.refuse(replace(page, forced=()), FitFailure("; ".join(reasons), FORCE_REMEDY))
+
+
+LEDGER = "batch.json"
+LedgerEntry = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class BatchItem:
+    """One of many results in one folder.
+
+    Parameters
+    ----------
+    name
+        Of the result, without suffix.
+    mark
+        Hash of all that the result follows from.
+    n_steps
+        Exposures that it is made of.
+    work
+        Makes it, as a job of its own.
+    """
+
+    name: str
+    mark: str
+    n_steps: int
+    work: Callable[[Job], Summary]
+
+
+class Batch:
+    """Many results in one folder: what is done is not done again, a failure ends no other.
+
+    ``batch.json`` in the folder says of each result which inputs it follows from and how large it
+    is. A result that stands there with other inputs is not replaced unless the job may overwrite.
+
+    Parameters
+    ----------
+    job
+        Its output is the folder.
+    suffix
+        Of each document.
+    tell
+        Told a line when a result is there or failed.
+
+    Attributes
+    ----------
+    folder
+        Where the results are.
+    """
+
+    def __init__(self, job: Job, suffix: str, tell: Callable[[str], None]) -> None:
+        if job.output is None or job.output.suffix:
+            raise OptionError(
+                "the results of several scans go into a folder",
+                where=f"-o {job.output}",
+                remedy="name a folder, without a dot in its name: -o clouds",
+            )
+        self._job, self.folder = job, job.output
+        self._suffix, self._tell = suffix, tell
+        self._ledger: dict[str, LedgerEntry] = {}
+        self._n_before = 0
+
+    def run(self, items: Sequence[BatchItem]) -> dict[str, LedgerEntry]:
+        """Make what is not there yet; what is known of each result, by name.
+
+        An entry has ``failed``, the reason, or ``seconds`` and ``data``, the result's own; and
+        ``is_old`` where it was there before.
+
+        Raises
+        ------
+        OutputError
+            If the folder or a file in it cannot be written: no other result could be.
+        OptionError
+            If the work of all was asked for wrongly, or the cluster was lost.
+        """
+        self._open()
+        found: dict[str, LedgerEntry] = {}
+        waiting = [one for one in items if not self._is_done(one)]
+        for item in items:
+            if item not in waiting:
+                found[item.name] = {**self._ledger[item.name], "is_old": True}
+        total, made = sum(item.n_steps for item in waiting), (0, 0.0)
+        for k, item in enumerate(waiting):
+            try:
+                found[item.name] = entry = self._result(item, total)
+            except KeyboardInterrupt:
+                self._tell(f"{k} of {len(waiting)} were made; the same command goes on")
+                raise
+            self._n_before += item.n_steps
+            self._write(item.name, {**entry, "mark": item.mark})
+            what = f"failed: {entry['failed']}" if "failed" in entry else "done"
+            if "seconds" in entry:
+                made = made[0] + item.n_steps, made[1] + entry["seconds"]
+            rest = total - self._n_before
+            if rest and made[0]:
+                minutes = rest * made[1] / made[0] / 60.0
+                what += f"  ({made[0] / made[1]:.1f} exposures/s, {minutes:.1f} min left)"
+            self._tell(f"{k + 1} of {len(waiting)}  {item.name}: {what}")
+        return found
+
+    def _open(self) -> None:
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"the folder cannot be made ({error.strerror})",
+                where=str(self.folder),
+                remedy="name another one",
+            ) from error
+        place = self.folder / LEDGER
+        if place.exists():
+            self._ledger = parse_json(read_bytes(place), str(place)).get("results", {})
+
+    def _place(self, name: str) -> Path:
+        return self.folder / f"{name}{self._suffix}"
+
+    def _is_done(self, item: BatchItem) -> bool:
+        entry, place = self._ledger.get(item.name, {}), self._place(item.name)
+        if entry.get("mark") != item.mark or "data" not in entry or not place.is_file():
+            return False
+        return bool(place.stat().st_size == entry.get("bytes"))
+
+    def _result(self, item: BatchItem, total: int) -> LedgerEntry:
+        place = self._place(item.name)
+        is_own = self._ledger.get(item.name, {}).get("mark") == item.mark
+        if place.exists() and not (is_own or self._job.is_overwriting):
+            return {"failed": f"{place.name} exists and is of other inputs; --force replaces it"}
+        self._write(item.name, {"mark": item.mark})
+        own = replace(
+            self._job,
+            output=place,
+            is_overwriting=is_own or self._job.is_overwriting,
+            progress=lambda event: self._advance(event, item, total),
+        )
+        start = time.monotonic()
+        try:
+            summary = item.work(own)
+        except OutputError:
+            raise
+        except OptionError as error:
+            if error.where.startswith("--"):
+                raise
+            return {"failed": str(error)}
+        except Exception as error:  # one scan's fault must not cost the others of a night
+            is_known = isinstance(error, ArmscanError)
+            return {"failed": str(error) if is_known else f"{type(error).__name__}: {error}"}
+        return {
+            "seconds": time.monotonic() - start,
+            "bytes": place.stat().st_size,
+            "data": json.loads(summary_json(summary)),
+        }
+
+    def _advance(self, event: ProgressEvent, item: BatchItem, total: int) -> None:
+        """Of all results together, in which this one's steps count by their share."""
+        share = event.done / event.total if event.total else 0.0
+        done = self._n_before + round(share * item.n_steps)
+        self._job.progress(ProgressEvent("batch", done, total, item.name))
+
+    def _write(self, name: str, entry: LedgerEntry) -> None:
+        self._ledger[name] = entry
+        content = json.dumps({"results": self._ledger}, indent=1)
+        write_files({self.folder / LEDGER: content.encode()}, is_overwriting=True)
 
 
 def solved(result: T | FitFailure, where: object = "") -> T:

@@ -3,9 +3,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +22,8 @@ from armscan.fusion.voxel_map import VoxelMap
 from armscan.geometry.arrays import Box
 from armscan.geometry.rotations import EulerConvention, check_convention
 from armscan.jobs.fuse import fused_marks, fused_pieces
-from armscan.jobs.job import Job
+from armscan.jobs.job import Batch, BatchItem, Job
+from armscan.jobs.live.recordings import count_exposures, recording_mark, recordings_in
 from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
 from armscan.pipeline.cluster.extraction import ClusterAddress, ClusterReader
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
@@ -46,7 +51,7 @@ from armscan.report.cloud import (
     status_totals,
 )
 from armscan.report.page import Page, render_page
-from armscan.report.quantity import Quantity, Summary, sentences
+from armscan.report.quantity import Quantity, Summary, Table, sentences
 from armscan.storage.arm import read_arm_model
 from armscan.storage.clouds import CLOUD_SUFFIXES, CloudPiece, cloud_losses, cloud_parts
 from armscan.storage.documents import (
@@ -54,7 +59,7 @@ from armscan.storage.documents import (
     read_scanner_calibration,
     read_sensor_calibration,
 )
-from armscan.storage.files import scratch_folder
+from armscan.storage.files import read_bytes, scratch_folder
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
 from armscan.storage.points import profile_files, read_profiles, read_robot_poses
@@ -62,6 +67,7 @@ from armscan.storage.recording import (
     FolderRecording,
     is_recording,
     read_recording,
+    recording_name,
     recording_tables,
 )
 
@@ -151,8 +157,12 @@ def reconstruct(
     is_profiled: bool = False,
     cluster: ClusterAddress | None = None,
     voxel_mm: float | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> Summary:
     """Measure a recording in Base if there is one and a scanner's document, else in Sensor.
+
+    A folder of recordings is measured one by one into a folder of clouds; what is there already
+    is not measured again, and a recording that fails ends no other.
 
     With a table of poses the files are profiles that a sensor delivered, to be placed in Base.
 
@@ -179,6 +189,8 @@ def reconstruct(
         Whose workers extract the stripes of a scan; None to do so here.
     voxel_mm
         Edge of the voxels of which each gives one point of the cloud in Base; None for all points.
+    tell
+        Told a line when one of several recordings is done or failed.
 
     Raises
     ------
@@ -194,27 +206,36 @@ def reconstruct(
     if poses is not None:
         return _delivered(job, calibration, paths.images, poses, box, voxel_mm=voxel_mm)
     recordings = [Path(name) for name in paths.images if is_recording(Path(name))]
-    if recordings and not (paths.background or paths.right):
+    several = [] if recordings or len(paths.images) != 1 else recordings_in(Path(paths.images[0]))
+    if (recordings or several) and not (paths.background or paths.right):
         image_options.check_unused()
-    if recordings and is_scanner_document(calibration):
+    if (recordings or several) and is_scanner_document(calibration):
         if len(paths.images) > 1:
             raise OptionError(
                 f"{len(paths.images)} places to measure",
                 where=", ".join(paths.images[:3]),
-                remedy="name one recording at a time",
+                remedy="name one recording at a time, or the folder that holds them all",
             )
         _check_own_images(paths)
         chosen = ScanOptions(measure=options, volume=box)
-        return _scan(
-            job,
-            calibration,
-            recordings[0],
-            arm,
-            chosen,
-            is_profiled=is_profiled,
-            cluster=cluster,
-            voxel_mm=voxel_mm,
-        )
+
+        def measure(folder: Path, own: Job) -> Summary:
+            return _scan(
+                own,
+                calibration,
+                folder,
+                arm,
+                chosen,
+                is_profiled=is_profiled,
+                cluster=cluster,
+                voxel_mm=voxel_mm,
+            )
+
+        if recordings:
+            return measure(recordings[0], job)
+        files = [path for path in (calibration, arm) if path is not None]
+        asked = f"{chosen!r} {voxel_mm} {is_profiled}"
+        return _scans(Batch(job, ".ply", tell or _unheard), several, files, asked, measure)
     of_scans = {
         "--volume": volume,
         "--arm": arm,
@@ -230,6 +251,54 @@ def reconstruct(
                 remedy="give a folder with exposures.csv and --scanner scanner.json",
             )
     return _stills(job, calibration, paths, options, image_options)
+
+
+def _unheard(line: str) -> None:
+    """Nobody listens."""
+
+
+def _scans(
+    batch: Batch,
+    folders: Sequence[Path],
+    files: Sequence[Path],
+    asked: str,
+    measure: Callable[[Path, Job], Summary],
+) -> Summary:
+    """A cloud of each recording, and a line of each."""
+    repeated = [name for name, n in Counter(map(recording_name, folders)).items() if n > 1]
+    if repeated:
+        raise OptionError(f"two recordings are called {repeated[0]}", remedy="rename one of them")
+    given = sha256(f"{version('armscan')} {asked}".encode())
+    for path in files:
+        given.update(read_bytes(path))
+    items = [
+        BatchItem(
+            recording_name(folder),
+            recording_mark(folder, given.hexdigest()),
+            count_exposures(folder),
+            partial(measure, folder),
+        )
+        for folder in folders
+    ]
+    found = batch.run(items)
+    failed = {name: entry["failed"] for name, entry in found.items() if "failed" in entry}
+    rows = []
+    for item in items:
+        entry = found[item.name]
+        data = entry.get("data", {})
+        n_warnings = len(data.get("warnings", ()))
+        told = "failed" if item.name in failed else "done before" if "is_old" in entry else "done"
+        counts = (f"{data['n_points']:,}", str(n_warnings)) if data else ("", "")
+        seconds = f"{entry['seconds']:.1f}" if "seconds" in entry else ""
+        rows.append((item.name, *counts, f"{item.n_steps:,}", seconds, told))
+    return Summary(
+        title=f"{len(items) - len(failed)} of {len(items)} scans placed in Base.",
+        tables=(Table(("scan", "points", "warnings", "exposures", "s", "result"), tuple(rows), "",
+                      (5,)),),
+        warnings=tuple(f"{name}: {why}" for name, why in failed.items()),
+        written=(batch.folder,),
+        extra={"kind": "scans", "n_failed": len(failed), "scans": found},
+    )  # fmt: skip
 
 
 def _stills(
@@ -360,7 +429,8 @@ def _scan(
             recording, scanner, points, options,
             progress=job.progress, cache=job.cache, clock=clock, reader=reader,
         )  # fmt: skip
-        warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
+        odd = _odd_times(recording, scanner)
+        warnings = (*recording.warnings, *recording.session.assumed, *odd, *scan.warnings)
         inputs = (*recording_tables(folder), calibration, arm)
         provenance = job.provenance(
             [path for path in inputs if path is not None],
@@ -382,6 +452,19 @@ def _scan(
             clock=clock if is_profiled else None,
             voxel_mm=voxel_mm,
         )
+
+
+def _odd_times(recording: FolderRecording, scanner: ScannerCalibration) -> tuple[str, ...]:
+    """A sentence where a constant time between camera and arm is left open."""
+    has_ids = any(row.trigger_id is not None for row in recording.rows)
+    is_known = scanner.latency_ns != 0 or scanner.latency_sigma_ns is not None
+    if recording.session.clock != "related" or has_ids or is_known:
+        return ()
+    return (
+        "the clocks of cameras and arm were related by when their elements arrived, and the "
+        "scanner's document holds no latency: a moving hand's points lie off by its speed times "
+        "some milliseconds; find it with `armscan calibrate latency`",
+    )
 
 
 def _delivered(

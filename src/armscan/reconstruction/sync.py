@@ -164,7 +164,7 @@ def exposure_poses(
     arm
         The arm's samples.
     clock
-        ``shared`` if both bear times of one clock.
+        ``shared`` if both bear times of one clock, ``related`` if they were brought to one.
     latency_ns
         Added to an exposure's time before the pose is looked up by time.
 
@@ -183,7 +183,7 @@ def exposure_poses(
     has_ids = arm.trigger_ids is not None and bool((arm.trigger_ids != NO_TRIGGER).any())
     if has_ids and any(row.trigger_id is not None for row in rows):
         poses = _by_trigger(rows, arm, clock, latency_ns)
-    elif clock == "shared":
+    elif clock != "separate":
         poses = poses_by_time(rows, arm, latency_ns)
     else:
         raise InputError(

@@ -15,7 +15,7 @@ from armscan.geometry.rotations import EulerConvention
 from armscan.records.exposure import SensorWindow
 
 SessionKind = Literal["scan", "calibration"]
-Clock = Literal["shared", "separate"]
+Clock = Literal["shared", "related", "separate"]
 PoseForm = Literal["quaternion", "matrix", "euler", "joints"]
 PixelAlignment = Literal["low", "high"]
 PixelColour = Literal["mono", "rgb", "bayer_rggb"]
@@ -58,7 +58,9 @@ class Session:
     cameras
         One entry a camera.
     clock
-        ``shared`` if exposures and arm samples bear times of one clock.
+        ``shared`` if exposures and arm samples bear times of one clock; ``related`` if times of
+        clocks of their own were brought to one by when they arrived: but for a constant, the
+        latency.
     pose_form, rotation
         How the arm's poses are written, and the convention if they are Euler angles.
     head

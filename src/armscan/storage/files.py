@@ -119,6 +119,18 @@ def _packed_folder(path: Path) -> McapFolder:
     return folder_in(path)
 
 
+def packed_notes(path: Path) -> tuple[str, ...]:
+    """What a recording in one file holds and its tables do not list; nothing of any other path.
+
+    Raises
+    ------
+    FileFormatError
+        If the recording is unfinished or damaged.
+    """
+    packed = packed_place(path)
+    return () if packed is None else _packed_folder(packed[0]).notes
+
+
 def is_folder(path: Path) -> bool:
     """True for a folder; False also for a path that no system takes."""
     try:

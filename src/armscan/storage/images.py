@@ -563,3 +563,24 @@ def _decode(data: bytes, path: Path) -> tuple[ImageArray, int]:
 def _as_image(pixels: NDArray[Any]) -> ImageArray:
     is_byte = pixels.dtype == np.uint8
     return pixels.astype(np.uint8) if is_byte else pixels.astype(np.uint16)
+
+
+def raw_encoding(image: ImageArray, colour: str, source: str) -> str:
+    """Name by which viewers of recordings know how pixels are stored.
+
+    Raises
+    ------
+    InputError
+        If no viewer knows such pixels.
+    """
+    if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
+        return "rgb8"
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16) or not image.size:
+        raise InputError(
+            f"an image of shape {image.shape} and type {image.dtype} is not recorded raw",
+            where=source,
+            remedy="give uint8, or uint16 of one channel, or the bytes of an image file",
+        )
+    if image.dtype == np.uint16:
+        return "mono16"
+    return "bayer_rggb8" if colour == "bayer_rggb" else "mono8"

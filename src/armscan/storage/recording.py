@@ -42,6 +42,7 @@ from armscan.storage.files import (
     holds_files,
     is_file,
     new_folder,
+    packed_notes,
     packed_place,
     read_bytes,
 )
@@ -49,6 +50,7 @@ from armscan.storage.image_paths import are_simulated
 from armscan.storage.images import ImageOptions, read_exposure
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
+    FLAGS,
     SESSION_FILE,
     SessionFile,
     check_files,
@@ -411,7 +413,7 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
     rows, unknown = exposure_rows(table)
     check_files(folder, rows)
     said, assumed = _said(folder)
-    warnings = [*said.warnings, *_odd(table, unknown)]
+    warnings = [*packed_notes(folder), *said.warnings, *_odd(table, unknown)]
     warnings += [f"{table.where}: {name} is listed again" for name in repeated_files(rows)]
     track, form, arm_model, arm_unknown = None, said.session.pose_form, None, {}
     if is_file(folder / ARM_FILE):
@@ -526,8 +528,9 @@ def _odd_head(folder: Path, head: str | None) -> list[str]:
 
 def _odd(table: CsvTable, unknown: Mapping[str, tuple[str, ...]]) -> list[str]:
     found = []
-    if unknown:
-        found.append(f"{table.where}: columns not known, kept: {', '.join(unknown)}")
+    odd = [name for name in unknown if name != FLAGS]
+    if odd:
+        found.append(f"{table.where}: columns not known, kept: {', '.join(odd)}")
     if table.is_cut:
         found.append(
             f"{table.where}: the last line does not end with a line break, so the file may be cut"

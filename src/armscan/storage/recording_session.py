@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
+
 from armscan.errors import FileFormatError
-from armscan.geometry.arrays import IntArray
+from armscan.geometry.arrays import ImageArray, IntArray
 from armscan.geometry.rotations import EulerConvention
 from armscan.records.exposure import SensorWindow
 from armscan.records.recording import (
@@ -35,6 +37,7 @@ from armscan.storage.codec import (
 )
 from armscan.storage.files import is_file, path_text, read_bytes
 from armscan.storage.tables import CsvTable
+from armscan.vision.stripe.ridge import near_lines
 
 SESSION_FILE = "session.toml"
 
@@ -159,6 +162,8 @@ EXPOSURES_FILE = "exposures.csv"
 MOST_CAMERAS = 100
 REQUIRED = ("index", "t_ns", "camera", "file", "lasers")
 OPTIONAL = ("trigger_id", "view")
+FLAGS = "flags"
+"""Marks that a live recording gives its exposures, joined by +; kept, and read by nobody."""
 DRIVE = re.compile(r"[A-Za-z]:")
 
 Columns = Mapping[str, tuple[str, ...]]
@@ -314,3 +319,19 @@ def _trigger(table: CsvTable, triggers: IntArray | None, row: int) -> int | None
     if triggers is None or not table.columns["trigger_id"][row]:
         return None
     return int(triggers[row])
+
+
+def has_band(row: ExposureRow, setup: CameraSetup) -> bool:
+    """Whether extraction takes this image as it is: of a view, the one without laser comes off."""
+    return bool(row.lasers) and row.view is None and setup.colour == "mono"
+
+
+def banded_image(
+    row: ExposureRow, image: ImageArray | bytes, setup: CameraSetup
+) -> ImageArray | None:
+    """Pixels near stripes; None for images that stay whole."""
+    if isinstance(image, bytes) or image.ndim != 2 or not has_band(row, setup):
+        return None
+    bits = setup.bits_used if setup.align == "low" else 8 * image.dtype.itemsize
+    keep = near_lines(image.astype(np.float32) * np.float32(255.0 / ((1 << bits) - 1)))
+    return np.where(keep, image, image.dtype.type(0))

@@ -14,13 +14,14 @@ import pytest
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
+from armscan.jobs.info import describe_recording
 from armscan.models.arm import forward, thesis_arm
 from armscan.pipeline.live.acquire import LiveEvent
 from armscan.pipeline.live.recorder import LiveRecorder
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.live.session import LiveSession
 from armscan.pipeline.scan import ScanOptions, measure_scan
-from armscan.reconstruction.sync import PoseStatus
+from armscan.reconstruction.sync import PoseStatus, exposure_poses
 from armscan.records.recording import CameraSetup
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording
@@ -92,8 +93,14 @@ def test_frames_that_no_table_places_are_kept_and_set_aside(tmp_path: Path) -> N
     recorder.add_events((LaserEvent(4, 10**15, 9, ("A", "B")),))
     assert recorder.close().n_written == 5
     assert recorder.n_aside == 3
+    said = "1 lack parts, 1 have no time that is known, 1 came after newer ones"
+    note = f"3 of 5 exposures in the file are set aside: {said}"
+    # no word of the column of marks, which is our own
+    assert read_recording(tmp_path / "scan.mcap").warnings == (note,)
+    assert describe_recording(tmp_path / "scan.mcap")["warnings"] == [note]
     recorded, found, events = read_back(tmp_path / "scan.mcap")
     assert (found.n_exposures, found.n_aside) == (2, 3)
+    assert found.aside == (note,)
     assert [row.t_ns for row in recorded.rows] == [1_000, 3_000]
     for row, image in enumerate((0, 4)):
         np.testing.assert_array_equal(recorded.exposure(row).image, IMAGES[image])
@@ -134,6 +141,39 @@ def test_where_ids_decide_a_clock_that_is_not_known_sets_nothing_aside(tmp_path:
     assert [row.trigger_id for row in recorded.rows] == [3, 4, 5, 6]
     assert recorded.arm.trigger_ids.tolist() == [3, 4, 5, 6]
     assert (np.diff([row.t_ns for row in recorded.rows]) > 0).all()
+
+
+def test_times_of_arrival_are_no_false_alarm_about_ids(tmp_path: Path) -> None:
+    """Images arrive 60 ms after the arm's samples, more than three of its steps: ids decide."""
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    for k in range(6):
+        recorder.add_instant(instant(k, None))
+        pose = triggered_scan(6).truth[k]
+        sample = ArmSample(k, 1, 4_940_000_000 + 10**7 * k, pose, trigger_id=k + 3)
+        recorder.add_samples((TimedSample(sample, None, ElementStatus.USABLE, pose),))
+    recorder.close()
+    recorded = read_recording(tmp_path / "scan.mcap")
+    poses = exposure_poses(recorded.rows, recorded.arm, recorded.session.clock)
+    assert poses.has_pose.all() and not any("trigger id" in text for text in poses.warnings)
+    assert recorded.session.clock == "related" and recorded.warnings == ()
+
+
+def test_frames_before_the_first_trigger_are_listed_and_get_no_pose(tmp_path: Path) -> None:
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    for k in range(5):
+        recorder.add_instant(instant(k, None, trigger_id=k if k > 1 else None))
+        pose = triggered_scan(5).truth[k]
+        sample = ArmSample(k, 1, 5_000_000_000 + 10**7 * k, pose, trigger_id=k if k > 1 else None)
+        recorder.add_samples((TimedSample(sample, None, ElementStatus.USABLE, pose),))
+    recorder.close()
+    assert (recorder.n_untriggered, recorder.n_aside) == (2, 0)
+    recorded = read_recording(tmp_path / "scan.mcap")
+    assert recorded.exposure_columns["flags"] == ("no-trigger", "no-trigger", "", "", "")
+    poses = exposure_poses(recorded.rows, recorded.arm, recorded.session.clock)
+    none, found = int(PoseStatus.NO_TRIGGER), int(PoseStatus.FOUND)
+    assert poses.status.tolist() == [none, none, found, found, found]
 
 
 def test_joints_are_recorded_with_the_arm_s_document(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from armscan.devices.matching import InstantMatcher, MatchedInstant
 from armscan.devices.protocols import ArmSample, CameraSettings, Frame, LaserEvent
 from armscan.errors import DeviceError, InputError, OutputError
 from armscan.models.arm import forward, thesis_arm
+from armscan.pipeline.live.acquire import Acquisition, WaitingInstant, WaitingInstants
 from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
 from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus, exposure_of
@@ -104,7 +104,7 @@ def frame(scan: FakeScan, k: int, **changes: Any) -> Frame:
     return replace(Frame(image, k, t_ns, t_ns, trigger_id=k, lasers=("A",)), **changes)
 
 
-ALL = LiveOptions(latest_ms=math.inf)
+ALL = LiveOptions(is_thinned=False)
 MEASURE = "armscan.pipeline.live.session.measure_instants"
 
 
@@ -443,7 +443,9 @@ def test_a_cloud_of_two_cameras_is_kept_once(monkeypatch: pytest.MonkeyPatch) ->
         assert len(cloud.exposure_sources) == 2 and set(cloud.exposure.tolist()) == {0, 1}
 
 
-def test_what_waits_too_long_is_recorded_and_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_newest_is_measured_and_what_waits_is_recorded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     real, is_held = measure_instants, threading.Event()
 
     def held(instants: Any, *given: Any, **named: Any) -> Any:
@@ -451,23 +453,118 @@ def test_what_waits_too_long_is_recorded_and_not_shown(monkeypatch: pytest.Monke
         return real(instants, *given, **named)
 
     monkeypatch.setattr(MEASURE, held)
-    scan, kept = triggered_scan(8), Kept()
-    rig = rig_of(scan)
-    camera = rig.cameras[0]
-    every, camera.elements = camera.elements, []
+    kept, clouds = Kept(), {}
+    rig = rig_of(triggered_scan(8))
+    every, rig.cameras[0].elements = rig.cameras[0].elements, []
     samples, rig.arm.elements = rig.arm.elements, []
-    session = LiveSession(rig, scanner(), options=LiveOptions(latest_ms=20.0), recorder=kept)
+    session = LiveSession(rig, scanner(), recorder=kept, keep_cloud=clouds.__setitem__)
     session.start()
-    camera.elements, rig.arm.elements = every[:1], samples[:1]
-    waited(lambda: kept.instants == [0])
-    time.sleep(0.05)
-    camera.elements, rig.arm.elements = every[1:], samples[1:]
+    rig.cameras[0].elements, rig.arm.elements = every, samples
     waited(lambda: len(kept.instants) == 8)
     is_held.set()
+    waited(lambda: 7 in clouds)
     session.stop()
     counts = session.snapshot().counts
     assert counts == {LiveStatus.PLACED: 1, LiveStatus.NOT_SHOWN: 7}
-    assert kept.instants == list(range(8))
+    assert list(clouds) == [7] and kept.instants == list(range(8))
+
+
+def waiting(number: int, lasers: tuple[str, ...]) -> WaitingInstant:
+    nothing = PoseStatus.UNKNOWN_TRIGGER
+    instant = MatchedInstant((None,), None, lasers, number, None, nothing)
+    return WaitingInstant(number, instant, time.monotonic_ns())
+
+
+def test_lasers_that_take_turns_are_measured_in_turn() -> None:
+    """Three triggers while one is measured, three lasers: the newest alone would be one laser's."""
+    slots, lasers = WaitingInstants(is_thinned=True), (("A",), ("B",), ("A", "B"))
+    seen, n_left_out = [], 0
+    for k in range(30):
+        n_left_out += slots.put(waiting(k, lasers[k % 3]))
+        if k % 3 == 2:
+            one, n_late = slots.take()
+            assert one is not None and k - one.number < 3
+            seen.append(one.instant.lasers)
+            n_left_out += n_late
+    assert len(seen) == 10 and all(seen.count(each) >= 3 for each in lasers)
+    rest = []
+    slots.close()
+    while (found := slots.take())[0] is not None:
+        rest.append(found[0])
+    assert len(seen) + len(rest) + n_left_out == 30
+
+
+def test_what_waited_too_long_gives_way_to_other_lasers(monkeypatch: pytest.MonkeyPatch) -> None:
+    slots = WaitingInstants(is_thinned=True)
+    slots.put(waiting(0, ("A",)))
+    monkeypatch.setattr("armscan.pipeline.live.acquire.LATEST_NS", 0)
+    slots.put(waiting(1, ("B",)))
+    one, n_late = slots.take()
+    assert one is not None and (one.number, n_late) == (1, 1)
+
+
+class Held(Kept):
+    """A disk that takes nothing until it is let."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.may_go_on = threading.Event()
+
+    def add_frame(self, camera: int, frame: Frame, status: object) -> None:
+        self.may_go_on.wait(20.0)
+        super().add_frame(camera, frame, status)
+
+
+def test_a_disk_that_is_behind_delays_no_picture_and_loses_nothing() -> None:
+    kept, rig = Held(), rig_of(triggered_scan(8))
+    devices: list[Any] = [rig.cameras[0], rig.arm]
+    held = [device.elements for device in devices]
+    for device in devices:
+        device.elements = []
+    session = LiveSession(rig, scanner(), options=ALL, recorder=kept)
+    session.start()
+    for device, elements in zip(devices, held, strict=True):
+        device.elements = elements
+    waited(lambda: session.snapshot().counts.get(LiveStatus.PLACED) == 8)
+    assert kept.instants == []
+    threading.Timer(0.1, kept.may_go_on.set).start()
+    session.pause()
+    # a recorder that is taken off has all that was matched before
+    assert kept.frames == kept.instants == list(range(8))
+    session.stop()
+
+
+def test_an_instant_waits_for_a_camera_whose_thread_lags(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What decides is when frames arrived, not when this computer comes to read them."""
+    monkeypatch.setattr("armscan.devices.matching.PATIENCE_NS", 20_000_000)
+    now = time.monotonic_ns()
+
+    def arrived(k: int) -> Frame:
+        t_ns = now + 1_000_000 * k
+        return Frame(np.zeros((2, 2), np.uint8), k, t_ns, t_ns, trigger_id=k)
+
+    class Arrived(Device):
+        """Gives frames with the times of their arrival, the first one when it may."""
+
+        may_go_on = threading.Event()
+
+        def read(self, timeout_s: float) -> Any:
+            if self.name == "slow":
+                self.may_go_on.wait(10.0)
+            time.sleep(0.001)
+            return self.elements.pop(0) if self.elements else None
+
+    cameras: list[Any] = [Arrived(name, [arrived(k) for k in range(5)]) for name in ("c", "slow")]
+    instants: list[MatchedInstant] = []
+    description = RigDescription(("c", "slow"), is_common_trigger=True)
+    acquisition = Acquisition(Rig(cameras, None, None, description), instants.append, print)
+    acquisition.start()
+    time.sleep(0.3)
+    assert instants == []
+    Arrived.may_go_on.set()
+    waited(lambda: len(instants) == 5)
+    acquisition.stop()
+    assert all(None not in one.frames for one in instants)
 
 
 class Lasers(Device):

@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 import zlib
 from pathlib import Path
@@ -154,6 +155,42 @@ def test_a_full_disk_keeps_what_is_there_and_says_how_much(
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert len(list(reader.iter_messages(["/exposures"]))) == 10
+
+
+def test_what_no_processor_has_time_to_pack_is_written_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    may_end, packs = threading.Event(), write_mcap._packed
+    niceness = []
+
+    def slow(chunk: object) -> list[bytes]:
+        niceness.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+        may_end.wait(20.0)
+        return packs(chunk)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(write_mcap, "_packed", slow)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    path = tmp_path / "scan.mcap"
+    with RecordingWriter(path) as writer:
+        writer.begin(SESSION)
+        added = time.monotonic()
+        for k in range(10):
+            writer.add_exposure(row(k), image(k))
+        while writer.status().n_written < 10 and time.monotonic() < added + 10.0:
+            time.sleep(0.01)
+        assert writer.status().n_written == 10
+        may_end.set()
+        for k in range(10, 20):
+            writer.add_exposure(row(k), image(k))
+        while writer.status().n_written < 20 and time.monotonic() < added + 10.0:
+            time.sleep(0.01)
+    stored = StreamReader(io.BytesIO(path.read_bytes()), emit_chunks=True).records
+    kinds = [one.compression for one in stored if isinstance(one, Chunk)]
+    assert kinds == ["", "", "zstd", "zstd"]
+    assert found_in(path.read_bytes())[0] == list(range(20))
+    if sys.platform == "linux":
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        assert set(niceness) == {min(max(own, write_mcap.NICENESS), 19)}
 
 
 def test_a_file_that_exists_is_left_as_it_is(tmp_path: Path) -> None:

@@ -16,15 +16,20 @@ RECORD_EXAMPLE = (
     "\b\nExamples:\n"
     "  armscan record rig.toml -o scan.mcap\n"
     "  armscan record rig.toml --scanner scanner.json --seconds 60 -o scan.mcap\n"
-    "  armscan record --camera webcam:0 -o bench.mcap"
+    "  armscan record --camera webcam:0 -o bench.mcap\n"
+    "  armscan record 'twin:thesis-single?loop=1' --seconds 10 -o scan.mcap"
 )
 
 
 def record(
     *,
     rig: Annotated[
-        Path | None, typer.Argument(help="rig.toml; or name the devices.", show_default=False)
-    ] = None,
+        str,
+        typer.Argument(
+            help="rig.toml, or twin:HEAD for the simulator; or name the devices.",
+            show_default=False,
+        ),
+    ] = "",
     camera: Annotated[
         list[str] | None, typer.Option(help="Address of a camera; twice for two, left first.")
     ] = None,
@@ -33,12 +38,20 @@ def record(
     rate: Annotated[
         float | None,
         typer.Option(
-            help="Triggers a second of the controller.", show_default=DefaultOf(RIG + "rate_hz")
+            help="Triggers a second of the controller, whatever rig.toml says.",
+            show_default=DefaultOf(RIG + "rate_hz"),
         ),
     ] = None,
     common_trigger: Annotated[
         bool,
         typer.Option("--common-trigger", help="Frames and arm samples bear ids of one trigger."),
+    ] = False,
+    stripe_band: Annotated[
+        bool,
+        typer.Option(
+            "--stripe-band",
+            help="Pixels away from what could be a stripe become zero: a small file, equal points.",
+        ),
     ] = False,
     scanner: Annotated[
         Path | None,
@@ -64,10 +77,17 @@ def record(
         arm=arm,
         lasers=lasers,
         trigger="external" if lasers else "free",
+    )
+    request = RecordRequest(
+        rig,
+        devices,
+        scanner,
+        seconds,
+        exposures,
         rate_hz=rate,
         is_common_trigger=common_trigger,
+        is_stripe_band=stripe_band,
     )
-    request = RecordRequest(rig, devices, scanner, seconds or 0.0, exposures or 0)
     is_live = sys.stderr.isatty()
 
     def tell(line: str) -> None:

@@ -296,7 +296,8 @@ def datum_face(number: int, part: PartModel) -> DatumFeature | FitFailure:
             return DatumFeature(name, _outwards(fit.value, part, number), number)
     return FitFailure(
         f"the face {name} is no plane, cylinder, sphere or cone",
-        "name another face, or say where a feature should be as cylinder:at=x,y,z:axis=x,y,z",
+        "name another face, or say where a feature should be, as plane:at=1,2,3:axis=0,0,1 or "
+        "cylinder:at=1,2,3:axis=0,0,1:diameter=8",
     )
 
 

@@ -18,7 +18,7 @@ from armscan.errors import ArmscanError, OptionError
 from armscan.jobs.info import examine_installation
 from armscan.report.quantity import Quantity, Summary, Table
 from armscan.storage.documents import content_hash
-from armscan.storage.files import check_outputs, holds_files, read_bytes, write_files
+from armscan.storage.files import check_outputs, holds_files, is_folder, read_bytes, write_files
 from armscan.storage.recording import is_recording, read_recording, recording_name
 from armscan.storage.recordings.read_mcap import record_folder
 
@@ -152,7 +152,12 @@ def pack_bundle(
 
 def _add_path(bundle: _Bundle, path: Path) -> None:
     if is_recording(path):
-        _add_recording(bundle, path)
+        try:
+            _add_recording(bundle, path)
+        except ArmscanError as error:
+            if is_folder(path) or not path.is_file():
+                raise
+            _add_unread(bundle, path, error)
         return
     if holds_files(path):
         bundle.leave_out(path, "a folder that is no recording: name the files that matter")
@@ -194,6 +199,20 @@ def _add_recording(bundle: _Bundle, path: Path) -> None:
     lacks = f"{n_all - n_cut} later exposures; " if n_cut < n_all else ""
     what = f"recording, the first {n_cut} of {n_all} exposures; images and tables as recorded"
     bundle.add(f"{recording_name(path)}.mcap", data, what, f"{lacks}{NOTED} in its documents")
+
+
+def _add_unread(bundle: _Bundle, path: Path, error: ArmscanError) -> None:
+    """A recording that cannot be read, which the question may be about: its bytes."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES)
+    except OSError as refused:
+        bundle.leave_out(path, refused.strerror or "it cannot be read")
+        return
+    n_bytes = path.stat().st_size
+    cut = f"all after its first {MOST_BYTES / 1e6:.0f} MB; " if n_bytes > len(data) else ""
+    what = f"as it is: as a recording it cannot be read ({without_secrets(error.what)})"
+    bundle.add(path.name, data, what, f"{cut}nothing in it is masked")
 
 
 def _edited(document: bytes) -> bytes:

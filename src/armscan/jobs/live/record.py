@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import signal
 import threading
@@ -16,14 +17,15 @@ from armscan.devices.registry import open_device
 from armscan.errors import DeviceError, OptionError, OutputError
 from armscan.jobs.live.recordings import SUFFIX
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline.live.acquire import LiveEvent
+from armscan.pipeline.live.acquire import OWN_PARTS, LiveEvent
 from armscan.pipeline.live.recorder import LiveRecorder
-from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
+from armscan.pipeline.live.rig import MOST_RATE_HZ, Rig, RigDescription, read_rig
 from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
+from armscan.pipeline.simulate import TwinName
 from armscan.report.quantity import Quantity, Summary
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.files import check_outputs
-from armscan.storage.recordings.write_mcap import WriterStatus
+from armscan.storage.recordings.write_mcap import WriterOptions, WriterStatus
 
 TOLD_EVERY_S = 1.0
 CLOCKS_S = 5.0
@@ -39,20 +41,30 @@ class RecordRequest:
     Parameters
     ----------
     rig
-        Path of ``rig.toml``; None where the addresses are given.
+        Path of ``rig.toml``, or the address of a simulated rig, ``twin:HEAD``; empty where the
+        devices are given.
     devices
         Devices by address in place of ``rig.toml``.
     scanner
         Path of ``scanner.json``, to measure meanwhile; None for that of ``rig.toml``, if any.
     seconds, n_exposures
-        End after so long, or so many; 0 for never.
+        End after so long, or so many; None for never.
+    rate_hz
+        Triggers a second; None for what ``rig.toml`` says, or the default.
+    is_common_trigger
+        Frames and arm samples bear ids of one trigger, whatever ``rig.toml`` says.
+    is_stripe_band
+        Keep pixels near stripes alone; see `WriterOptions`.
     """
 
-    rig: Path | None = None
+    rig: str = ""
     devices: RigDescription = field(default_factory=lambda: RigDescription(()))
     scanner: Path | None = None
-    seconds: float = 0.0
-    n_exposures: int = 0
+    seconds: float | None = None
+    n_exposures: int | None = None
+    rate_hz: float | None = None
+    is_common_trigger: bool = False
+    is_stripe_band: bool = False
 
     def description(self) -> RigDescription:
         """The rig that is asked for.
@@ -64,21 +76,53 @@ class RecordRequest:
         FileFormatError
             If its description cannot be read.
         """
+        self._check_numbers()
         is_named = bool(self.devices.cameras or self.devices.arm or self.devices.lasers)
-        if self.rig is not None and is_named:
+        if self.rig and is_named:
             raise OptionError(
                 "both a rig's description and devices are given", remedy="leave one of them out"
             )
-        if self.seconds < 0.0 or self.n_exposures < 0:
-            raise OptionError("a negative time or count", remedy="give one above 0")
-        if self.rig is not None:
-            return read_rig(self.rig)
-        if not self.devices.cameras:
+        if not self.rig and not self.devices.cameras:
             raise OptionError(
                 "no camera is named",
                 remedy="give rig.toml, or --camera with an address that `armscan devices` lists",
             )
-        return self.devices
+        found = self.devices
+        if self.rig.startswith(TWIN):
+            found = _simulated(self.rig)
+        elif self.rig:
+            found = read_rig(Path(self.rig))
+        return replace(
+            found,
+            rate_hz=found.rate_hz if self.rate_hz is None else self.rate_hz,
+            is_common_trigger=found.is_common_trigger or self.is_common_trigger,
+        )
+
+    def _check_numbers(self) -> None:
+        for option, value in (("--seconds", self.seconds), ("--exposures", self.n_exposures)):
+            if value is not None and not 0 < value < math.inf:
+                raise OptionError(
+                    f"{value:g} is no time or count to record",
+                    where=option,
+                    remedy="give a number above 0, or leave it out: Ctrl-C ends the recording",
+                )
+        if self.rate_hz is not None and not 0.0 < self.rate_hz <= MOST_RATE_HZ:
+            raise OptionError(
+                f"{self.rate_hz:g} triggers a second",
+                where="--rate",
+                remedy=f"give a rate above 0 and up to {MOST_RATE_HZ:g}",
+            )
+
+
+def _simulated(address: str) -> RigDescription:
+    """All devices of a simulated rig, with both cameras where its head has two."""
+    head, _, query = address.removeprefix(TWIN).partition("?")
+    twin = TwinName(head or "thesis-single", "thesis", 1).build()
+    second = f"{address}{'&' if query else '?'}camera=1"
+    cameras = (address,) if twin.truth.right_camera_parameters is None else (address, second)
+    return RigDescription(
+        cameras, address, address, is_common_trigger="wired=0" not in query.split("&")
+    )
 
 
 def record_scan(
@@ -125,7 +169,8 @@ def record_scan(
     scanner = None if place is None else read_scanner_calibration(place)
     with Rig.open(description, open_device) as rig:
         rig.set_windows()
-        run = _Recording(rig, scanner, output, tell, show_rate or tell)
+        options = WriterOptions(is_stripe_band=request.is_stripe_band)
+        run = _Recording(rig, scanner, output, options, (tell, show_rate or tell))
         run.until_the_end(request)
     return run.summary(place)
 
@@ -151,12 +196,12 @@ class _Recording:
         rig: Rig,
         scanner: ScannerCalibration | None,
         output: Path,
-        tell: Callable[[str], None],
-        show_rate: Callable[[str], None],
+        writer_options: WriterOptions,
+        tell: tuple[Callable[[str], None], Callable[[str], None]],
     ) -> None:
-        self._output, self._tell, self._show_rate = output, tell, show_rate
+        self._output, (self._tell, self._show_rate) = output, tell
         simulated = all(one.startswith(TWIN) for one in rig.description.cameras)
-        self._recorder = LiveRecorder(output, rig, is_simulated=simulated)
+        self._recorder = LiveRecorder(output, rig, is_simulated=simulated, options=writer_options)
         options = LiveOptions.of(rig.description)
         self._session = LiveSession(rig, scanner, options=options, recorder=self._recorder)
         self._session.add_listener(self._hear)
@@ -256,8 +301,9 @@ class _Recording:
             time.sleep(LOOK_S)
             now = time.monotonic()
             status = self._recorder.status()
-            is_over = 0.0 < request.seconds <= now - start
-            if is_over or 0 < request.n_exposures <= status.n_accepted:
+            is_over = request.seconds is not None and now - start >= request.seconds
+            wanted = request.n_exposures
+            if is_over or (wanted is not None and status.n_accepted >= wanted):
                 return
             if not self._session.is_recording:
                 return
@@ -298,7 +344,7 @@ class _Recording:
 
     def _hear(self, event: LiveEvent) -> None:
         if event.kind in ("fault", "recovered", "warning"):
-            self._n_faults += event.kind == "fault"
+            self._n_faults += event.kind == "fault" and event.device not in OWN_PARTS
             where = f"{event.device}: " if event.device and event.device not in event.text else ""
             self._tell(f"{event.kind}: {where}{event.text}")
         if event.kind in ("fault", "warning"):
@@ -335,6 +381,12 @@ class _Recording:
                 0,
                 f"{self._recorder.n_aside} of {self._end.n_written} exposures are kept and not to "
                 "be used: parts of them were lost, or their clock was not known",
+            )
+        if self._recorder.n_untriggered:
+            warnings.insert(
+                0,
+                f"{self._recorder.n_untriggered} exposures bear no trigger's id, as those before "
+                "the first trigger: they are listed, and get no pose",
             )
         if self._n_faults:
             warnings.insert(0, f"devices failed {self._n_faults} times; the recording says when")

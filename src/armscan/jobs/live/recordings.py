@@ -1,18 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings from a folder to one file and back, and what is whole of a broken file."""
+"""Recordings from a folder to one file and back, what is whole of a broken file, and which there
+are in a folder.
+"""
 
 from __future__ import annotations
 
+from hashlib import sha256
 from pathlib import Path
 
-from armscan.errors import OptionError, OutputError
+from armscan.errors import FileFormatError, OptionError, OutputError
 from armscan.report.quantity import Quantity, Summary
-from armscan.storage.files import check_outputs, is_folder, scratch_folder
-from armscan.storage.recording import is_recording, read_recording
+from armscan.storage.clouds import CLOUD_SUFFIXES
+from armscan.storage.files import (
+    check_outputs,
+    is_folder,
+    packed_notes,
+    path_text,
+    read_bytes,
+    scratch_folder,
+)
+from armscan.storage.image_paths import IMAGE_SUFFIXES
+from armscan.storage.recording import is_recording, read_recording, recording_tables
+from armscan.storage.recording_session import EXPOSURES_FILE, has_band
+from armscan.storage.recordings.mcap_folder import read_summary
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording, record_folder
-from armscan.storage.recordings.write_mcap import has_band
 
 SUFFIX = ".mcap"
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    """Recordings in a folder that is none itself and holds no images, by name."""
+    if not is_folder(folder) or is_recording(folder):
+        return []
+    there = sorted(folder.iterdir())
+    if any(path.suffix.lower() in IMAGE_SUFFIXES for path in there):
+        return []
+    return [path for path in there if is_recording(path)]
+
+
+def count_exposures(recording: Path) -> int:
+    """Exposures that a recording lists, without a look at them; 0 if it cannot be read."""
+    try:
+        if not is_folder(recording):
+            return read_summary(recording).n_exposures
+        lines = read_bytes(recording / EXPOSURES_FILE).splitlines()
+    except FileFormatError:
+        return 0
+    return max(sum(bool(line) and not line.startswith(b"#") for line in lines) - 1, 0)
+
+
+def recording_mark(recording: Path, given: str) -> str:
+    """Hash of what a result follows from: a recording's tables, or its file's size and time, and
+    what else was ``given``.
+    """
+    mark = sha256(given.encode())
+    if is_folder(recording):
+        for path in recording_tables(recording):
+            mark.update(path.name.encode() + read_bytes(path))
+    else:
+        facts = recording.stat()
+        mark.update(f"{facts.st_size} {facts.st_mtime_ns}".encode())
+    return mark.hexdigest()
 
 
 def convert_recording(
@@ -44,6 +92,7 @@ def convert_recording(
             where="--stripe-band",
             remedy=f"end the new name in {SUFFIX}, or leave it out",
         )
+    _refuse_points(output, source)
     if source.suffix.lower() == SUFFIX and output.suffix.lower() != SUFFIX:
         return _summary("Converted: recording to a folder.", extract_recording(source, output),
                         output)  # fmt: skip
@@ -62,6 +111,7 @@ def convert_recording(
     )
     return Summary(
         title="Converted: recording to one file.",
+        warnings=packed_notes(source),
         quantities=(
             Quantity("exposures", "exposures", status.n_written),
             *((Quantity("with_band", "of these as a band", n_banded),) if is_stripe_band else ()),
@@ -83,6 +133,7 @@ def recover_recording(source: Path, output: Path, *, is_overwriting: bool = Fals
         If the output exists or cannot be written.
     """
     title = "Recovered."
+    _refuse_points(output, source)
     if output.exists() and output.samefile(source):
         raise OutputError(
             "this is the damaged file itself", where=f"-o {output}", remedy="name another file"
@@ -97,13 +148,18 @@ def recover_recording(source: Path, output: Path, *, is_overwriting: bool = Fals
     return _summary(title, found, output)
 
 
+def _refuse_points(output: Path, source: Path) -> None:
+    """Raise if a recording is to become a cloud: it holds images."""
+    if output.suffix.lower() in CLOUD_SUFFIXES:
+        raise OptionError(
+            f"'{output.name}' is the name of a cloud, and a recording holds images",
+            where=path_text(source),
+            remedy=f"measure its points: armscan reconstruct {source} --scanner scanner.json "
+            f"-o {output}",
+        )
+
+
 def _summary(title: str, found: ReadBack, output: Path) -> Summary:
-    aside = (
-        (f"{found.n_aside} exposures or samples were set aside: parts or times of them "
-         "are missing, times or numbers repeat or go back, or names cannot be used",)
-        if found.n_aside
-        else ()
-    )  # fmt: skip
     is_file = output.suffix.lower() == SUFFIX
     return Summary(
         title=title,
@@ -115,7 +171,7 @@ def _summary(title: str, found: ReadBack, output: Path) -> Summary:
             Quantity("lost_exposures", "lost exposures", found.n_lost),
             Quantity("seconds", "duration", found.seconds, unit="s"),
         ),
-        warnings=(*(f"lost: {text}" for text in found.lost), *aside, *found.warnings),
+        warnings=(*(f"lost: {text}" for text in found.lost), *found.aside, *found.warnings),
         written=(output,),
         next_step=f"armscan convert {output} FOLDER" if is_file else f"armscan info {output}",
         extra={"kind": "recording", "lost": list(found.lost)},

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Streams of a rig, read by one thread a device and matched to instants by another."""
+"""Streams of a rig, read by one thread a device, matched to instants by another and kept."""
 
 from __future__ import annotations
 
@@ -23,8 +23,22 @@ LATE_NS = 100_000_000
 SILENT_S = 2.0
 """A device that delivers nothing for so long is pointed out."""
 MOST_WAITING = 512
-"""Elements that wait to be matched and recorded; more, and this computer cannot keep up."""
+"""Elements that wait to be matched; more, and this computer cannot keep up."""
+MOST_TO_KEEP = 256
+"""Elements that are matched and wait to be recorded; then matching waits, and nothing is lost."""
+BEHIND_SHARE = 0.25
+"""Of them: with more, recording needs the processor, and nothing is measured live."""
+SEEN_EVERY_NS = 20_000_000
+"""So often a device that has nothing says so."""
 BEHIND = "this computer cannot keep up with the recording; the devices' own buffers must hold"
+
+MOST_AHEAD = 16
+"""Instants that wait where all are to be measured; further ones are recorded and not shown."""
+LATEST_NS = 100_000_000
+"""An instant that waited for longer gives way to newer ones with other lasers."""
+
+RECORDER, MATCHING, MEASURING = OWN_PARTS = ("recorder", "matching", "measuring")
+"""Named in events in the place of a device."""
 
 EventKind = Literal["state", "pass", "fault", "recovered", "button", "warning", "setting"]
 
@@ -40,7 +54,7 @@ class LiveEvent:
     text
         In words.
     device
-        Name of the device that it concerns; empty for none.
+        Name of the device, or of one of `OWN_PARTS`, that it concerns; empty for none.
     """
 
     kind: EventKind
@@ -64,8 +78,35 @@ class Recorder(Protocol):
         """Keep what belongs together, at which time and why it has no pose."""
 
 
+@dataclass(slots=True, eq=False)
+class _Recording:
+    """From a begin to a pause or a failure."""
+
+    recorder: Recorder
+    has_failed: bool = False
+
+
+@dataclass(slots=True)
+class _Stream:
+    """How far one device is read.
+
+    Parameters
+    ----------
+    asked_ns
+        Since when a read has not answered; 0 while none is under way.
+    seen_ns
+        All that arrived before is matched; written by the matching thread.
+    """
+
+    asked_ns: int = 0
+    seen_ns: int = 0
+
+
 class Acquisition:
     """Reads a rig and hands out its instants in order; nothing that arrives is dropped.
+
+    An instant is handed out before it is recorded: a disk that is behind delays no picture. It
+    waits for what belongs to it by what has arrived, not by how far these threads are behind.
 
     Parameters
     ----------
@@ -96,10 +137,12 @@ class Acquisition:
             latency_ns=latency_ns,
             arm=rig.arm_model,
         )
-        self.recorder: Recorder | None = None
-        """Set while what arrives is to be recorded."""
+        self._recording: _Recording | None = None
         self._deliver, self._tell = deliver, tell
         self._arrived: queue.Queue[tuple[str, int, Any]] = queue.Queue(MOST_WAITING)
+        self._to_keep: queue.Queue[_ToKeep | threading.Event] = queue.Queue(MOST_TO_KEEP)
+        self._keeper: threading.Thread | None = None
+        self._streams: dict[tuple[str, int], _Stream] = {}
         self._stopping = threading.Event()
         self._stopped_ns = 0
         self._is_broken = threading.Event()
@@ -115,12 +158,16 @@ class Acquisition:
             If a device does not answer; all are stopped then.
         """
         self.rig.start()
-        for k, camera in enumerate(self.rig.cameras):
-            self._run(self._read, "frame", k, camera)
-        if self.rig.arm is not None:
-            self._run(self._read, "samples", 0, self.rig.arm)
-        if self.rig.lasers is not None:
-            self._run(self._read, "events", 0, self.rig.lasers)
+        devices: dict[tuple[str, int], Any] = {
+            ("frame", k): camera for k, camera in enumerate(self.rig.cameras)
+        }
+        devices |= {} if self.rig.arm is None else {("samples", 0): self.rig.arm}
+        devices |= {} if self.rig.lasers is None else {("events", 0): self.rig.lasers}
+        self._streams = {key: _Stream() for key in devices}
+        self._keeper = threading.Thread(target=self._keep, daemon=True)
+        self._keeper.start()
+        for (what, k), device in devices.items():
+            self._run(self._read, what, k, device)
         self._run(self._match)
 
     def stop(self) -> None:
@@ -133,11 +180,32 @@ class Acquisition:
             if thread is not threading.current_thread():
                 thread.join()
         self._threads.clear()
+        self._keep_the_rest()
+        if self._keeper is not None:
+            self._to_keep.put(_END)
+            self._keeper.join()
+            self._keeper = None
+
+    @property
+    def recorder(self) -> Recorder | None:
+        """Set while what arrives is to be recorded; None is set when all before it is kept."""
+        return None if self._recording is None else self._recording.recorder
+
+    @recorder.setter
+    def recorder(self, recorder: Recorder | None) -> None:
+        self._recording = None if recorder is None else _Recording(recorder)
+        if recorder is None:
+            self._keep_the_rest()
 
     @property
     def n_waiting(self) -> int:
-        """Elements that wait to be matched and recorded."""
-        return self._arrived.qsize()
+        """Elements that wait to be matched or recorded."""
+        return self._arrived.qsize() + self._to_keep.qsize()
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether recording is behind what arrives."""
+        return self._to_keep.qsize() > BEHIND_SHARE * MOST_TO_KEEP
 
     def _run(self, work: Callable[..., None], *given: Any) -> None:
         thread = threading.Thread(target=work, args=given, daemon=True)
@@ -149,15 +217,26 @@ class Acquisition:
 
         Drivers are other people's: whatever one of them raises is its device's fault.
         """
+        stream = self._streams[what, k]
+        try:
+            self._read_all(what, k, device, stream)
+        finally:
+            self._put(what, k, _ALL_SEEN)
+
+    def _read_all(self, what: str, k: int, device: Any, stream: _Stream) -> None:
         last, is_silent, n_faults = time.monotonic(), False, 0
+        told_ns = 0
         while True:
             # asked before reading: what came before the stop is then read by this very read
             is_stopped, fault, found = self._stopping.is_set(), "", None
+            asked_ns = stream.asked_ns = time.monotonic_ns()
             try:
                 with told_as_fault_of(device.name):
                     found = device.read(READ_S)
             except ArmscanError as error:
                 fault = str(error)
+            stream.asked_ns = 0
+            if fault:
                 self._stopping.wait(READ_S)
             # a fault may stand between what came before and after it, and is raised once then
             n_faults = n_faults + 1 if fault else 0
@@ -168,7 +247,11 @@ class Acquisition:
                     self._tell(LiveEvent("recovered", f"{device.name} answers again", device.name))
                 last, is_silent = time.monotonic(), False
                 self._put(what, k, found)
-            elif not is_silent and (fault or time.monotonic() - last > SILENT_S):
+                continue
+            if asked_ns - told_ns > SEEN_EVERY_NS:
+                told_ns = asked_ns
+                self._put(what, k, asked_ns)
+            if not is_silent and (fault or time.monotonic() - last > SILENT_S):
                 is_silent = True
                 since = f"{device.name} has delivered nothing for {time.monotonic() - last:.1f} s"
                 self._tell(LiveEvent("fault", fault or since, device.name))
@@ -176,6 +259,15 @@ class Acquisition:
     def _is_late(self, found: Any) -> bool:
         first = found[0] if isinstance(found, tuple) else found
         return bool(first.t_host_ns > self._stopped_ns + LATE_NS)
+
+    def _keep_the_rest(self) -> None:
+        """Wait until what was handed to the recorder is kept."""
+        keeper, is_kept = self._keeper, threading.Event()
+        if keeper is None or keeper is threading.current_thread():
+            return
+        self._to_keep.put(is_kept)
+        while keeper.is_alive() and not is_kept.wait(READ_S):
+            """What is before it goes on."""
 
     @property
     def is_matching(self) -> bool:
@@ -190,7 +282,7 @@ class Acquisition:
                 self._arrived.put((what, k, found), timeout=READ_S)
             except queue.Full:
                 if not is_told:
-                    self._tell(LiveEvent("warning", BEHIND, "recorder"))
+                    self._tell(LiveEvent("warning", BEHIND, RECORDER))
                 is_told = True
             else:
                 return
@@ -202,7 +294,7 @@ class Acquisition:
         except Exception as error:  # any fault of it must not hang those that wait
             self._is_broken.set()
             text = f"the images are no longer matched: {type(error).__name__}: {error}"
-            self._tell(LiveEvent("fault", text))
+            self._tell(LiveEvent("fault", text, MATCHING))
 
     def _match_all(self) -> None:
         readers = self._threads[:-1] if self._threads else []
@@ -213,9 +305,20 @@ class Acquisition:
                 if self._stopping.is_set() and not any(one.is_alive() for one in readers):
                     self._hand_out(time.monotonic_ns() + 2**40)
                     return
-            self._hand_out(time.monotonic_ns())
+            self._hand_out(self._seen_ns())
+
+    def _seen_ns(self) -> int:
+        """All that arrived before this time is taken in; a device that hangs counts no more."""
+        now_ns = time.monotonic_ns()
+        hangs = now_ns - round(1e9 * SILENT_S)
+        read = [one.seen_ns for one in self._streams.values() if not 0 < one.asked_ns < hangs]
+        return min(read, default=now_ns)
 
     def _take_in(self, what: str, k: int, found: Any) -> None:
+        stream = self._streams[what, k]
+        if isinstance(found, int):
+            stream.seen_ns = max(stream.seen_ns, found)
+            return
         if what == "frame":
             status = self.matcher.add_frame(found, k)
             self._record(lambda recorder: recorder.add_frame(k, found, status))
@@ -226,24 +329,39 @@ class Acquisition:
         else:
             self.matcher.add_events(found)
             self._record(lambda recorder: recorder.add_events(found))
+        last = found[-1] if isinstance(found, tuple) else found
+        stream.seen_ns = max(stream.seen_ns, last.t_host_ns)
 
-    def _hand_out(self, now_ns: int) -> None:
-        for instant in self.matcher.take(now_ns):
-            self._record_instant(instant)
+    def _hand_out(self, seen_ns: int) -> None:
+        for instant in self.matcher.take(seen_ns):
             self._deliver(instant)
+            self._record_instant(instant)
 
     def _record_instant(self, instant: MatchedInstant) -> None:
         self._record(lambda recorder: recorder.add_instant(instant))
 
     def _record(self, write: Callable[[Recorder], None]) -> None:
-        recorder = self.recorder
-        if recorder is None:
-            return
-        try:
-            write(recorder)
-        except ArmscanError as error:
-            self.recorder = None
-            self._tell(LiveEvent("warning", f"the recording ended: {error}", "recorder"))
+        recording = self._recording
+        if recording is not None:
+            self._to_keep.put((recording, write))
+
+    def _keep(self) -> None:
+        """Record in the order of matching; a recording that failed is given nothing more."""
+        while (waiting := self._to_keep.get()) is not _END:
+            if isinstance(waiting, threading.Event):
+                waiting.set()
+                continue
+            recording, write = waiting
+            if recording.has_failed:
+                continue
+            try:
+                write(recording.recorder)
+            except Exception as error:  # whatever ends a recording must not hang those that wait
+                recording.has_failed = True
+                if self._recording is recording:
+                    self._recording = None
+                fact = error if isinstance(error, ArmscanError) else repr(error)
+                self._tell(LiveEvent("warning", f"the recording ended: {fact}", RECORDER))
 
     def _press(self, samples: tuple[ArmSample, ...]) -> None:
         for sample in samples:
@@ -252,3 +370,86 @@ class Acquisition:
             for bit in range(pressed.bit_length()):
                 if pressed >> bit & 1:
                     self._tell(LiveEvent("button", str(bit), "arm"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WaitingInstant:
+    """An instant that waits to be measured, and since when.
+
+    Parameters
+    ----------
+    number
+        Since the start of the session.
+    instant
+        What waits.
+    since_ns
+        By this computer's monotonic clock.
+    """
+
+    number: int
+    instant: MatchedInstant
+    since_ns: int
+
+
+class WaitingInstants:
+    """Instants that wait to be measured; any thread may put, one takes.
+
+    Parameters
+    ----------
+    is_thinned
+        Keep the newest of each choice of lasers; else all, in order, up to `MOST_AHEAD`.
+    """
+
+    def __init__(self, *, is_thinned: bool) -> None:
+        self._is_thinned, self._is_closed = is_thinned, False
+        self._waiting: list[WaitingInstant] = []
+        self._measured: dict[tuple[str, ...] | None, int] = {}
+        self._changed = threading.Condition()
+
+    def put(self, new: WaitingInstant) -> int:
+        """Let an instant wait; how many, it may be itself, do not any more."""
+        with self._changed:
+            n_before = len(self._waiting)
+            if self._is_thinned:
+                self._waiting = [one for one in self._waiting if _lasers(one) != _lasers(new)]
+            elif n_before >= MOST_AHEAD:
+                return 1
+            self._waiting.append(new)
+            self._changed.notify_all()
+            return n_before + 1 - len(self._waiting)
+
+    def take(self) -> tuple[WaitingInstant | None, int]:
+        """The next one, None after the end, and how many waited too long."""
+        with self._changed:
+            while not self._waiting and not self._is_closed:
+                self._changed.wait()
+            n_before = len(self._waiting)
+            if not n_before:
+                return None, 0
+            if not self._is_thinned:
+                return self._waiting.pop(0), 0
+            oldest_ns = time.monotonic_ns() - LATEST_NS
+            newest = self._waiting[-1]
+            young = [one for one in self._waiting if one.since_ns > oldest_ns or one is newest]
+            # lasers that take turns shall not be measured by the beat of measuring and triggers
+            chosen = min(young, key=lambda one: self._measured.get(_lasers(one), -1))
+            self._measured[_lasers(chosen)] = chosen.number
+            self._waiting = [one for one in young if one is not chosen]
+            return chosen, n_before - len(young)
+
+    def close(self) -> None:
+        """Nothing comes any more."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
+
+def _lasers(one: WaitingInstant) -> tuple[str, ...] | None:
+    return one.instant.lasers
+
+
+_ToKeep = tuple[_Recording, Callable[[Recorder], None]]
+_END = threading.Event()
+"""Ends the keeping thread."""
+_ALL_SEEN = 2**62
+"""Of a device that is read no more."""

@@ -51,6 +51,9 @@ class LiveRecorder:
     ----------
     n_aside
         Frames that are kept and that no table places.
+    n_untriggered
+        Frames without a trigger's id where ids decide, as before the first trigger: they are
+        listed, and get no pose.
     """
 
     def __init__(
@@ -61,7 +64,7 @@ class LiveRecorder:
         is_simulated: bool = False,
         options: WriterOptions | None = None,
     ) -> None:
-        self.n_aside = 0
+        self.n_aside = self.n_untriggered = 0
         self._writer = RecordingWriter(path, options)
         self._rig, self._is_triggered = rig, rig.description.is_common_trigger
         by_joints = rig.arm is not None and rig.arm.pose_form == "joints"
@@ -69,6 +72,7 @@ class LiveRecorder:
         self._session = Session(
             "scan",
             tuple(camera.setup for camera in rig.cameras),
+            clock="related",
             pose_form=self._form,
             is_simulated=is_simulated,
         )
@@ -157,6 +161,9 @@ class LiveRecorder:
             t_ns = frame.t_host_ns if instant.t_ns is None and may_guess else instant.t_ns
             flags = [] if frame.is_complete else ["incomplete"]
             flags += ["no-time"] if t_ns is None else []
+            if self._is_triggered and frame.trigger_id is None:
+                flags.append("no-trigger")
+                self.n_untriggered += 1
             is_unknown = instant.lasers is None and self._rig.lasers is not None
             flags += ["laser-unknown"] if is_unknown else []
             is_usable = frame.is_complete and t_ns is not None

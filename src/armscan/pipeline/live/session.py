@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-import queue
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
@@ -24,7 +22,14 @@ from armscan.geometry.arrays import FloatArray, ImageArray, IntArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.instants import Instant, InstantImages
-from armscan.pipeline.live.acquire import Acquisition, LiveEvent, Recorder
+from armscan.pipeline.live.acquire import (
+    MEASURING,
+    Acquisition,
+    LiveEvent,
+    Recorder,
+    WaitingInstant,
+    WaitingInstants,
+)
 from armscan.pipeline.live.exposure import ExposureControl, ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription, told_as_fault_of
 from armscan.pipeline.measure import (
@@ -47,9 +52,8 @@ STILL_MM, STILL_RAD = 0.05, 5e-4
 """A hand at rest and an arm's scatter move the tool by less between exposures."""
 STOP_NS = 500_000_000
 """Standing still for so long ends a pass."""
-MOST_AHEAD = 16
-"""Instants that wait to be measured; further ones are recorded and not shown."""
-LOOK_S = 0.1
+SELDOM_NS = 500_000_000
+"""While recording is behind, one instant in so long is measured: it needs the processor."""
 LATENCIES = 500
 """Latest instants over which rate and latency are told."""
 
@@ -82,8 +86,9 @@ class LiveOptions:
         One point a voxel and pass is shown.
     measured_every
         Every so many instants is measured live.
-    latest_ms
-        While an instant has waited so long to be measured, those that come are recorded alone.
+    is_thinned
+        Where measuring is slower than the triggers the newest instant is measured, of each choice
+        of lasers in turn; else all are, in order, while not too many wait.
     exposure
         How long the cameras expose.
     """
@@ -91,7 +96,7 @@ class LiveOptions:
     measure: MeasureOptions = field(default_factory=MeasureOptions)
     voxel_mm: float = 0.5
     measured_every: int = 1
-    latest_ms: float = 100.0
+    is_thinned: bool = True
     exposure: ExposureSettings = field(default_factory=ExposureSettings)
 
     def __post_init__(self) -> None:
@@ -216,15 +221,6 @@ class _Pass:
         self.pieces.append(ShownCloud(kept.points_mm, kept.sheet, kept.sigma_mm, exposure))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Waiting:
-    """An instant that waits to be measured, and since when."""
-
-    number: int
-    instant: MatchedInstant
-    since_ns: int
-
-
 class LiveSession:
     """Drives a rig; every method may be called from any thread.
 
@@ -267,7 +263,7 @@ class LiveSession:
         self._lock = threading.RLock()
         self._listeners: list[Callable[[LiveEvent], None]] = []
         self._state: SessionState = "closed"
-        self._todo: queue.Queue[_Waiting | None] = queue.Queue(MOST_AHEAD)
+        self._todo = WaitingInstants(is_thinned=self.options.is_thinned)
         self._measuring = threading.Thread(target=self._measure, daemon=True)
         self._passes: list[_Pass] = []
         self._version = self._n_instants = 0
@@ -285,7 +281,8 @@ class LiveSession:
         self._taken_back = 0
         """Instants before this number that still wait to be measured are not placed any more."""
         self._told = ""
-        self._now: _Waiting | None = None
+        self._now: WaitingInstant | None = None
+        self._waits_since_ns = 0
         self._asked: tuple[str, ...] = ()
         self._controls = [
             ExposureControl(one, self.options.exposure, partial(self._tell_set, one.name))
@@ -388,10 +385,8 @@ class LiveSession:
         for control in self._controls:
             control.stop()
         self._acquisition.stop()
-        while self._measuring.is_alive():
-            with suppress(queue.Full):
-                self._todo.put(None, timeout=LOOK_S)
-                self._measuring.join()
+        self._todo.close()
+        self._measuring.join()
         self._change("stopped")
 
     @property
@@ -511,22 +506,18 @@ class LiveSession:
             if status is not None:
                 self._counts[status] += 1
                 return
-        try:
-            if self._is_behind():
-                raise queue.Full
-            self._todo.put_nowait(_Waiting(number, instant, time.monotonic_ns()))
-        except queue.Full:
+        now_ns = time.monotonic_ns()
+        if self._acquisition.is_behind and now_ns - self._waits_since_ns < SELDOM_NS:
             self._count(LiveStatus.NOT_SHOWN)
+            return
+        self._waits_since_ns = now_ns
+        n_left_out = self._todo.put(WaitingInstant(number, instant, now_ns))
+        self._count(LiveStatus.NOT_SHOWN, n_left_out)
 
-    def _is_behind(self) -> bool:
-        with self._todo.mutex:
-            first = self._todo.queue[0] if self._todo.queue else None
-        limit_ns = 1e6 * self.options.latest_ms
-        return first is not None and time.monotonic_ns() - first.since_ns > limit_ns
-
-    def _count(self, status: LiveStatus) -> None:
+    def _count(self, status: LiveStatus, n: int = 1) -> None:
         with self._lock:
-            self._counts[status] += 1
+            if n:
+                self._counts[status] += n
 
     def _fault(self, instant: MatchedInstant) -> LiveStatus | None:
         if any(frame is None for frame in instant.frames):
@@ -553,7 +544,7 @@ class LiveSession:
         return LiveStatus.NOT_SHOWN if number % self.options.measured_every else None
 
     def _feed(self) -> Iterator[InstantImages]:
-        while (found := self._todo.get()) is not None:
+        while (found := self._next()) is not None:
             self._now = found
             number, instant = found.number, found.instant
             if self._scanner is None or instant.pose is None:
@@ -572,9 +563,14 @@ class LiveSession:
             )
         self._now = None
 
+    def _next(self) -> WaitingInstant | None:
+        found, n_left_out = self._todo.take()
+        self._count(LiveStatus.NOT_SHOWN, n_left_out)
+        return found
+
     def _measure(self) -> None:
         if self._scanner is None or self._scanner.sensor is None or self._labeller is None:
-            while self._todo.get() is not None:
+            while self._next() is not None:
                 """Nothing can be placed."""
             return
         transform = BaseTransform.of(self._scanner)
@@ -599,9 +595,11 @@ class LiveSession:
         self._count(LiveStatus.FAILED)
         is_new, self._told = fact != self._told, fact
         if is_new:
-            self._tell(LiveEvent("warning", text))
+            self._tell(LiveEvent("warning", text, MEASURING))
 
-    def _place(self, one: MeasuredInstant, waiting: _Waiting, transform: BaseTransform) -> None:
+    def _place(
+        self, one: MeasuredInstant, waiting: WaitingInstant, transform: BaseTransform
+    ) -> None:
         """Put the points of an instant into the pass that it belongs to."""
         number, instant = waiting.number, waiting.instant
         pose = instant.pose

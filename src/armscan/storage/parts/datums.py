@@ -94,10 +94,19 @@ def _feature(word: str, part: PartModel) -> DatumFeature:
     return found
 
 
+def _example(kind: str) -> str:
+    """A nominal feature of a kind, such as is understood."""
+    words = {"at": "1,2,3", "axis": "0,0,1", "diameter": "8", "half-angle": "30"}
+    return ":".join([kind, *(f"{name}={words[name]}" for name in _needed(kind))])
+
+
+def _needed(kind: str) -> list[str]:
+    needed = ["at"] + ["axis"] * (kind != "sphere") + ["diameter"] * (kind in ROUND)
+    return needed + ["half-angle"] * (kind == "cone")
+
+
 def _nominal_feature(word: str, kind: str, rest: str) -> DatumFeature:
-    remedy = (
-        f"write KIND:WORD=VALUE:..., as cylinder:at=1,2,3:axis=0,0,1; words: {', '.join(WORDS)}"
-    )
+    remedy = f"write it with all its words, as {_example(kind)}"
     given: dict[str, list[float]] = {}
     for item in rest.split(":"):
         name, is_there, value = item.partition("=")
@@ -112,8 +121,7 @@ def _nominal_feature(word: str, kind: str, rest: str) -> DatumFeature:
         if not all(math.isfinite(one) for one in numbers):
             raise OptionError(f"'{item}' is not finite", where="--datums", remedy=remedy)
         given[name] = numbers
-    needed = ["at"] + ["axis"] * (kind != "sphere") + ["diameter"] * (kind in ROUND)
-    needed += ["half-angle"] * (kind == "cone")
+    needed = _needed(kind)
     missing = [name for name in needed if name not in given]
     vain = [name for name in given if name not in (*needed, "region")]
     if missing or vain:

@@ -8,7 +8,7 @@ import re
 import struct
 import threading
 import zlib
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -20,6 +20,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import zstandard
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from mcap import records
@@ -29,25 +30,23 @@ from mcap.opcode import Opcode
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
-from armscan.errors import FileFormatError
+from armscan.errors import FileFormatError, InputError
+from armscan.geometry.arrays import FloatArray, ImageArray
+from armscan.records.recording import ExposureRow, Session
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE
 from armscan.storage.files import is_file, path_text, read_bytes
+from armscan.storage.images import image_format, raw_encoding
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
     MOST_CAMERAS,
     SESSION_FILE,
     is_inside,
 )
-from armscan.storage.recordings.write_mcap import (
-    ARM_TOPIC,
-    DOCUMENT_TOPIC,
-    EVENT_TOPIC,
-    EXPOSURE_TOPIC,
-    MAGIC,
-    TRANSFORM_TOPIC,
-)
 from armscan.storage.tables import csv_bytes
 
+MAGIC = b"\x89MCAP0\r\n"
+EXPOSURE_TOPIC, ARM_TOPIC, EVENT_TOPIC = "/exposures", "/arm/samples", "/events"
+TRANSFORM_TOPIC, DOCUMENT_TOPIC = "/tf", "/documents"
 EVENTS_FILE = "events.jsonl"
 TABLES = {EXPOSURES_FILE, ARM_FILE}
 OWN_NAMES = {*TABLES, SESSION_FILE, ARM_MODEL_FILE, EVENTS_FILE}
@@ -64,8 +63,15 @@ MOST_RECORD_BYTES, MOST_OTHER_BYTES = 1 << 31, 1 << 28
 LONGEST_NAME = 4
 """Of a compression: zstd."""
 MOST_OPCODE = 15
-ASIDE_FLAGS = frozenset({"incomplete", "no-time", "back"})
-"""A frame that lacks parts, or has no time or one that goes back: in the file, used by none."""
+ASIDE_FLAGS = {
+    "incomplete": "lack parts",
+    "no-time": "have no time that is known",
+    "back": "have a time that goes back",
+    "late": "came after newer ones",
+}
+"""Why a frame is in the file and used by none."""
+REPEATED = "repeat or go back"
+NS_PER_S = 1_000_000_000
 UNKNOWN_SIZE = zstandard.CONTENTSIZE_UNKNOWN
 LISTED_KINDS = frozenset({EXPOSURE_TOPIC, ARM_TOPIC, EVENT_TOPIC})
 CAMERA_TOPICS = "/camera/"
@@ -116,15 +122,17 @@ class FileSummary:
 class RecordedTables:
     """The tables of a recording as its messages are read, one after the other.
 
-    ``exposures``, ``samples``: their lines. ``events``: as they were recorded. ``n_aside``: lines
-    that the tables' parsers would refuse.
+    ``exposures``, ``samples``: their lines. ``events``: as they were recorded. ``aside``: counts of
+    exposures that no table lists, by reason. ``n_samples_aside``: samples that the table's parser
+    would refuse.
     """
 
     exposures: list[dict[str, str]] = field(default_factory=list)
     samples: list[dict[str, str]] = field(default_factory=list)
     events: list[bytes] = field(default_factory=list)
     times: list[int] = field(default_factory=list)
-    n_aside: int = 0
+    aside: Counter[str] = field(default_factory=Counter)
+    n_samples_aside: int = 0
     latest: dict[str, int] = field(default_factory=dict)
     ids: set[tuple[str, str]] = field(default_factory=set)
     checksums: dict[str, int] = field(default_factory=dict)
@@ -149,15 +157,16 @@ class RecordedTables:
         keys = [("index", cells["index"])]
         if cells.get("trigger_id"):
             keys.append((f"trigger of camera {said['camera']}", cells["trigger_id"]))
+        fault = next((text for flag, text in ASIDE_FLAGS.items() if flag in said["flags"]), "")
         is_usable = (
-            ASIDE_FLAGS.isdisjoint(said["flags"])
+            not fault
             and is_inside(name)
             and name not in OWN_NAMES
             and 0 <= said["camera"] < MOST_CAMERAS
             and self.checksums.get(name, facts["crc32"]) == facts["crc32"]
         )
         if not (is_usable and self._is_next(f"camera {said['camera']}", said["t_ns"], keys)):
-            self.n_aside += 1
+            self.aside[fault or REPEATED] += 1
             return None
         self.checksums[name] = facts["crc32"]
         if said["flags"]:
@@ -171,7 +180,21 @@ class RecordedTables:
         if self._is_next("arm", int(cells["t_ns"]), [("arm", number)] if number else []):
             self.samples.append(cells)
         else:
-            self.n_aside += 1
+            self.n_samples_aside += 1
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the file holds and the tables do not, in words."""
+        found = []
+        if self.aside:
+            why = ", ".join(f"{n} {text}" for text, n in self.aside.items())
+            found.append((self.aside.total(), len(self.exposures), "exposures", why))
+        if n := self.n_samples_aside:
+            found.append((n, len(self.samples), "samples of the arm", f"{n} {REPEATED}"))
+        return tuple(
+            f"{n} of {n + n_used} {what} in the file are set aside: {why}"
+            for n, n_used, what, why in found
+        )
 
     def _is_next(self, source: str, t_ns: int, ids: list[tuple[str, str]]) -> bool:
         """False for what the tables' parsers refuse."""
@@ -208,6 +231,54 @@ def stored_image(message: StoredMessage, said: Mapping[str, Any]) -> CompressedI
     if message.topic != facts["topic"] or zlib.crc32(shown.data) != facts["crc32"]:
         raise ValueError("an image is not the one that was recorded")
     return shown
+
+
+def transform_message(t_ns: int, place_mm: FloatArray, quaternion: FloatArray) -> bytes:
+    """Where the tool is in Base, as viewers draw it: (3,) mm and (4,) x, y, z, w."""
+    shown = FrameTransform(parent_frame_id="base", child_frame_id="tool")
+    _set_time(shown, t_ns)
+    shown.translation.x, shown.translation.y, shown.translation.z = map(float, 1e-3 * place_mm)
+    turn = shown.rotation
+    turn.x, turn.y, turn.z, turn.w = map(float, quaternion)
+    content: bytes = shown.SerializeToString()
+    return content
+
+
+def _set_time(message: Any, t_ns: int) -> None:
+    message.timestamp.seconds, message.timestamp.nanos = divmod(max(t_ns, 0), NS_PER_S)
+
+
+def _varint(value: int) -> bytes:
+    content = bytearray()
+    while value > 0x7F:
+        content.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes((*content, value))
+
+
+def image_message(
+    row: ExposureRow, image: ImageArray | bytes, session: Session
+) -> tuple[tuple[bytes, ...], dict[str, Any]]:
+    """Bytes of an image's message without a copy of the pixels into it, and what is stored."""
+    shown: Any
+    if isinstance(image, bytes):
+        kind = image_format(image)
+        if kind is None:
+            raise InputError("these bytes are no image file", where=row.source)
+        shown, data, tag = CompressedImage(frame_id="sensor", format=kind.lower()), image, 0x12
+        facts: dict[str, Any] = {"stored": "file", "format": kind.lower()}
+    else:
+        encoding = raw_encoding(image, session.cameras[row.camera].colour, row.source)
+        height, width = image.shape[:2]
+        data, tag = np.ascontiguousarray(image).tobytes(), 0x32
+        shown = RawImage(
+            frame_id="sensor", width=width, height=height, encoding=encoding,
+            step=len(data) // height,
+        )  # fmt: skip
+        facts = {"stored": "raw", "encoding": encoding, "width_px": width, "height_px": height}
+    _set_time(shown, row.t_ns)
+    facts |= {"crc32": zlib.crc32(data), "bytes": len(data)}
+    return (shown.SerializeToString(), bytes([tag]) + _varint(len(data)), data), facts
 
 
 def raw_pixels(shown: RawImage) -> NDArray[Any]:
@@ -467,6 +538,11 @@ class McapFolder:
     ------
     FileFormatError
         If it is no recording of armscan, unfinished or damaged.
+
+    Attributes
+    ----------
+    notes
+        What is set aside in it, in words.
     """
 
     def __init__(self, path: Path) -> None:
@@ -475,6 +551,7 @@ class McapFolder:
         self._kept: OrderedDict[int, bytes] = OrderedDict()
         self._lock = threading.Lock()
         self._images: dict[str, _ImagePlace] = {}
+        self.notes: tuple[str, ...] = ()
         try:
             with opened(path) as file:
                 self._files = self._read_files(file)
@@ -571,6 +648,7 @@ class McapFolder:
                     self._images[name] = _ImagePlace(chunk, offset, message.number, said)
         if n_exposures != self._summary.n_exposures:
             raise ValueError(f"{n_exposures} exposures of {self._summary.n_exposures} are there")
+        self.notes = tables.notes
         return files | tables.contents()
 
 

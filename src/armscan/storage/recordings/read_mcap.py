@@ -46,13 +46,19 @@ from armscan.storage.recording_session import (
     EXPOSURES_FILE,
     SESSION_FILE,
     exposure_columns,
+    has_band,
     is_inside,
     session_toml,
 )
 from armscan.storage.recordings.mcap_folder import (
+    ARM_TOPIC,
     CAMERA_TOPICS,
     DAMAGE,
+    DOCUMENT_TOPIC,
+    EVENT_TOPIC,
     EVENTS_FILE,
+    EXPOSURE_TOPIC,
+    NS_PER_S,
     RECOVER_REMEDY,
     TABLES,
     Damage,
@@ -65,17 +71,7 @@ from armscan.storage.recordings.mcap_folder import (
     read_summary,
     stored_image,
 )
-from armscan.storage.recordings.write_mcap import (
-    ARM_TOPIC,
-    DOCUMENT_TOPIC,
-    EVENT_TOPIC,
-    EXPOSURE_TOPIC,
-    NS_PER_S,
-    RecordingWriter,
-    WriterOptions,
-    WriterStatus,
-    has_band,
-)
+from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions, WriterStatus
 from armscan.storage.tables import read_csv
 
 ARM_BATCH = 1000
@@ -99,6 +95,8 @@ class ReadBack:
         Exposures that were recorded and are not whole.
     seconds
         From the first exposure to the last.
+    aside
+        What was set aside and why, in words.
     lost
         What the file does not give any more, in words; empty for nothing.
     warnings
@@ -111,6 +109,7 @@ class ReadBack:
     n_aside: int = 0
     n_lost: int = 0
     seconds: float = 0.0
+    aside: tuple[str, ...] = ()
     lost: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -172,7 +171,8 @@ class _Folder:
             n_exposures=len(tables.exposures),
             n_samples=len(tables.samples),
             n_events=len(tables.events),
-            n_aside=tables.n_aside,
+            n_aside=tables.aside.total() + tables.n_samples_aside,
+            aside=tables.notes,
             n_lost=self.n_lost(n_stated),
             seconds=1e-9 * (max(times) - min(times)) if times else 0.0,
             lost=self._lost(n_stated),
@@ -363,7 +363,7 @@ def _stored(
 
 def _span(arm: ArmTrack, rows: Sequence[ExposureRow], session: Session) -> slice:
     """Samples a second before to a second after exposures; all where the clocks differ."""
-    if session.clock != "shared":
+    if session.clock == "separate":
         return slice(None)
     times = [row.t_ns for row in rows]
     low, high = min(times) - NS_PER_S, max(times) + NS_PER_S

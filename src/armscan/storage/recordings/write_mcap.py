@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live recording written to one MCAP file by a thread of its own; a killed run loses at most what
-was still waiting and the open chunks.
-"""
+"""A live recording written to one MCAP file by a thread of its own, whole but for what waits."""
 
 from __future__ import annotations
 
@@ -9,16 +7,17 @@ import json
 import math
 import os
 import struct
+import sys
 import threading
 import time
 import zlib
 from base64 import b64encode
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
@@ -34,27 +33,40 @@ from scipy.spatial.transform import Rotation
 
 from armscan.errors import InputError, OutputError
 from armscan.geometry.arrays import ImageArray
-from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.records.recording import ArmTrack, ExposureRow, Session
 from armscan.storage.arm import arm_columns
 from armscan.storage.files import path_text
-from armscan.storage.images import image_format
-from armscan.storage.recording_session import SESSION_FILE, exposure_columns, session_toml
-from armscan.vision.stripe.ridge import near_lines
+from armscan.storage.recording_session import (
+    SESSION_FILE,
+    banded_image,
+    exposure_columns,
+    session_toml,
+)
+from armscan.storage.recordings.mcap_folder import (
+    ARM_TOPIC,
+    DOCUMENT_TOPIC,
+    EVENT_TOPIC,
+    EXPOSURE_TOPIC,
+    MAGIC,
+    TRANSFORM_TOPIC,
+    image_message,
+    transform_message,
+)
 
-MAGIC = b"\x89MCAP0\r\n"
 CHUNK_BYTES = 4 << 20
 """Of images in one chunk: reading one exposure unpacks no more than this and one image."""
 CHUNK_SECONDS = 0.5
 """After so long a chunk is closed and handed to the system; a killed process loses no more."""
+PACKING_SECONDS = 0.3
+"""A chunk is written as it is when no processor had time to pack it for so long."""
+NICENESS = 10
+"""Of the packing thread: a scan is measured with nine tenths of a core that both want."""
 DOCUMENTS_SECONDS, MOST_REPEATED_BYTES = 5.0, 1 << 16
 """So often documents up to this size come again: a broken file is read without its beginning."""
 SYNC_SECONDS = 1.0
 """So often the system is asked to put all on the disk: a power cut loses about as much."""
-NS_PER_S = 1_000_000_000
 NEW_FILE = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
 
-EXPOSURE_TOPIC, ARM_TOPIC, EVENT_TOPIC = "/exposures", "/arm/samples", "/events"
-TRANSFORM_TOPIC, DOCUMENT_TOPIC = "/tf", "/documents"
 Compression = Literal["auto", "raw", "zstd"]
 
 
@@ -65,8 +77,8 @@ class WriterOptions:
     Parameters
     ----------
     compression
-        ``raw``; ``zstd`` at level 1; ``auto`` packs while less than half of the queue is filled,
-        on a machine of at least two cores.
+        ``raw``; ``zstd`` at level 1; ``auto`` packs what a thread that yields to all others has
+        time for, while less than half of the queue is filled, on a machine of at least two cores.
     queue_bytes
         Images that may wait; a caller waits when they are that many.
     is_stripe_band
@@ -145,6 +157,15 @@ class _Chunk:
         self.n_exposures += message.n_exposures
 
 
+@dataclass(frozen=True, slots=True)
+class _Closed:
+    """A chunk that waits to be written: since when, and how it is packed; None to write it raw."""
+
+    chunk: _Chunk
+    since: float
+    packed: Future[list[bytes]] | None
+
+
 class RecordingWriter:
     """Writes a recording while it is taken.
 
@@ -182,6 +203,8 @@ class RecordingWriter:
         self._declared: dict[int, tuple[bytes, ...]] = {}
         self._session = Session()
         self._of_topic: dict[str, int] = {}
+        self._closed: deque[_Closed] = deque()
+        self._packing = ThreadPoolExecutor(1, "packing", _yield_to_all)
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
 
     def begin(self, session: Session, documents: Mapping[str, bytes] | None = None) -> None:
@@ -276,8 +299,8 @@ class RecordingWriter:
         if not 0 <= row.camera < len(self._session.cameras):
             raise InputError(f"camera {row.camera} is not among those of the session")
         setup = self._session.cameras[row.camera]
-        banded = _banded(row, image, setup) if self._options.is_stripe_band else None
-        pieces, facts = _image_message(row, image if banded is None else banded, self._session)
+        banded = banded_image(row, image, setup) if self._options.is_stripe_band else None
+        pieces, facts = image_message(row, image if banded is None else banded, self._session)
         facts |= {} if banded is None else {"outside_band": "zero"}
         topic = f"/camera/{row.camera}/" + facts["stored"]
         if cells is None:
@@ -370,12 +393,7 @@ class RecordingWriter:
     def __enter__(self) -> RecordingWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _refuse_failed(self) -> None:
@@ -395,9 +413,8 @@ class RecordingWriter:
         n_bytes = sum(message.n_bytes for message in messages)
         most = self._options.queue_bytes
         with self._ready:
-            is_waiting = self._queue and self._queued_bytes + n_bytes > most
-            self._n_waits += bool(is_waiting)
-            while self._queue and self._queued_bytes + n_bytes > most and self._failure is None:
+            self._n_waits += self._is_full(n_bytes)
+            while self._is_full(n_bytes) and self._failure is None:
                 self._ready.wait()
             self._refuse_failed()
             if self._is_closing or self._handle < 0:
@@ -412,19 +429,25 @@ class RecordingWriter:
             self._ready.notify_all()
             return min(1.0, self._queued_bytes / most)
 
+    def _is_full(self, n_bytes: int) -> bool:
+        is_empty = not self._queue and not self._closed
+        return not is_empty and self._queued_bytes + n_bytes > self._options.queue_bytes
+
     def _run(self) -> None:
         """The thread: whatever ends it is kept for the callers."""
         try:
             self._fill_chunks()
         except BaseException as error:  # nobody else sees what a thread raises
             self._stop(error)
+        finally:
+            self._packing.shutdown(cancel_futures=True)
 
     def _fill_chunks(self) -> None:
         """Fill chunks, close them when they are full or old, write them."""
         chunks = {kind: _Chunk() for kind in ("images", "views", "tables")}
         begun = time.monotonic()
         while True:
-            messages, is_last = self._take(begun + CHUNK_SECONDS)
+            messages, is_last = self._take(self._next_look(begun))
             for message in messages:
                 self._add(chunks, message)
                 # facts last: an exposure that is listed has its image
@@ -438,11 +461,17 @@ class RecordingWriter:
                 for kind in chunks:
                     self._close_chunk(chunks, kind)
                 begun = time.monotonic()
+            self._write_closed(is_last=is_last)
             if is_last:
                 self._write(self._summary())
                 os.fsync(self._handle)
                 self._has_summary = True
                 return
+
+    def _next_look(self, begun: float) -> float:
+        """When something is to be done though no message came."""
+        waits = [one.since + PACKING_SECONDS for one in self._closed]
+        return min([begun + CHUNK_SECONDS, *waits[:1]])
 
     def _add(self, chunks: dict[str, _Chunk], message: _Message) -> None:
         if message.kind == "tables" and time.monotonic() > self._documented + DOCUMENTS_SECONDS:
@@ -479,6 +508,7 @@ class RecordingWriter:
             with self._ready:
                 self._failure = error
                 self._queue.clear()
+                self._closed.clear()
                 self._queued_bytes = 0
                 self._ready.notify_all()
 
@@ -487,21 +517,45 @@ class RecordingWriter:
         os.lseek(self._handle, self._size, os.SEEK_SET)
 
     def _close_chunk(self, chunks: dict[str, _Chunk], kind: str) -> None:
+        """Let a chunk wait to be written, and be packed meanwhile."""
         chunk, chunks[kind] = chunks[kind], _Chunk()
         if not chunk.n_bytes:
             return
+        is_packing = self._is_packing()
+        packed = self._packing.submit(_packed, chunk) if is_packing else None
+        with self._ready:
+            self._closed.append(_Closed(chunk, time.monotonic(), packed))
+            self._queued_bytes += chunk.n_bytes
+
+    def _write_closed(self, *, is_last: bool) -> None:
+        """Write chunks in their order: packed where that is done, as they are where it is late."""
+        while self._closed:
+            one, packed = self._closed[0], self._closed[0].packed
+            if packed is not None and not packed.done() and not self._must_pack:
+                is_late = is_last or time.monotonic() > one.since + PACKING_SECONDS
+                if not is_late and 2 * self._queued_bytes < self._options.queue_bytes:
+                    return
+                packed.cancel()
+                packed = None
+            # what cannot be packed, for want of memory, is written as it is
+            is_raw = packed is None or packed.exception() is not None
+            self._write_chunk(one.chunk, None if packed is None or is_raw else packed.result())
+            with self._ready:
+                self._closed.popleft()
+                self._queued_bytes -= one.chunk.n_bytes
+                self._ready.notify_all()
+
+    def _write_chunk(self, chunk: _Chunk, packed: list[bytes] | None) -> None:
         crc = 0
         for piece in chunk.pieces:
             crc = zlib.crc32(piece, crc)
-        pieces, name = chunk.pieces, ""
-        if self._is_packing():
-            pieces, name = [zstandard.ZstdCompressor(level=1).compress(b"".join(pieces))], "zstd"
-        packed = sum(map(len, pieces))
+        pieces, name = (chunk.pieces, "") if packed is None else (packed, "zstd")
+        n_bytes = sum(map(len, pieces))
         first, last = min(chunk.times), max(chunk.times)
         inner = struct.pack("<QQQII", first, last, chunk.n_bytes, crc, len(name))
-        inner += name.encode() + struct.pack("<Q", packed)
-        head = struct.pack("<BQ", Opcode.CHUNK, len(inner) + packed) + inner
-        start, length = self._size, len(head) + packed
+        inner += name.encode() + struct.pack("<Q", n_bytes)
+        head = struct.pack("<BQ", Opcode.CHUNK, len(inner) + n_bytes) + inner
+        start, length = self._size, len(head) + n_bytes
         indexes = {n: _record(records.MessageIndex(n, at)) for n, at in chunk.index.items()}
         offsets, place = {}, start + length
         for channel, content in indexes.items():
@@ -513,7 +567,7 @@ class RecordingWriter:
                 chunk_length=length,
                 chunk_start_offset=start,
                 compression=name,
-                compressed_size=packed,
+                compressed_size=n_bytes,
                 message_end_time=last,
                 message_index_length=place - start - length,
                 message_index_offsets=offsets,
@@ -528,10 +582,14 @@ class RecordingWriter:
             os.fsync(self._handle)
             self._synced = time.monotonic()
 
-    def _is_packing(self) -> bool:
+    @property
+    def _must_pack(self) -> bool:
         chosen = self._options.compression
-        if chosen != "auto" or self._options.is_stripe_band:
-            return chosen != "raw"
+        return chosen == "zstd" or (self._options.is_stripe_band and chosen != "raw")
+
+    def _is_packing(self) -> bool:
+        if self._must_pack or self._options.compression == "raw":
+            return self._must_pack
         return (os.cpu_count() or 1) > 1 and 2 * self._queued_bytes < self._options.queue_bytes
 
     def _write(self, pieces: Sequence[bytes]) -> None:
@@ -588,16 +646,9 @@ class RecordingWriter:
         return _Message(self._of_topic[topic], "tables", t_ns, (content,), n_exposures)
 
     def _transform(self, track: ArmTrack, row: int, quaternion: Any) -> _Message:
-        shown = FrameTransform(parent_frame_id="base", child_frame_id="tool")
         t_ns = int(track.t_ns[row])
-        _set_time(shown, t_ns)
-        shown.translation.x, shown.translation.y, shown.translation.z = (
-            1e-3 * float(value) for value in track.translations_mm[row]
-        )
-        turn = shown.rotation
-        turn.x, turn.y, turn.z, turn.w = map(float, quaternion)
-        channel = self._of_topic[TRANSFORM_TOPIC]
-        return _Message(channel, "views", t_ns, (shown.SerializeToString(),))
+        content = transform_message(t_ns, track.translations_mm[row], quaternion)
+        return _Message(self._of_topic[TRANSFORM_TOPIC], "views", t_ns, (content,))
 
     def _summary(self) -> tuple[bytes, ...]:
         ends = [index.message_end_time for index in self._chunks]
@@ -622,6 +673,19 @@ class RecordingWriter:
         return (end, body, footer, MAGIC)
 
 
+def _yield_to_all() -> None:
+    """Let this thread have what the others leave; where one thread's rank can be set."""
+    if sys.platform == "linux":
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+
+
+def _packed(chunk: _Chunk) -> list[bytes]:
+    """A chunk's bytes as one frame; piece by piece, which needs no copy of all of them."""
+    frame = zstandard.ZstdCompressor(level=1).compressobj(size=chunk.n_bytes)
+    return [*(frame.compress(piece) for piece in chunk.pieces), frame.flush()]
+
+
 def _write_some(handle: int, pieces: list[memoryview]) -> int:
     """Windows cannot write several pieces at once."""
     if hasattr(os, "writev"):
@@ -633,68 +697,3 @@ def _record(record: records.McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return bytes(builder.end())
-
-
-def _set_time(message: Any, t_ns: int) -> None:
-    message.timestamp.seconds, message.timestamp.nanos = divmod(max(t_ns, 0), NS_PER_S)
-
-
-def _varint(value: int) -> bytes:
-    content = bytearray()
-    while value > 0x7F:
-        content.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes((*content, value))
-
-
-def _image_message(
-    row: ExposureRow, image: ImageArray | bytes, session: Session
-) -> tuple[tuple[bytes, ...], dict[str, Any]]:
-    """Bytes of an image's message without a copy of the pixels into it, and what is stored."""
-    shown: Any
-    if isinstance(image, bytes):
-        kind = image_format(image)
-        if kind is None:
-            raise InputError("these bytes are no image file", where=row.source)
-        shown, data, tag = CompressedImage(frame_id="sensor", format=kind.lower()), image, 0x12
-        facts: dict[str, Any] = {"stored": "file", "format": kind.lower()}
-    else:
-        encoding = _encoding(image, session.cameras[row.camera].colour, row.source)
-        height, width = image.shape[:2]
-        data, tag = np.ascontiguousarray(image).tobytes(), 0x32
-        shown = RawImage(
-            frame_id="sensor", width=width, height=height, encoding=encoding,
-            step=len(data) // height,
-        )  # fmt: skip
-        facts = {"stored": "raw", "encoding": encoding, "width_px": width, "height_px": height}
-    _set_time(shown, row.t_ns)
-    facts |= {"crc32": zlib.crc32(data), "bytes": len(data)}
-    return (shown.SerializeToString(), bytes([tag]) + _varint(len(data)), data), facts
-
-
-def has_band(row: ExposureRow, setup: CameraSetup) -> bool:
-    """Whether extraction takes this image as it is: of a view, the one without laser comes off."""
-    return bool(row.lasers) and row.view is None and setup.colour == "mono"
-
-
-def _banded(row: ExposureRow, image: ImageArray | bytes, setup: CameraSetup) -> ImageArray | None:
-    """Pixels near stripes; None for images that stay whole."""
-    if isinstance(image, bytes) or image.ndim != 2 or not has_band(row, setup):
-        return None
-    bits = setup.bits_used if setup.align == "low" else 8 * image.dtype.itemsize
-    keep = near_lines(image.astype(np.float32) * np.float32(255.0 / ((1 << bits) - 1)))
-    return np.where(keep, image, image.dtype.type(0))
-
-
-def _encoding(image: ImageArray, colour: str, source: str) -> str:
-    if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
-        return "rgb8"
-    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16) or not image.size:
-        raise InputError(
-            f"an image of shape {image.shape} and type {image.dtype} is not recorded raw",
-            where=source,
-            remedy="give uint8, or uint16 of one channel, or the bytes of an image file",
-        )
-    if image.dtype == np.uint16:
-        return "mono16"
-    return "bayer_rggb8" if colour == "bayer_rggb" else "mono8"

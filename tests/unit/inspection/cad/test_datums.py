@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from armscan.errors import FileFormatError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.features import fit_shape
+from armscan.geometry.features import SHAPE_KINDS, fit_shape
 from armscan.geometry.poses import Cad, Part, Pose
 from armscan.inspection.cad.alignment import Alignment, align_none
 from armscan.inspection.cad.comparison import CadComparison, CadOptions, compare_with_part
@@ -271,6 +271,22 @@ def test_every_kind_is_brought_onto_its_place(kind: str, text: str, holds: int) 
 def test_datums_that_are_none_are_refused(text: str) -> None:
     with pytest.raises((OptionError, FileFormatError)):
         datum_features(text, FIXED)
+
+
+@pytest.mark.parametrize("kind", SHAPE_KINDS)
+def test_the_remedy_of_a_datum_is_one_that_is_understood(kind: str) -> None:
+    with pytest.raises(OptionError) as refused:
+        datum_features(f"{kind}:at=1,2", FIXED)
+    (found,) = datum_features(refused.value.remedy.rpartition(" ")[2], FIXED)
+    assert isinstance(found, DatumFeature) and found.shape.kind == kind
+
+
+def test_the_remedy_of_a_face_that_is_no_shape_is_understood() -> None:
+    part = replace(FIXED, face=np.zeros_like(FIXED.face), face_names=("blob",))
+    found = datum_face(0, part)
+    assert isinstance(found, FitFailure)
+    examples = [word for word in found.remedy.split() if ":at=" in word]
+    assert len(datum_features("|".join(examples), FIXED)) == 2
 
 
 # reference points and markers

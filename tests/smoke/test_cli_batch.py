@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan reconstruct`` of a folder of scans: each once, whatever ends it in between."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from armscan.cli import main
+from armscan.errors import OptionError
+from armscan.jobs import reconstruct as module
+from armscan.storage.clouds import read_ply
+from armscan.storage.documents import scanner_document
+from armscan.storage.recording import write_recording
+from armscan.storage.recordings.read_mcap import record_folder
+from rigs.scan_fake import as_source, fake_scan, scanner
+
+Run = Callable[..., tuple[int, dict[str, Any]]]
+N = 6
+
+
+@pytest.fixture
+def week(tmp_path: Path) -> Path:
+    """Scans a and b of one scanner, c whose end is missing, and something else."""
+    week = tmp_path / "week"
+    week.mkdir()
+    write_recording(week / "a", as_source(fake_scan(N)))
+    write_recording(tmp_path / "b", as_source(fake_scan(N + 2)))
+    record_folder(tmp_path / "b", week / "b.mcap")
+    (week / "c.mcap").write_bytes((week / "b.mcap").read_bytes()[:-30])
+    (week / "notes.txt").write_text("two parts\n")
+    (tmp_path / "scanner.json").write_bytes(scanner_document(scanner()))
+    return week
+
+
+@pytest.fixture
+def run(week: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    def run(*more: str) -> tuple[int, dict[str, Any]]:
+        place = week.parent
+        words = [str(week), "--scanner", str(place / "scanner.json"), "-o", str(place / "clouds")]
+        code = main(["reconstruct", *words, "--json", *more])
+        out = capsys.readouterr().out
+        return code, json.loads(out) if out else {}
+
+    return run
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the scans that are measured; one that is called so is interrupted."""
+    names: list[str] = []
+    real = module._scan
+
+    def scan(job: Any, calibration: Path, folder: Path, *given: Any, **named: Any) -> Any:
+        names.append(folder.stem)
+        if names.count("interrupted") and folder.stem == "b":
+            names.clear()
+            raise KeyboardInterrupt
+        return real(job, calibration, folder, *given, **named)
+
+    monkeypatch.setattr(module, "_scan", scan)
+    return names
+
+
+def test_each_scan_is_measured_once_and_a_failure_ends_no_other(
+    week: Path, run: Run, measured: list[str]
+) -> None:
+    code, told = run()
+    assert code == 2 and measured == ["a", "b", "c"]
+    clouds = week.parent / "clouds"
+    kept = {path.name for path in clouds.iterdir()} - {"armscan-cache"}
+    assert kept == {"a.ply", "a.html", "b.ply", "b.html", "batch.json"}
+    scans = told["scans"]
+    assert told["n_failed"] == 1 and "armscan recover" in scans["c"]["failed"]
+    for name in "ab":
+        assert scans[name]["data"]["n_points"] == len(read_ply(clouds / f"{name}.ply")) > 500
+    before = (clouds / "a.ply").read_bytes()
+    measured.clear()
+    code, told = run("--force")
+    assert code == 2 and measured == ["c"] and told["scans"]["a"]["is_old"]
+    (week / "c.mcap").write_bytes((week / "b.mcap").read_bytes())
+    measured.clear()
+    assert run()[0] == 0 and measured == ["c"]
+    assert (clouds / "a.ply").read_bytes() == before
+    alone = week.parent / "alone.ply"
+    words = ["reconstruct", str(week / "a"), "--scanner", str(week.parent / "scanner.json")]
+    assert main([*words, "-o", str(alone)]) == 0
+    np.testing.assert_array_equal(read_ply(alone).points_mm, read_ply(clouds / "a.ply").points_mm)
+
+
+def test_after_an_interrupt_what_is_done_is_not_done_again(
+    week: Path, run: Run, measured: list[str]
+) -> None:
+    measured.append("interrupted")
+    with pytest.MonkeyPatch.context() as patch:
+        said: list[str] = []
+        patch.setattr("armscan.cli.reconstruct.typer.echo", lambda line, **_: said.append(line))
+        assert run()[0] == 130
+    told_first, told_last = (line for line in said if " of 3 " in line)
+    assert re.fullmatch(r"1 of 3  a: done  \([\d.]+ exposures/s, [\d.]+ min left\)", told_first)
+    assert told_last == "1 of 3 were made; the same command goes on"
+    code, told = run()
+    assert code == 2 and measured == ["b", "c"]
+    assert told["scans"]["a"]["is_old"] and "is_old" not in told["scans"]["b"]
+
+
+def test_a_result_of_other_inputs_is_replaced_only_by_force(
+    week: Path, run: Run, measured: list[str]
+) -> None:
+    run()
+    table = week / "a" / "exposures.csv"
+    table.write_text(table.read_text().rsplit("\n", 2)[0] + "\n")
+    measured.clear()
+    code, told = run()
+    assert code == 2 and measured == ["c"] and "--force" in told["scans"]["a"]["failed"]
+    measured.clear()
+    assert "data" in run("--force")[1]["scans"]["a"] and measured == ["a", "c"]
+
+
+def test_what_is_wrong_for_all_is_said_once(
+    week: Path, run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scanner_file = str(week.parent / "scanner.json")
+    assert main(["reconstruct", str(week), "--scanner", scanner_file, "-o", "x.ply"]) == 2
+    assert "-o clouds" in capsys.readouterr().err
+
+    def lost(*_: Any, **__: Any) -> None:
+        raise OptionError("the cluster's workers were lost", where="--cluster tcp://h:1")
+
+    monkeypatch.setattr(module, "_scan", lost)
+    assert run()[0] == 2
+    ledger = json.loads((week.parent / "clouds" / "batch.json").read_text())
+    assert list(ledger["results"]) == ["a"] and "data" not in ledger["results"]["a"]

@@ -69,7 +69,7 @@ class MeasuredAngle:
 
     @property
     def sigma_rad(self) -> float:
-        """The larger of both; NaN if neither is known."""
+        """As of a length; NaN if neither is known."""
         return MeasuredLength(0.0, self.sigma_scatter_rad, self.sigma_propagated_rad).sigma_mm
 
 

@@ -125,8 +125,9 @@ class MeasuredLength:
         Standard deviation from what differs between exposures (jackknife over them, and over
         blocks of neighbours: the larger); NaN where there are too few.
     sigma_propagated_mm
-        Standard deviation from the points' own covariances, errors being common to an exposure
-        or to a block of neighbouring ones (the larger); NaN where the cloud carries none.
+        Standard deviation from the points' own covariances, errors being common to exposures as
+        far as what these disagree about tells, and larger than stated if that is; NaN where the
+        cloud carries none, or for one exposure.
     """
 
     value_mm: float
@@ -135,13 +136,10 @@ class MeasuredLength:
 
     @property
     def sigma_mm(self) -> float:
-        """The larger of both; NaN if neither is known."""
-        known = [
-            sigma
-            for sigma in (self.sigma_scatter_mm, self.sigma_propagated_mm)
-            if math.isfinite(sigma)
-        ]
-        return max(known, default=math.nan)
+        """The propagated one, which the scatter is in; else that of scatter; NaN without either."""
+        if math.isfinite(self.sigma_propagated_mm):
+            return self.sigma_propagated_mm
+        return self.sigma_scatter_mm
 
 
 class PlaneInspection(ArrayRecord):

@@ -359,7 +359,7 @@ def sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
         fact(
             f"Sigma of the {name} propagated",
             f"{significant(length.sigma_propagated_mm, 'mm')}: from the points' covariances, "
-            "errors being common to an exposure, or to a block of neighbours: the larger",
+            "common to exposures as far as what these disagree about tells; U is of it if known",
         ),
         fact(
             "Not in either",

@@ -235,6 +235,14 @@ class Bench(Protocol):
 class ScanRecorder(LiveRecorder):
     """Records a live scan to one file, and knows what came with which frame.
 
+    Parameters
+    ----------
+    path, rig, is_simulated
+        As of `LiveRecorder`.
+    keeps_times
+        Times are the devices' own, of one clock: a simulated hand arrives as fast as its images are
+        rendered, and this computer's time says nothing of it.
+
     Attributes
     ----------
     pose_of
@@ -245,9 +253,11 @@ class ScanRecorder(LiveRecorder):
         Exposures that were taken back.
     """
 
-    def __init__(self, path: Path, rig: Rig, *, is_simulated: bool) -> None:
+    def __init__(
+        self, path: Path, rig: Rig, *, is_simulated: bool, keeps_times: bool = False
+    ) -> None:
         super().__init__(path, rig, is_simulated=is_simulated)
-        self.path = path
+        self.path, self._keeps_times = path, keeps_times
         self.pose_of: dict[int, Pose[Base, Tool] | None] = {}
         self.latest_joints_rad: FloatArray | None = None
         self.n_left_out = 0
@@ -259,12 +269,17 @@ class ScanRecorder(LiveRecorder):
         for one in samples:
             if one.sample.joints_rad is not None:
                 self.latest_joints_rad = one.sample.joints_rad
+        if self._keeps_times:
+            samples = tuple(replace(one, t_ns=one.sample.t_device_ns) for one in samples)
         super().add_samples(samples)
 
     def add_instant(self, instant: MatchedInstant) -> None:
         """Write its images."""
         with self._lock:
             first = self.n_exposures
+            if self._keeps_times:
+                times = [frame.t_device_ns for frame in instant.frames if frame is not None]
+                instant = replace(instant, t_ns=times[0])
             super().add_instant(instant)
             for frame in instant.frames:
                 if frame is not None:
@@ -326,7 +341,9 @@ class LiveScan:
     ) -> None:
         self.bench, self.step, self.path = bench, step, path
         self.rig = bench.scan_rig(step)
-        self.recorder = ScanRecorder(path, self.rig, is_simulated=bench.is_simulated)
+        self.recorder = ScanRecorder(
+            path, self.rig, is_simulated=bench.is_simulated, keeps_times=bench.has_operator
+        )
         self.events: deque[LiveEvent] = deque(maxlen=50)
         self._scanner = scanner
         self._frame_of: dict[int, int] = {}

@@ -52,6 +52,10 @@ def test_what_is_recorded_is_what_was_shown(tmp_path: Path) -> None:
     recorded = read_recording(tmp_path / "scan-01.mcap")
     assert [row.trigger_id for row in recorded.rows] == list(range(10))
     assert {row.lasers for row in recorded.rows} == {("A",)}
+    # a simulated hand's way keeps its times, however long its images took
+    source = drawn_scan(10)
+    assert [row.t_ns for row in recorded.rows] == [row.t_ns for row in source.rows]
+    assert recorded.arm.t_ns.tolist() == source.arm.t_ns.tolist()
     cloud = measure_scan(recorded, scanner(), ScanOptions(has_normals=False)).cloud
     direct = measure_scan(drawn_scan(10), scanner(), ScanOptions(has_normals=False)).cloud
     # poses pass a table of 17 digits

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pages of inspections and calibrations in a browser at two widths and on paper: nothing overlaps,
-is cut or asked for from elsewhere. ``benchmarks/pages.py`` looks at the pages of any folder in the same way.
+is cut or asked for from elsewhere. ``benchmarks/pages.py`` looks at the pages of any folder so.
 """
 
 from __future__ import annotations

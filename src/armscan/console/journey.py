@@ -116,8 +116,9 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.PROBING,
         "Touch the plate",
-        "Fix the plate to the table. Touch it with the arm's probe where drawn, always from above. "
-        "Leave the scanner mounted, and do not reference the arm anew until the hand-eye is done.",
+        "Fix a flat, matt plate to the table. Touch it with the arm's probe where drawn, always "
+        "from above, hold still, and take. Leave the scanner mounted, and do not reference the arm "
+        "anew until the hand-eye is done.",
         "touches",
         TOUCHES,
         least=8,
@@ -125,8 +126,9 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.HAND_EYE,
         "Hand-eye",
-        "Point the head at the plate as drawn, with the laser line on the plate from end to end. "
-        "Hold the arm still and take. The plate and the arm's base must not move.",
+        "Point the head at the plate that you touched, as drawn, with the laser line on the plate "
+        "from end to end. Hold the arm still and take. The plate and the arm's base must not move "
+        "from the first touch to the last take.",
         "placements",
         HAND_EYE,
         least=6,
@@ -135,9 +137,10 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.LATENCY,
         "Latency",
-        "Only where camera and arm have no trigger in common. Over the plate, move the head nearer "
-        "and away by 10 mm or more, about once a second and unevenly, for ten seconds, and "
-        "slowly sideways meanwhile.",
+        "Only where camera and arm have no trigger in common. Start, and over the plate move the "
+        "head nearer and away by 10 mm or more, about once a second and unevenly, for ten seconds, "
+        "and slowly sideways meanwhile. Keep the line on the plate and the range bar in the green; "
+        "then finish.",
         "motion",
         needs=(StepName.HAND_EYE,),
         is_optional=True,
@@ -145,9 +148,9 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.CHECK,
         "Daily check",
-        "Put the reference ball on the table and scan it from above and from four sides. This "
-        "says whether the scanner is still what its calibration says: do it every day, and after "
-        "a knock.",
+        "Put the reference ball on the table and write its certified diameter into 'Ball, mm'. "
+        "Start, scan it from above and from four sides, and finish. This says whether the scanner "
+        "is still what its calibration says: do it every day, and after a knock.",
         "motion",
         needs=(StepName.HAND_EYE,),
     ),
@@ -155,7 +158,8 @@ STEPS: tuple[Step, ...] = (
         StepName.SCAN,
         "Scan",
         "Scan the part: start, move the line over it in even passes, and keep the range bar in the "
-        "green. Pause to put the arm elsewhere. A pass that went wrong can be taken back.",
+        "green. Pause to put the arm elsewhere. A pass that went wrong can be taken back. Finish "
+        "makes the points.",
         "motion",
         needs=(StepName.HAND_EYE,),
     ),

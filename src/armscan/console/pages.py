@@ -32,7 +32,15 @@ from armscan.console.journey import (
     open_journey,
     sessions_in,
 )
-from armscan.console.panels import Controls, PointsPanel, ScanPanel, SeeingPanel, padded, put
+from armscan.console.panels import (
+    Controls,
+    PointsPanel,
+    ScanPanel,
+    SeeingPanel,
+    TipPanel,
+    padded,
+    put,
+)
 from armscan.console.placements import Placement, drawing
 from armscan.console.quality import ModelWatch
 from armscan.console.rig import open_bench, take_back
@@ -88,6 +96,7 @@ class ConsolePage:
         self.points = PointsPanel(SceneView(server))
         self.scanning = ScanPanel(self.controls, self.points, self.finish, self._look)
         self.seeing = SeeingPanel(self.controls, self._see)
+        self.tip = TipPanel(self.controls, lambda: self.journey.folder / PROBE_FILE)
         self._seen: tuple[bool, str] | None = None
         self._said: tuple[str, ...] = ()
         self._is_listing = False
@@ -162,6 +171,7 @@ class ConsolePage:
         self._choice.on_update(lambda _: self._choose_title(self._choice.value))
         self._guide = gui.add_html("")
         self._settings()
+        self.tip.build()
         self._view = self.controls.button(
             "Camera view", self.view, "V", "Show what the camera sees, lasers on where needed"
         )
@@ -470,6 +480,7 @@ class ConsolePage:
             if field.value != value:
                 put(field, value)
         self._target.visible = self.step in (StepName.CAMERA, StepName.LASER)
+        self.tip.show(is_visible=self._needs_tip())
         uses_ball = is_inspection and self._compare.value == "ball"
         self._ball.visible = (self.step is StepName.CHECK or uses_ball) and not is_live
         can_run = not is_blocked and (is_inspection or state.n_taken >= step.least)
@@ -566,12 +577,11 @@ class ConsolePage:
                 "Write into 'Target' which one you hold, for example chessboard:9x6:10 for 9 by 6 "
                 "inner corners 10 mm apart."
             )
-        is_real = self.bench is not None and not self.bench.has_operator
-        if self.step is StepName.PROBING and is_real:
-            place = self.journey.folder / PROBE_FILE
-            if not place.is_file():
-                return f"Write first where the tip of the probe is, into {place}: see the how-to."
-        return ""
+        return self.tip.lacking if self._needs_tip() else ""
+
+    def _needs_tip(self) -> bool:
+        is_person = self.bench is not None and not self.bench.has_operator
+        return self.step is StepName.PROBING and is_person
 
     def _placement(self, k: int) -> Placement:
         known = BY_NAME[self.step].placements

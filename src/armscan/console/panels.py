@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -37,6 +38,8 @@ from armscan.pipeline.live.session import LiveSnapshot, LiveStatus
 from armscan.records.exposure import Exposure
 from armscan.report.drawing import ALERT, INK, MUTED
 from armscan.report.quantity import sentence
+from armscan.storage.arm import ProbeTip, probe_tip_toml, read_probe_tip
+from armscan.storage.files import write_files
 
 REFRESH_S, CLOUD_EVERY_S = 0.3, 1.0
 DETAILS = {"up to 100,000": 100_000, "up to 500,000": 500_000, "up to 2 million": MOST_POINTS}
@@ -257,6 +260,61 @@ class SeeingPanel:
         # wrong counts are refused before they are kept
         found.options  # noqa: B018
         return found
+
+
+class TipPanel:
+    """Where the tip of the probe is, for a session whose plate a person touches.
+
+    Parameters
+    ----------
+    controls
+        Of the page.
+    place
+        Gives the file that holds it.
+    """
+
+    def __init__(self, controls: Controls, place: Callable[[], Path]) -> None:
+        self._controls, self._place = controls, place
+
+    def build(self) -> None:
+        """Add it to the column."""
+        gui = self._controls.gui
+        self._centre = gui.add_text("Tip, mm", "", hint="x, y, z of its centre in the tool's frame")
+        self._diameter = gui.add_number("Its diameter, mm", 0.0, min=0.0, step=0.0001)
+        self._use = self._controls.button("Use this tip", self._keep, "", "From now on")
+
+    def show(self, *, is_visible: bool) -> None:
+        """Show what is in the file, if there is one."""
+        for handle in (self._centre, self._diameter, self._use):
+            handle.visible = is_visible
+        if is_visible and self._place().is_file() and not self._centre.value:
+            with suppress(ArmscanError):
+                tip = read_probe_tip(self._place())
+                put(self._centre, ", ".join(f"{x:g}" for x in tip.centre_tool_mm))
+                put(self._diameter, tip.diameter_mm)
+
+    @property
+    def lacking(self) -> str:
+        """What a person has to tell before touches make sense; empty for nothing."""
+        if self._place().is_file():
+            return ""
+        return (
+            "Write first where the centre of the probe's ball is from the arm's tool point, along "
+            "the tool's axes, into 'Tip, mm', and how large it is: it stands in the probe's "
+            "papers. An arm that reports the ball's centre itself has 0, 0, 0."
+        )
+
+    def _keep(self) -> None:
+        try:
+            x, y, z = (float(one) for one in str(self._centre.value).split(","))
+        except ValueError as error:
+            raise OptionError(
+                f"the tip is '{self._centre.value}'", remedy="write three numbers as 0, 0, 125.3"
+            ) from error
+        if not float(self._diameter.value) > 0.0:
+            raise OptionError("the tip has no diameter", remedy="write that of its ball")
+        content = probe_tip_toml(ProbeTip(np.array([x, y, z]), float(self._diameter.value)))
+        write_files({self._place(): content}, is_overwriting=True)
 
 
 class ScanPanel:

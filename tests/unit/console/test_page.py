@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from html import unescape
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ pytest.importorskip("viser")
 from armscan.console.journey import StepName
 from armscan.console.pages import ConsolePage
 from armscan.console.server import close_server, open_server
+from armscan.storage.arm import read_probe_tip
 from armscan.storage.recording import read_recording
 from rigs.console_rig import FailingBench, put_scanner, waited
 
@@ -33,7 +35,7 @@ def opened(folder: Path, bench: FailingBench | None) -> Iterator[ConsolePage]:
 def text_of(page: ConsolePage) -> str:
     """What the column says."""
     parts = (page._head, page._guide, page._note, page.scanning._facts)
-    return re.sub(r"<[^>]*>", " ", " ".join(part.content for part in parts))
+    return unescape(re.sub(r"<[^>]*>", " ", " ".join(part.content for part in parts)))
 
 
 def begin_scan(page: ConsolePage) -> None:
@@ -99,3 +101,21 @@ def test_settings_hold_for_the_session_and_a_wrong_one_is_a_sentence(tmp_path: P
         assert page.bench.rig.description.stripes.threshold == 12.0
         page.controls.tried(lambda: page._see(None))
         assert page.bench.rig.description.windows == ()
+
+
+def test_a_plate_is_touched_by_what_the_page_asks_for(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    bench = FailingBench()
+    with opened(tmp_path / "s", bench) as page:
+        page.choose(StepName.PROBING)
+        assert "into 'Tip, mm'" in text_of(page)
+        page.tip._centre.value = "0, 0"
+        page.controls.tried(page.tip._keep)
+        assert "write three numbers" in text_of(page)
+        page.tip._centre.value, page.tip._diameter.value = "0, 0, 120.5", 6.0
+        page.controls.tried(page.tip._keep)
+        assert "into 'Tip, mm'" not in text_of(page) and not page.controls.problem
+        page.controls.tried(page.take_one)
+        assert "Touch 2 of 20" in text_of(page)
+        tip = read_probe_tip(page.journey.recording(StepName.PROBING) / "probe.toml")
+        assert tip.centre_tool_mm.tolist() == [0.0, 0.0, 120.5] and tip.diameter_mm == 6.0

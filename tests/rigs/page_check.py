@@ -25,7 +25,7 @@ CHROMIUM = next(
     None,
 )
 DRIVER = shutil.which("chromedriver")
-WIDTHS_PX = (1400, 700)
+WIDTHS_PX = (1400, 500)
 PAPER_PX = 688
 """Width of the text on A4 with the margins of `page.css`: 182 mm at 96 px an inch."""
 FLAGS = (

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages of an inspection in a browser at two widths and on paper: nothing overlaps, is cut or asked
-for from elsewhere. ``benchmarks/pages.py`` looks at the pages of any folder in the same way.
+"""Pages of inspections and calibrations in a browser at two widths and on paper: nothing overlaps,
+is cut or asked for from elsewhere. ``benchmarks/pages.py`` looks at the pages of any folder so.
 """
 
 from __future__ import annotations
@@ -12,12 +12,30 @@ import numpy as np
 import pytest
 import trimesh
 
+from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
+from armscan.calibration.cameras.pairs import StereoOptions
+from armscan.calibration.cameras.result import CameraOptions
+from armscan.calibration.cameras.stereo_result import StereoFit
+from armscan.calibration.latency import LatencyFit, calibrate_latency
 from armscan.cli import main
 from armscan.records.cloud import CalibrationMark
+from armscan.records.exposure import Exposure
+from armscan.report.hand_eye import latency_page
+from armscan.report.page import Page, render_page
+from armscan.report.stereo import stereo_page
 from armscan.storage.clouds import ply_bytes
+from armscan.storage.documents import scanner_document
+from armscan.storage.points import markers_csv
+from armscan.storage.recording import write_recording
 from rigs.inspection_clouds import RADIUS_MM, ball_stripes, cloud_of
+from rigs.latency import LatencyCase, draw
+from rigs.marked_plate import draw_marked_plate
+from rigs.marker_scenes import walk
 from rigs.page_check import CHROMIUM, DRIVER, browser, page_faults
 from rigs.parts import wedge_part
+from rigs.scan_fake import as_source, fake_scan, scanner
+from rigs.sheet_rig import PROVENANCE
+from rigs.stereo_rig import StereoScene, make_pairs
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 pytestmark = pytest.mark.skipif(
@@ -58,6 +76,67 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for words in made:
             assert main(["inspect", *words]) in (0, 1)
     return folder
+
+
+@pytest.fixture(scope="module")
+def calibrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Pages of two cameras, of a latency, of markers, of views that they join, of a check."""
+    folder = tmp_path_factory.mktemp("calibrations")
+    (folder / "stereo.html").write_bytes(render_page(page_of_two_cameras()))
+    fit = calibrate_latency(*draw(LatencyCase(seconds=4.0), 0)[:3], is_shared=True)
+    assert isinstance(fit, LatencyFit)
+    told = latency_page(fit, PROVENANCE, warnings=[LONG], is_simulated=True)
+    (folder / "latency.html").write_bytes(render_page(told))
+    draw_marked_plate(folder)
+    views = walk(np.random.default_rng(1), 3).views
+    lists = [folder / f"{name}.csv" for name in ("first", LONG[:80], "third")]
+    for path, view in zip(lists, views, strict=True):
+        path.write_bytes(markers_csv(view))
+    write_recording(folder / "plate", as_source(fake_scan(12, 2.0)))
+    (folder / "scanner.json").write_bytes(scanner_document(scanner()))
+    (folder / "plate.csv").write_text("A,B,C,D\n0,0,1,0\n")
+    images = ["markers", "left.png", "right.png"]
+    made = [
+        [*images, "-o", "rings.html"],
+        [*images, "--stereo", "stereo.json", "--diameter", "6", "-o", "markers.csv"],
+        ["register", *(path.name for path in lists), "-o", "joined"],
+        [
+            "verify",
+            "plate",
+            "--scanner",
+            "scanner.json",
+            "--plate",
+            "plate.csv",
+            "-o",
+            "check.html",
+        ],
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for words in made:
+            assert main(words) in (0, 1)
+    return folder
+
+
+def page_of_two_cameras() -> Page:
+    scene = StereoScene(n_pairs=8)
+    pairs, _ = make_pairs(scene, 0)
+    options = StereoOptions(CameraOptions(distortion="k1k2p1p2k3", n_folds=0), n_folds=4)
+    fit = calibrate_stereo(pairs, scene.target, options)
+    assert isinstance(fit, StereoFit)
+    names = [f"{LONG[:70]}.png", *(one.source for pair in pairs for one in pair.views if one)]
+    grey = np.full((1536, 2048), 80, dtype=np.uint8)
+    shown = {name: Exposure(grey, name) for name in names}
+    return stereo_page(fit, [(names[0], "no target")], shown, PROVENANCE, is_simulated=True)
+
+
+def test_pages_of_calibrations_are_whole(calibrations: Path, tmp_path: Path) -> None:
+    found = sorted(calibrations.rglob("*.html"))
+    names = {"stereo", "latency", "rings", "markers", "registration", "check"}
+    assert {page.stem for page in found} == names
+    with browser(tmp_path) as driver:
+        faults = {page.name: page_faults(driver, page) for page in found}
+    assert not any(faults.values()), faults
 
 
 def test_pages_are_whole_on_the_screen_and_on_paper(pages: Path, tmp_path: Path) -> None:

@@ -13,18 +13,23 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
 from armscan.console.placements import CAMERA, HAND_EYE, LASER, TOUCHES, Placement
-from armscan.errors import ArmscanError, FileFormatError, OutputError
+from armscan.errors import ArmscanError, FileFormatError, OptionError, OutputError
+from armscan.pipeline.live.exposure import ExposureSettings
+from armscan.pipeline.live.rig import RigDescription
+from armscan.pipeline.live.session import LiveOptions
+from armscan.pipeline.measure import MeasureOptions
 from armscan.storage.arm import ARM_FILE
 from armscan.storage.codec import MismatchError, RecordCodec, parse_toml, toml_bytes
-from armscan.storage.files import path_text, read_bytes, write_files
+from armscan.storage.files import files_in, is_file, path_text, read_bytes, write_files
 from armscan.storage.recording_session import EXPOSURES_FILE, exposure_rows
 from armscan.storage.tables import read_csv
+from armscan.vision.stripe.image import StripeOptions
 
 try:
     import fcntl
@@ -33,6 +38,8 @@ except ImportError:  # pragma: no cover - Windows has none
 
 SETTINGS_FILE, LOCK_FILE, REPORT_FILE = "console.toml", ".console.lock", "report.html"
 RECORDINGS, RESULTS = "recordings", "results"
+MOVED = ".mcap"
+"""Of a recording that was taken while the hand moved."""
 
 
 class StepName(StrEnum):
@@ -109,8 +116,9 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.PROBING,
         "Touch the plate",
-        "Fix the plate to the table. Touch it with the arm's probe where drawn, always from above. "
-        "Leave the scanner mounted, and do not reference the arm anew until the hand-eye is done.",
+        "Fix a flat, matt plate to the table. Touch it with the arm's probe where drawn, always "
+        "from above, hold still, and take. Leave the scanner mounted, and do not reference the arm "
+        "anew until the hand-eye is done.",
         "touches",
         TOUCHES,
         least=8,
@@ -118,8 +126,9 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.HAND_EYE,
         "Hand-eye",
-        "Point the head at the plate as drawn, with the laser line on the plate from end to end. "
-        "Hold the arm still and take. The plate and the arm's base must not move.",
+        "Point the head at the plate that you touched, as drawn, with the laser line on the plate "
+        "from end to end. Hold the arm still and take. The plate and the arm's base must not move "
+        "from the first touch to the last take.",
         "placements",
         HAND_EYE,
         least=6,
@@ -128,9 +137,10 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.LATENCY,
         "Latency",
-        "Only where camera and arm have no trigger in common. Over the plate, move the head nearer "
-        "and away by 10 mm or more, about once a second and unevenly, for ten seconds, and "
-        "slowly sideways meanwhile.",
+        "Only where camera and arm have no trigger in common. Start, and over the plate move the "
+        "head nearer and away by 10 mm or more, about once a second and unevenly, for ten seconds, "
+        "and slowly sideways meanwhile. Keep the line on the plate and the range bar in the green; "
+        "then finish.",
         "motion",
         needs=(StepName.HAND_EYE,),
         is_optional=True,
@@ -138,9 +148,9 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.CHECK,
         "Daily check",
-        "Put the reference ball on the table and scan it from above and from four sides. This "
-        "says whether the scanner is still what its calibration says: do it every day, and after "
-        "a knock.",
+        "Put the reference ball on the table and write its certified diameter into 'Ball, mm'. "
+        "Start, scan it from above and from four sides, and finish. This says whether the scanner "
+        "is still what its calibration says: do it every day, and after a knock.",
         "motion",
         needs=(StepName.HAND_EYE,),
     ),
@@ -148,7 +158,8 @@ STEPS: tuple[Step, ...] = (
         StepName.SCAN,
         "Scan",
         "Scan the part: start, move the line over it in even passes, and keep the range bar in the "
-        "green. Pause to put the arm elsewhere. A pass that went wrong can be taken back.",
+        "green. Pause to put the arm elsewhere. A pass that went wrong can be taken back. Finish "
+        "makes the points.",
         "motion",
         needs=(StepName.HAND_EYE,),
     ),
@@ -161,6 +172,47 @@ STEPS: tuple[Step, ...] = (
     ),
 )
 BY_NAME: Mapping[StepName, Step] = {step.name: step for step in STEPS}
+
+
+@dataclass(frozen=True, slots=True)
+class SeeingSettings:
+    """How the cameras look at the laser's line, and how it is found; most keys are ``rig.toml``'s.
+
+    Parameters
+    ----------
+    windows, exposure, stripes
+        As of `armscan.pipeline.live.rig.RigDescription`.
+    photo_us
+        Exposure time of photographs of the target; 0 for the camera's own.
+    voxel_mm, measured_every
+        As of `armscan.pipeline.live.session.LiveOptions`.
+    """
+
+    windows: tuple[tuple[int, int, int, int], ...] = ()
+    exposure: ExposureSettings = field(default_factory=ExposureSettings)
+    stripes: StripeOptions = field(default_factory=StripeOptions)
+    photo_us: float = 0.0
+    voxel_mm: float = 0.5
+    measured_every: int = 1
+
+    @staticmethod
+    def of(rig: RigDescription) -> SeeingSettings:
+        """What the description of a rig says."""
+        return SeeingSettings(rig.windows, rig.exposure, rig.stripes)
+
+    def set_in(self, rig: RigDescription) -> RigDescription:
+        """The description of a rig with these in place of its own."""
+        return replace(rig, windows=self.windows, exposure=self.exposure, stripes=self.stripes)
+
+    @property
+    def options(self) -> LiveOptions:
+        """Those of a live scan."""
+        return LiveOptions(
+            MeasureOptions(stripes=self.stripes),
+            voxel_mm=self.voxel_mm,
+            measured_every=self.measured_every,
+            exposure=self.exposure,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +235,8 @@ class SessionSettings:
         As of ``armscan inspect cad``; empty for none.
     needs_latency
         Camera and arm have no trigger in common.
+    seeing
+        In place of what the rig's description says; None for that.
     """
 
     rig: str = ""
@@ -192,6 +246,7 @@ class SessionSettings:
     part: str = ""
     tolerance: str = ""
     needs_latency: bool = False
+    seeing: SeeingSettings | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,20 +342,38 @@ class Journey:
         return tuple(step for step in STEPS if not step.is_optional or self.settings.needs_latency)
 
     def recording(self, step: StepName, scan: str = "") -> Path:
-        """Folder that a step fills; of a scan by its name."""
-        return self.folder / RECORDINGS / (scan or step.value)
+        """What a step fills, of a scan by its name: a folder, or one file while the hand moves.
+
+        A folder that is there, of an earlier console or put there, is read all the same.
+        """
+        place = self.folder / RECORDINGS / (scan or step.value)
+        is_one_file = BY_NAME[step].filling == "motion" or step in OF_A_SCAN
+        return place.with_name(place.name + MOVED) if is_one_file and not place.is_dir() else place
 
     @property
     def scans(self) -> tuple[str, ...]:
         """Names of the scans, in their order."""
         place = self.folder / RECORDINGS
         found = place.glob("scan-*") if place.is_dir() else []
-        return tuple(sorted(one.name for one in found if (one / EXPOSURES_FILE).is_file()))
+        names = {one.name.removesuffix(MOVED) for one in found if is_file(one / EXPOSURES_FILE)}
+        return tuple(sorted(names))
+
+    @property
+    def cut_short(self) -> tuple[Path, ...]:
+        """Recordings whose end was not written, as of a console that was killed."""
+        found = []
+        for path in sorted((self.folder / RECORDINGS).glob(f"[!.]*{MOVED}")):
+            try:
+                files_in(path)
+            except ArmscanError:
+                found.append(path)
+        return tuple(found)
 
     def new_scan(self) -> str:
         """A name that no scan has."""
         place = self.folder / RECORDINGS
-        used = {one.name for one in place.glob("scan-*")} if place.is_dir() else set()
+        found = place.glob("scan-*") if place.is_dir() else []
+        used = {one.name.partition(".")[0] for one in found}
         return next(name for k in range(1, 10_000) if (name := f"scan-{k:02d}") not in used)
 
     @property
@@ -382,6 +455,7 @@ class Journey:
             if place.is_dir():
                 place.rename(gone)
                 shutil.rmtree(gone)
+            place.unlink(missing_ok=True)
             (self.folder / RESULTS / f"{result_key(step, scan)}.json").unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(
@@ -419,10 +493,10 @@ OF_A_SCAN = (StepName.SCAN, StepName.INSPECT)
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file; empty where it cannot be read."""
+    """SHA-256 of a file, also of a table in a recording; empty where it cannot be read."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
+        return hashlib.sha256(read_bytes(path)).hexdigest()
+    except ArmscanError:
         return ""
 
 
@@ -448,9 +522,10 @@ def open_journey(folder: Path, settings: SessionSettings | None = None) -> Journ
     if path.is_file():
         journey = Journey(folder, read_settings(path))
         if settings is not None:
-            known = {key: value for key, value in asdict(journey.settings).items() if value}
+            told = {key: getattr(settings, key) for key in settings.__slots__}
+            known = {key: value for key in told if (value := getattr(journey.settings, key))}
             of_rig = {"rig": settings.rig, "needs_latency": settings.needs_latency}
-            journey.change(**{**asdict(settings), **known, **of_rig})
+            journey.change(**{**told, **known, **of_rig})
         return journey
     _check_own(folder)
     try:
@@ -491,7 +566,7 @@ def read_settings(path: Path) -> SessionSettings:
     try:
         content = parse_toml(read_bytes(path), where, "write lines as ball_mm = 30.0")
         return RecordCodec({}, unknown).read(SessionSettings, content)
-    except MismatchError as error:
+    except (MismatchError, OptionError) as error:
         raise FileFormatError(str(error), where=where, remedy=remedy) from error
 
 

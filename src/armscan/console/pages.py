@@ -24,6 +24,7 @@ from armscan.console.journey import (
     OF_A_SCAN,
     REPORT_FILE,
     Journey,
+    SeeingSettings,
     StepName,
     StepResult,
     StepState,
@@ -31,15 +32,23 @@ from armscan.console.journey import (
     open_journey,
     sessions_in,
 )
-from armscan.console.panels import Controls, PointsPanel, ScanPanel, padded, put
+from armscan.console.panels import (
+    Controls,
+    PointsPanel,
+    ScanPanel,
+    SeeingPanel,
+    TipPanel,
+    padded,
+    put,
+)
 from armscan.console.placements import Placement, drawing
 from armscan.console.quality import ModelWatch
 from armscan.console.rig import open_bench, take_back
 from armscan.console.scan import Bench, LiveScan
 from armscan.console.scene import SceneView, ShownPoints, paragraph, shown_points
 from armscan.console.server import LOOPBACK, PAGES, close_server, open_server
-from armscan.console.work import Worker, run_step, seen_in_take
-from armscan.errors import ArmscanError
+from armscan.console.work import Worker, recover_scans, run_step, seen_in_take
+from armscan.errors import ArmscanError, OutputError
 from armscan.pipeline.progress import ProgressEvent
 from armscan.records.exposure import Exposure
 from armscan.report.drawing import ACCENT, ALERT, INK, LINE, MUTED
@@ -86,10 +95,13 @@ class ConsolePage:
         self.controls = Controls(server, self.refresh)
         self.points = PointsPanel(SceneView(server))
         self.scanning = ScanPanel(self.controls, self.points, self.finish, self._look)
+        self.seeing = SeeingPanel(self.controls, self._see)
+        self.tip = TipPanel(self.controls, lambda: self.journey.folder / PROBE_FILE)
         self._seen: tuple[bool, str] | None = None
+        self._said: tuple[str, ...] = ()
         self._is_listing = False
         # real lasers are on only when somebody asked for it
-        self._is_viewing = bench is not None and bench.is_simulated
+        self._is_viewing = bench is not None and bench.has_operator
         self._held = ExitStack()
         self._lock = threading.RLock()
         self.journey = self._opened(folder)
@@ -98,7 +110,22 @@ class ConsolePage:
         self._build()
         self.refresh()
         self._show_stored()
-        threading.Thread(target=self.worker.prepare, daemon=True).start()
+        threading.Thread(target=self._prepare, daemon=True).start()
+
+    def _prepare(self) -> None:
+        """Start the worker's process, and save what a killed console left behind."""
+        self.worker.prepare()
+        if self.journey.cut_short:
+            self.controls.tried(self._recover)
+
+    def _recover(self) -> None:
+        self._busy("Saving a recording that was cut short ...")
+        try:
+            self._said = self.worker.run(recover_scans, self.journey.folder)
+        finally:
+            self._busy("")
+        if not self.scan and self.journey.scans:
+            self.scan = self.journey.scans[-1]
 
     def close(self) -> None:
         """End a scan and the work under way, and let others open the session."""
@@ -117,6 +144,8 @@ class ConsolePage:
         try:
             settings = None if self.bench is None else self.bench.settings
             journey = open_journey(folder, settings)
+            if self.bench is not None:
+                self.bench.see(journey.settings.seeing)
         except BaseException:
             held.close()
             raise
@@ -142,6 +171,7 @@ class ConsolePage:
         self._choice.on_update(lambda _: self._choose_title(self._choice.value))
         self._guide = gui.add_html("")
         self._settings()
+        self.tip.build()
         self._view = self.controls.button(
             "Camera view", self.view, "V", "Show what the camera sees, lasers on where needed"
         )
@@ -159,6 +189,7 @@ class ConsolePage:
         )
         self.scanning.build(self.start_or_pause)
         self._inspecting()
+        self.seeing.build(has_exposure=self.bench is not None and not self.bench.has_operator)
         self.scanning.build_pictures()
         self._calculate = self.controls.button(
             "Calculate", self.calculate, "K", "Run this step's job", "teal"
@@ -202,6 +233,12 @@ class ConsolePage:
         if any(getattr(now, key) != value for key, value in settings.items()):
             self.controls.tried(lambda: self.journey.change(**settings))
 
+    def _see(self, seeing: SeeingSettings | None) -> None:
+        """Have cameras and lines looked at so in this session."""
+        with self._lock:
+            self._bench().see(seeing)
+            self.journey.change(seeing=seeing)
+
     def _name(self) -> str:
         return self.journey.folder.resolve().name
 
@@ -243,7 +280,7 @@ class ConsolePage:
             self._rest()
 
     def _rest(self) -> None:
-        self._is_viewing = self.bench is not None and self.bench.is_simulated
+        self._is_viewing = self.bench is not None and self.bench.has_operator
         self.scanning.show_image(None)
         if self.bench is not None:
             self.bench.rest()
@@ -296,22 +333,29 @@ class ConsolePage:
                 self.live.start()
 
     def _begin(self) -> None:
-        step = self.step
+        step, now = self.step, self.journey.settings
         scanner = read_scanner_calibration(self.journey.scanner_file)
-        if step is StepName.SCAN:
-            self.scan = self.journey.new_scan()
-        else:
+        scan = self.journey.new_scan() if step is StepName.SCAN else ""
+        if not scan:
             self.journey.start_over(step)
-        folder = self.journey.recording(step, self._scan_of(step))
-        part, model = self.journey.settings.part, None
-        if step is StepName.SCAN and part:
-            model = ModelWatch(self.worker, self.journey.folder / part)
-        self.scanning.begin(LiveScan(self._bench(), step, folder, scanner), scanner, model)
+        path, model = self.journey.recording(step, scan), None
+        if step is StepName.SCAN and now.part:
+            model = ModelWatch(self.worker, self.journey.folder / now.part)
+        live = LiveScan(self._bench(), step, path, scanner, now.seeing)
+        self.scanning.begin(live, scanner, model)
+        self.scan = scan or self.scan
 
     def finish(self) -> None:
         """End the scan, and run its job."""
         with self._lock:
-            n = self.scanning.end()
+            try:
+                n = self.scanning.end()
+            except OutputError as error:
+                if self.journey.cut_short:
+                    self._recover()
+                raise OutputError(
+                    error.what, remedy="free some space, and scan the rest anew"
+                ) from error
         self.refresh()
         if n:
             self.calculate()
@@ -405,7 +449,7 @@ class ConsolePage:
         is_blocked = state.status == "waiting"
         is_full = is_taken and state.n_taken >= self._n_wanted()
         self._take.visible = is_taken and has_rig and not is_full and not is_blocked
-        is_twin = self.bench is not None and self.bench.is_simulated
+        is_twin = self.bench is not None and self.bench.has_operator
         is_view = self._take.visible and step.filling == "placements" and not is_twin
         self._view.visible = is_view
         self._view.label = "End the camera view (V)" if self._is_viewing else "Camera view (V)"
@@ -425,6 +469,7 @@ class ConsolePage:
         self._scan_choice.visible = self._scan_choice.visible and not is_live
         self._list_scans()
         now = self.journey.settings
+        self.seeing.show(self._seeing(), is_visible=has_rig and not is_live and not is_inspection)
         known: tuple[tuple[Any, object], ...] = (
             (self._target, now.target),
             (self._ball, now.ball_mm),
@@ -435,6 +480,7 @@ class ConsolePage:
             if field.value != value:
                 put(field, value)
         self._target.visible = self.step in (StepName.CAMERA, StepName.LASER)
+        self.tip.show(is_visible=self._needs_tip())
         uses_ball = is_inspection and self._compare.value == "ball"
         self._ball.visible = (self.step is StepName.CHECK or uses_ball) and not is_live
         can_run = not is_blocked and (is_inspection or state.n_taken >= step.least)
@@ -444,6 +490,13 @@ class ConsolePage:
         is_settled = state.status in ("good", "doubtful")
         self._calculate.color = "gray" if is_settled else "teal"
         self._next.visible = is_settled and not is_live and self.step is not StepName.INSPECT
+
+    def _seeing(self) -> SeeingSettings:
+        """How lines are looked at now."""
+        kept = self.journey.settings.seeing
+        if kept is None:
+            return SeeingSettings() if self.bench is None else self.bench.seeing
+        return kept
 
     def _list_scans(self) -> None:
         """Show the scans; the library chooses the first of new options by itself."""
@@ -507,7 +560,7 @@ class ConsolePage:
             return body + paragraph(f"All {wanted} are taken.", GOOD)
         shown = self._placement(n)
         enough = f" At least {step.least} are needed." if n < step.least else ""
-        is_twin = self.bench is not None and self.bench.is_simulated
+        is_twin = self.bench is not None and self.bench.has_operator
         own = "The simulated operator follows a list of its own." if is_twin else ""
         return (
             body + f'<p style="margin:6px 0 2px;font-size:14px;color:{INK}"><b>{kind} {n + 1} of '
@@ -524,19 +577,19 @@ class ConsolePage:
                 "Write into 'Target' which one you hold, for example chessboard:9x6:10 for 9 by 6 "
                 "inner corners 10 mm apart."
             )
-        is_real = self.bench is not None and not self.bench.is_simulated
-        if self.step is StepName.PROBING and is_real:
-            place = self.journey.folder / PROBE_FILE
-            if not place.is_file():
-                return f"Write first where the tip of the probe is, into {place}: see the how-to."
-        return ""
+        return self.tip.lacking if self._needs_tip() else ""
+
+    def _needs_tip(self) -> bool:
+        is_person = self.bench is not None and not self.bench.has_operator
+        return self.step is StepName.PROBING and is_person
 
     def _placement(self, k: int) -> Placement:
         known = BY_NAME[self.step].placements
         return known[k % len(known)]
 
     def _told(self, state: StepState) -> str:
-        problem = paragraph(self.controls.problem, WRONG) if self.controls.problem else ""
+        problem = "".join(paragraph(text, INK) for text in self._said)
+        problem += paragraph(self.controls.problem, WRONG) if self.controls.problem else ""
         if state.result is None or self.live is not None:
             return problem
         return problem + result_card(state, self._link(state.result.page, "All about it"))

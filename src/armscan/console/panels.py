@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts of the console's column that know no session: buttons with their keys, the points that are
-shown, and a scan while it runs.
+shown, how lines are seen, and a scan while it runs.
 """
 
 from __future__ import annotations
@@ -8,11 +8,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
 import viser
 
+from armscan.console.journey import SeeingSettings
 from armscan.console.quality import ModelWatch
 from armscan.console.scan import LiveScan
 from armscan.console.scene import (
@@ -27,16 +31,26 @@ from armscan.console.scene import (
     taken_image,
 )
 from armscan.console.work import told
+from armscan.errors import ArmscanError, OptionError
 from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.live.exposure import ExposureMode, ExposureSettings, LaserTarget
 from armscan.pipeline.live.session import LiveSnapshot, LiveStatus
 from armscan.records.exposure import Exposure
 from armscan.report.drawing import ALERT, INK, MUTED
+from armscan.report.quantity import sentence
+from armscan.storage.arm import ProbeTip, probe_tip_toml, read_probe_tip
+from armscan.storage.files import write_files
 
 REFRESH_S, CLOUD_EVERY_S = 0.3, 1.0
 DETAILS = {"up to 100,000": 100_000, "up to 500,000": 500_000, "up to 2 million": MOST_POINTS}
 DETAIL = "up to 500,000"
 """Shown at first: a computer without graphics processor draws two million points once a second."""
 WINDOW_PX = 420.0
+MODES: dict[str, ExposureMode] = {
+    "as set": "fixed",
+    "automatic": "automatic",
+    "automatic, glints": "reflective",
+}
 START_BUTTON, UNDO_BUTTON = "0", "1"
 """Buttons of the arm: start or pause, and take the last pass back."""
 
@@ -129,6 +143,180 @@ class PointsPanel:
             self._legend.content = padded(paragraph(text, MUTED, 12))
 
 
+class SeeingPanel:
+    """How the cameras see the laser's line, and what counts as one.
+
+    Parameters
+    ----------
+    controls
+        Of the page.
+    keep
+        Told of new settings; of None for what the rig's description says.
+    """
+
+    def __init__(self, controls: Controls, keep: Callable[[SeeingSettings | None], object]) -> None:
+        self._controls, self._keep = controls, keep
+
+    def build(self, *, has_exposure: bool) -> None:
+        """Add it to the column; a rendered camera has no exposure to set."""
+        gui = self._controls.gui
+        self._folder = gui.add_folder("Exposure, window, thresholds", expand_by_default=False)
+        with self._folder:
+            self._mode = gui.add_dropdown(
+                "Exposure", tuple(MODES), visible=has_exposure,
+                hint="Automatic brings the line to the grey value below, for parts with glints "
+                "its brightest twentieth",
+            )  # fmt: skip
+            self._target = gui.add_number("Line's grey value, %", 70.0, min=5.0, max=95.0)
+            self._lasers = gui.add_text("Of single lasers, %", "", hint="For example A 50, B 80")
+            self._time = gui.add_number("Exposure, us", 0.0, min=0.0, hint="0: the camera's own")
+            self._least = gui.add_number("At least, us", 20.0, min=0.1)
+            self._most = gui.add_number("At most, us", 5000.0, min=0.1)
+            self._gain = gui.add_text("Gain, dB", "", hint="Empty: the camera's own")
+            self._photo = gui.add_number(
+                "Photographs, us", 0.0, min=0.0, hint="Of the target; 0: the camera's own"
+            )
+            self._windows = gui.add_text(
+                "Window, px", "", hint="x, y, width, height; of two cameras with ; between"
+            )
+            of_camera = (
+                *(self._target, self._lasers, self._time, self._least, self._most),
+                *(self._gain, self._photo, self._windows),
+            )
+            for field in of_camera:
+                field.visible = has_exposure
+            self._height = gui.add_number(
+                "Line's height", 0.0, min=0.0, hint="Grey levels; 0: from the noise of the image"
+            )
+            self._width = gui.add_number(
+                "Line's width, px", 0.0, min=0.0, hint="Sigma of its cross-section; 0: found"
+            )
+            self._smoothing = gui.add_number("Smoothing, px", 12.0, min=0.0)
+            self._voxel = gui.add_number("A point each, mm", 0.5, min=0.001, hint="Shown, live")
+            self._every = gui.add_number("Measure every", 1, min=1, step=1, hint="Exposure, live")
+            self._controls.button("Use these", lambda: self._keep(self._read()), "", "From now on")
+            self._controls.button(
+                "As the rig says", lambda: self._keep(None), "", "What rig.toml says, or the twin"
+            )
+
+    def show(self, seeing: SeeingSettings, *, is_visible: bool) -> None:
+        """Show what holds."""
+        self._folder.visible = is_visible
+        given, lines = seeing.exposure, seeing.stripes
+        mode = next(words for words, name in MODES.items() if name == given.mode)
+        windows = "; ".join(", ".join(map(str, one)) for one in seeing.windows)
+        lasers = ", ".join(f"{one.laser} {100.0 * one.target:g}" for one in given.laser)
+        known: tuple[tuple[Any, object], ...] = (
+            (self._mode, mode),
+            (self._target, round(100.0 * given.target, 6)),
+            (self._lasers, lasers),
+            (self._time, given.exposure_us),
+            (self._least, given.least_us),
+            (self._most, given.most_us),
+            (self._gain, "" if given.gain_db is None else f"{given.gain_db:g}"),
+            (self._photo, seeing.photo_us),
+            (self._windows, windows),
+            (self._height, lines.threshold or 0.0),
+            (self._width, lines.line_sigma_px or 0.0),
+            (self._smoothing, lines.smoothing_px),
+            (self._voxel, seeing.voxel_mm),
+            (self._every, seeing.measured_every),
+        )
+        for field, value in known:
+            put(field, value)
+        self._before = seeing
+
+    def _read(self) -> SeeingSettings:
+        """What stands in the fields; raises `OptionError`."""
+        lasers = [one.rpartition(" ") for one in str(self._lasers.value).split(",") if one.strip()]
+        windows = [one.split(",") for one in str(self._windows.value).split(";") if one.strip()]
+        gain = str(self._gain.value).strip()
+        try:
+            exposure = ExposureSettings(
+                MODES[self._mode.value],
+                float(self._time.value),
+                float(gain) if gain else None,
+                0.01 * float(self._target.value),
+                float(self._least.value),
+                float(self._most.value),
+                tuple(LaserTarget(name.strip(), 0.01 * float(level)) for name, _, level in lasers),
+            )
+            places = tuple((int(x), int(y), int(w), int(h)) for x, y, w, h in windows)
+        except (ValueError, TypeError) as error:
+            raise OptionError(
+                "a gain, laser or window is not understood",
+                remedy="write 6 for a gain, A 50, B 80 for lasers, 0, 100, 1280, 400 for a window",
+            ) from error
+        stripes = replace(
+            self._before.stripes,
+            threshold=float(self._height.value) or None,
+            line_sigma_px=float(self._width.value) or None,
+            smoothing_px=float(self._smoothing.value),
+        )
+        found = SeeingSettings(
+            places, exposure, stripes, float(self._photo.value), float(self._voxel.value),
+            int(self._every.value),
+        )  # fmt: skip
+        # wrong counts are refused before they are kept
+        found.options  # noqa: B018
+        return found
+
+
+class TipPanel:
+    """Where the tip of the probe is, for a session whose plate a person touches.
+
+    Parameters
+    ----------
+    controls
+        Of the page.
+    place
+        Gives the file that holds it.
+    """
+
+    def __init__(self, controls: Controls, place: Callable[[], Path]) -> None:
+        self._controls, self._place = controls, place
+
+    def build(self) -> None:
+        """Add it to the column."""
+        gui = self._controls.gui
+        self._centre = gui.add_text("Tip, mm", "", hint="x, y, z of its centre in the tool's frame")
+        self._diameter = gui.add_number("Its diameter, mm", 0.0, min=0.0, step=0.0001)
+        self._use = self._controls.button("Use this tip", self._keep, "", "From now on")
+
+    def show(self, *, is_visible: bool) -> None:
+        """Show what is in the file, if there is one."""
+        for handle in (self._centre, self._diameter, self._use):
+            handle.visible = is_visible
+        if is_visible and self._place().is_file() and not self._centre.value:
+            with suppress(ArmscanError):
+                tip = read_probe_tip(self._place())
+                put(self._centre, ", ".join(f"{x:g}" for x in tip.centre_tool_mm))
+                put(self._diameter, tip.diameter_mm)
+
+    @property
+    def lacking(self) -> str:
+        """What a person has to tell before touches make sense; empty for nothing."""
+        if self._place().is_file():
+            return ""
+        return (
+            "Write first where the centre of the probe's ball is from the arm's tool point, along "
+            "the tool's axes, into 'Tip, mm', and how large it is: it stands in the probe's "
+            "papers. An arm that reports the ball's centre itself has 0, 0, 0."
+        )
+
+    def _keep(self) -> None:
+        try:
+            x, y, z = (float(one) for one in str(self._centre.value).split(","))
+        except ValueError as error:
+            raise OptionError(
+                f"the tip is '{self._centre.value}'", remedy="write three numbers as 0, 0, 125.3"
+            ) from error
+        if not float(self._diameter.value) > 0.0:
+            raise OptionError("the tip has no diameter", remedy="write that of its ball")
+        content = probe_tip_toml(ProbeTip(np.array([x, y, z]), float(self._diameter.value)))
+        write_files({self._place(): content}, is_overwriting=True)
+
+
 class ScanPanel:
     """A scan while it runs: its buttons, images, range bar and figures.
 
@@ -187,26 +375,36 @@ class ScanPanel:
         """End a scan, and show no more."""
         self._closing.set()
         if self.live is not None:
-            self.live.stop()
+            # what a full disk did not take is told when the session is opened again
+            with suppress(ArmscanError):
+                self.live.stop()
         self._thread.join(5.0)
 
     def begin(
         self, live: LiveScan, scanner: ScannerCalibration, model: ModelWatch | None = None
     ) -> None:
         """Start a scan and show it, beside its model if there is one."""
-        self.live, self._scanner, self._model = live, scanner, model
+        live.start()
         self._version = -1
         self._points.show(None)
-        live.start()
+        self._scanner, self._model, self.live = scanner, model, live
 
     def end(self) -> int:
-        """End the scan; returns how many exposures it recorded, 0 where none runs."""
+        """End the scan; returns how many exposures it recorded, 0 where none runs.
+
+        Raises
+        ------
+        OutputError
+            As `LiveScan.stop`; no scan runs then.
+        """
         live, self.live = self.live, None
         if live is None:
             return 0
-        live.stop()
-        self.show_image(None)
-        self._points.view.show_head(None, None)
+        try:
+            live.stop()
+        finally:
+            self.show_image(None)
+            self._points.view.show_head(None, None)
         return live.n_recorded
 
     def undo(self) -> None:
@@ -305,12 +503,14 @@ class ScanPanel:
     def _hear(self, live: LiveScan) -> None:
         while live.events:
             event = live.events.popleft()
+            is_fault = event.kind == "fault" and bool(event.device)
             if event.kind == "button" and event.text == START_BUTTON:
                 self._controls.tried(self._start)
             elif event.kind == "button" and event.text == UNDO_BUTTON:
                 self._controls.tried(self.undo)
             elif event.kind in ("fault", "warning"):
-                self._controls.problem = event.text
+                goes_on = " The scan goes on by itself when it answers again."
+                self._controls.problem = sentence(event.text) + (goes_on if is_fault else "")
                 self._controls.refresh()
             elif event.kind == "recovered":
                 self._controls.problem = ""
@@ -338,6 +538,11 @@ def _live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) -
     if live.bench.is_over:
         lines.append("the simulated hand has come to its end: finish")
     alerts = [model.problem] if model is not None and model.problem else []
+    if shown.state == "scanning" and not live.is_timed:
+        alerts.append(
+            "The devices' clocks are not known yet: what is recorded now cannot be placed. Wait; "
+            "if this stays, take more images a second."
+        )
     if shown.state == "scanning" and not live.session.is_recording:
         alerts.append("Nothing is recorded any more: finish, and see to the disk.")
     return "".join(

@@ -17,7 +17,7 @@ from typing import cast
 
 import numpy as np
 
-from armscan.console.journey import BY_NAME, SessionSettings, StepName
+from armscan.console.journey import BY_NAME, SeeingSettings, SessionSettings, StepName
 from armscan.console.scan import ArmReading, Bench, GrowingRecording, samples_of
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample, arm_track
@@ -33,8 +33,9 @@ from armscan.devices.protocols import (
 from armscan.devices.registry import open_device
 from armscan.devices.sources import Preset, ScanSource, TwinScene
 from armscan.errors import DeviceError, FileFormatError, OptionError
-from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
-from armscan.pipeline.live.session import LiveSession, exposure_of
+from armscan.pipeline.live.exposure import ExposureSettings
+from armscan.pipeline.live.rig import Rig, RigDescription, read_rig, told_as_fault_of
+from armscan.pipeline.live.session import LiveOptions, LiveSession, exposure_of
 from armscan.pipeline.simulate import TwinName, fewer_views
 from armscan.records.exposure import Exposure
 from armscan.records.recording import NO_TRIGGER, CameraSetup, ExposureRow, PoseForm, Session
@@ -57,6 +58,14 @@ WAIT_S = 5.0
 """A take waits so long for an image and a pose."""
 
 
+SHOWN_SCENES: dict[StepName, TwinScene] = {
+    StepName.CAMERA: "camera",
+    StepName.LASER: "laser",
+    StepName.HAND_EYE: "hand-eye",
+    StepName.LATENCY: "latency",
+    StepName.CHECK: "ball",
+}
+"""Put before the devices of a twin that run by themselves; scans see what its address says."""
 TAKEN_SCENES: dict[StepName, TwinScene] = {
     StepName.CAMERA: "camera",
     StepName.LASER: "laser",
@@ -200,7 +209,7 @@ class TwinBench:
         self.scene = cast(TwinScene, values.get("scene", "workpiece"))
         preset = cast(Preset, values.get("preset", "thesis"))
         self.twin = TwinName(head or "thesis-single", preset, seed).build()
-        self.address, self.is_simulated = address, True
+        self.address, self.is_simulated, self.has_operator = address, True, True
         self._n_cameras = len(self.twin.scan("camera").session.cameras)
         self._sources: dict[str, ScanSource] = {}
         self._hand: _Hand | None = None
@@ -304,10 +313,20 @@ class TwinBench:
         source = self.scan_source(scenes.get(step, self.scene))
         hand = self._hand = _Hand(source, self.rate_hz)
         ids = source.arm is not None and source.arm.trigger_ids is not None
-        description = RigDescription((self.address,), is_common_trigger=ids)
+        description = RigDescription((self.address,) * self._n_cameras, is_common_trigger=ids)
         cameras: list[Camera] = [_HandCamera(hand, k) for k in range(self._n_cameras)]
         arm: Arm = _HandArm(hand)
         return Rig(cameras, arm, None, description)
+
+    @property
+    def seeing(self) -> SeeingSettings:
+        """As of `Bench`."""
+        return SeeingSettings()
+
+    def see(self, seeing: SeeingSettings | None) -> None:
+        """As of `Bench`; its images are rendered as they are, only thresholds matter."""
+        if seeing is not None:
+            seeing.set_in(RigDescription((self.address,) * self._n_cameras))
 
     def hold(self, is_held: bool) -> None:
         """As of `Bench`."""
@@ -401,9 +420,13 @@ class DeviceBench:
     def __init__(self, rig: Rig, name: str) -> None:
         self.rig, self.name = rig, name
         self.n_placements: dict[StepName, int] = {}
-        self.is_over = self.is_simulated = False
+        self.is_over = self.has_operator = False
+        self.is_simulated = all(one.startswith(TWIN) for one in rig.description.cameras)
+        self._described, self._photo_us = rig.description, 0.0
+        self._whole = [camera.settings for camera in rig.cameras]
         self._lock = threading.RLock()
         self._watched: tuple[LiveSession, _Latest] | None = None
+        self._watched_for: StepName | None = None
         self._lit: tuple[str, ...] | None = None
 
     @property
@@ -423,8 +446,11 @@ class DeviceBench:
             states = [*((source,) for source in sources), ()]
         elif step is StepName.HAND_EYE:
             states = [sources, sources]
+        # cameras deliver their whole sensor from here on
+        self._watch(step)
         setups = [camera.setup for camera in self.rig.cameras]
-        grown = GrowingRecording.of(folder, Session("calibration", tuple(setups)))
+        session = Session("calibration", tuple(setups), is_simulated=self.is_simulated)
+        grown = GrowingRecording.of(folder, session)
         shown = None
         view = f"{k + 1:02d}"
         for state, instant in zip(states, self._instants(states, step), strict=True):
@@ -447,7 +473,7 @@ class DeviceBench:
         tip = read_probe_tip(folder.parents[1] / PROBE_FILE)
         if self.rig.arm is None:
             raise DeviceError("the rig has no arm", remedy="name it in rig.toml")
-        latest = self._watch()
+        latest = self._watch(StepName.PROBING)
         self._light(())
         latest.samples.clear()
         end = time.monotonic() + WAIT_S
@@ -459,11 +485,12 @@ class DeviceBench:
         with suppress(FileFormatError):
             before = list(samples_of(read_arm_track(folder)[0]))
         t_ns = max(found[-1].sample.t_host_ns, before[-1][0] + 1 if before else 0)
-        _write_touches(folder, [*before, (t_ns, found[-1].pose, -1)], tip, is_simulated=False)
+        _write_touches(folder, [*before, (t_ns, found[-1].pose, -1)], tip,
+                       is_simulated=self.is_simulated)  # fmt: skip
 
     def look(self, step: StepName, k: int) -> Exposure | None:
         """As of `Bench`: the latest image of the first camera."""
-        latest = self._watch()
+        latest = self._watch(step)
         self._light(() if step is StepName.CAMERA else self._sources)
         instants = tuple(latest.instants)
         frames = [one.frames[0] for one in instants if one.frames[0] is not None]
@@ -471,15 +498,43 @@ class DeviceBench:
             return None
         return exposure_of(frames[-1], self.rig.cameras[0].setup, instants[-1])
 
-    def _watch(self) -> _Latest:
+    @property
+    def seeing(self) -> SeeingSettings:
+        """As of `Bench`."""
+        return SeeingSettings.of(self._described)
+
+    def see(self, seeing: SeeingSettings | None) -> None:
+        """As of `Bench`."""
+        how = seeing or SeeingSettings.of(self._described)
+        described = how.set_in(self._described)
+        self.rest()
+        self.rig.description, self._photo_us = described, how.photo_us
+
+    def _watch(self, step: StepName) -> _Latest:
         """What comes while targets and head are put right; nothing of it is recorded."""
         with self._lock:
-            if self._watched is None:
+            if self._watched is None or self._watched_for is not step:
+                self.rest()
+                self._set_out(step)
+                # photographs are taken in the light of the room: there is no line to go by
+                exposure = self.rig.description.exposure
+                if step is StepName.CAMERA:
+                    exposure = ExposureSettings(exposure_us=self._photo_us)
                 latest = _Latest()
-                session = LiveSession(self.rig, recorder=latest)
+                session = LiveSession(
+                    self.rig, options=LiveOptions(exposure=exposure), recorder=latest
+                )
                 session.start()
-                self._watched, self._lit = (session, latest), None
+                self._watched, self._watched_for, self._lit = (session, latest), step, None
             return self._watched[1]
+
+    def _set_out(self, step: StepName) -> None:
+        """The cameras as they were opened: windows are for scans, exposures for their step."""
+        for camera, whole in zip(self.rig.cameras, self._whole, strict=True):
+            with told_as_fault_of(camera.name):
+                camera.configure(replace(whole, rate_hz=None))
+        if self.rig.can_show and step in SHOWN_SCENES:
+            self.rig.show(SHOWN_SCENES[step])
 
     def rest(self) -> None:
         """As of `Bench`."""
@@ -502,7 +557,7 @@ class DeviceBench:
         self, states: Sequence[tuple[str, ...]], step: StepName
     ) -> Iterator[MatchedInstant]:
         """One complete instant of each state of the lasers."""
-        latest = self._watch()
+        latest = self._watch(step)
         for state in states:
             self._light(state)
             latest.instants.clear()
@@ -531,6 +586,8 @@ class DeviceBench:
     def scan_rig(self, step: StepName) -> Rig:
         """As of `Bench`."""
         self.rest()
+        self._set_out(step)
+        self.rig.set_windows()
         return self.rig
 
     def hold(self, is_held: bool) -> None:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scan of a session while it is taken: its live chain, and its recording, which grows on disk and
-is whole again and again.
+"""What a session records: placements one by one in a folder, and a scan while it is taken, with its
+live chain, in one file.
 """
 
 from __future__ import annotations
@@ -8,32 +8,28 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from armscan.console.journey import SessionSettings, StepName
+from armscan.console.journey import SeeingSettings, SessionSettings, StepName
 from armscan.console.quality import Incidence, passes_apart_mm
-from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample, arm_track
-from armscan.devices.protocols import Frame, LaserEvent
 from armscan.errors import OutputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.arm import axis_frames
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.live.acquire import LiveEvent
+from armscan.pipeline.live.recorder import LiveRecorder
 from armscan.pipeline.live.rig import Rig
 from armscan.pipeline.live.session import (
-    LiveOptions,
     LiveSession,
     LiveSnapshot,
     ShownCloud,
-    exposure_of,
 )
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
@@ -49,10 +45,8 @@ from armscan.storage.recording_session import (
 )
 from armscan.storage.tables import csv_bytes
 
-TABLES_EVERY_S = 1.0
-"""A scan's tables are written so often: a kill loses no more."""
-WRITERS, MOST_PENDING = 2, 64
-"""Threads that pack images, and images that may wait for them: more, and the devices wait."""
+CLOCKS_S = 5.0
+"""A scan begins when the devices' clocks are known, or after so long with those that are."""
 ArmReading = tuple[int, Pose[Base, Tool] | None, int]
 """Time in ns, ``base_from_tool`` or None, and number of the trigger."""
 
@@ -71,15 +65,12 @@ class GrowingRecording:
         The exposures that are listed.
     samples
         Time, pose and trigger id of samples of the arm.
-    left_out
-        Exposures whose images are there and which are not listed.
     """
 
     folder: Path
     session: Session
     rows: list[ExposureRow] = field(default_factory=list)
     samples: list[ArmReading] = field(default_factory=list)
-    left_out: list[ExposureRow] = field(default_factory=list)
 
     @staticmethod
     def of(folder: Path, session: Session) -> GrowingRecording:
@@ -100,12 +91,7 @@ class GrowingRecording:
         return grown
 
     def add(self, row: ExposureRow, exposure: Exposure) -> None:
-        """Write an image; `flush` lists it."""
-        self.write_image(row, exposure)
-        self.rows.append(row)
-
-    def write_image(self, row: ExposureRow, exposure: Exposure) -> None:
-        """Write an image of a row that is added afterwards; several threads may do so.
+        """Write an image; `flush` lists it.
 
         Raises
         ------
@@ -114,20 +100,15 @@ class GrowingRecording:
         """
         content = encoded_png(exposure, self.session.cameras[row.camera])
         path = self.folder / row.source
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(
-                f"the folder cannot be made ({error.strerror})", where=path_text(path.parent)
-            ) from error
+        make_folder(path.parent)
         write_files({path: content}, is_overwriting=True)
+        self.rows.append(row)
 
     def take_back(self) -> None:
         """Take the latest view out of the list, and samples of the arm that came after the rest."""
         views = [row.t_ns if row.view is None else row.view for row in self.rows]
-        self.leave_out(
-            [row for row, view in zip(self.rows, views, strict=True) if view == views[-1]]
-        )
+        both = zip(self.rows, views, strict=True)
+        self.rows = [row for row, view in both if view != views[-1]]
         until = max((row.t_ns for row in self.rows), default=-1)
         self.samples = [one for one in self.samples if one[0] <= until]
 
@@ -135,11 +116,6 @@ class GrowingRecording:
         """Keep a sample of the arm; one that is not later than the last is passed over."""
         if not self.samples or t_ns > self.samples[-1][0]:
             self.samples.append((t_ns, pose, NO_TRIGGER if trigger_id is None else trigger_id))
-
-    def leave_out(self, chosen: Sequence[ExposureRow]) -> None:
-        """Take rows out of the list; their images stay."""
-        self.left_out += chosen
-        self.rows = [row for row in self.rows if row not in chosen]
 
     def flush(self) -> None:
         """Write the tables, all or none."""
@@ -168,6 +144,22 @@ def samples_of(arm: ArmTrack) -> Iterator[ArmReading]:
         yield t_ns, arm.pose(k) if arm.is_known[k] else None, trigger
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder with those above it.
+
+    Raises
+    ------
+    OutputError
+        If the disk refuses.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"the folder cannot be made ({error.strerror})", where=path_text(folder)
+        ) from error
+
+
 class Bench(Protocol):
     """A rig and what stands before it, as the console uses them."""
 
@@ -178,6 +170,23 @@ class Bench(Protocol):
     @property
     def is_simulated(self) -> bool:
         """Whether images are rendered."""
+
+    @property
+    def has_operator(self) -> bool:
+        """Whether a simulated operator shows what each step asks for."""
+
+    @property
+    def seeing(self) -> SeeingSettings:
+        """How they are looked at where nothing else is said."""
+
+    def see(self, seeing: SeeingSettings | None) -> None:
+        """Have cameras and lines looked at so from now; None for what the rig's description says.
+
+        Raises
+        ------
+        InputError
+            If windows do not fit the cameras.
+        """
 
     @property
     def n_placements(self) -> dict[StepName, int]:
@@ -223,103 +232,81 @@ class Bench(Protocol):
         """Give the devices back."""
 
 
-class ScanRecorder:
-    """Records a live scan as a folder; see `armscan.pipeline.live.acquire.Recorder`.
+class ScanRecorder(LiveRecorder):
+    """Records a live scan to one file, and knows what came with which frame.
 
     Parameters
     ----------
-    folder
-        Of the recording.
-    rig
-        Whose instants come.
-    is_simulated
-        Whether images are rendered.
+    path, rig, is_simulated
+        As of `LiveRecorder`.
+    keeps_times
+        Times are the devices' own, of one clock: a simulated hand arrives as fast as its images are
+        rendered, and this computer's time says nothing of it.
+
+    Attributes
+    ----------
+    pose_of
+        The tool's pose by number of the frame.
+    latest_joints_rad
+        (J,) angles of the arm, where it gives them.
+    n_left_out
+        Exposures that were taken back.
     """
 
-    def __init__(self, folder: Path, rig: Rig, *, is_simulated: bool) -> None:
-        self.is_triggered = rig.description.is_common_trigger
-        self.setups = [camera.setup for camera in rig.cameras]
-        # one clock for all where ids decide nothing: the times are then this computer's
-        session = Session("scan", tuple(self.setups), is_simulated=is_simulated)
-        self.grown = GrowingRecording.of(folder, session)
+    def __init__(
+        self, path: Path, rig: Rig, *, is_simulated: bool, keeps_times: bool = False
+    ) -> None:
+        super().__init__(path, rig, is_simulated=is_simulated)
+        self.path, self._keeps_times = path, keeps_times
         self.pose_of: dict[int, Pose[Base, Tool] | None] = {}
-        """By number of the frame."""
         self.latest_joints_rad: FloatArray | None = None
-        self._rows_of: dict[int, list[ExposureRow]] = {}
-        self._n_rows = len(self.grown.rows)
-        self._writers = ThreadPoolExecutor(WRITERS)
-        self._pending: deque[tuple[Future[None], ExposureRow]] = deque()
+        self.n_left_out = 0
+        self._index_of: dict[int, int] = {}
         self._lock = threading.Lock()
-        self._written = time.monotonic()
-
-    @property
-    def n_rows(self) -> int:
-        """Exposures that are recorded, also those whose images are being written."""
-        return len(self.grown.rows) + len(self._pending)
-
-    def add_frame(self, camera: int, frame: Frame, status: ElementStatus) -> None:
-        """Instants hold the frames."""
-
-    def add_events(self, events: tuple[LaserEvent, ...]) -> None:
-        """Instants know what was on."""
 
     def add_samples(self, samples: tuple[TimedSample, ...]) -> None:
-        """Keep those that have a time."""
-        with self._lock:
-            for one in samples:
-                if one.sample.joints_rad is not None:
-                    self.latest_joints_rad = one.sample.joints_rad
-                t_ns = one.sample.t_device_ns if self.is_triggered else one.t_ns
-                if t_ns is not None:
-                    self.grown.add_sample(t_ns, one.pose, one.sample.trigger_id)
+        """Keep them, and the latest angles to draw the arm."""
+        for one in samples:
+            if one.sample.joints_rad is not None:
+                self.latest_joints_rad = one.sample.joints_rad
+        if self._keeps_times:
+            samples = tuple(replace(one, t_ns=one.sample.t_device_ns) for one in samples)
+        super().add_samples(samples)
 
     def add_instant(self, instant: MatchedInstant) -> None:
-        """Write its images; one without a time cannot be placed and is passed over."""
+        """Write its images."""
         with self._lock:
-            for camera, frame in enumerate(instant.frames):
-                if frame is None or not frame.is_complete:
-                    continue
-                t_ns = frame.t_device_ns if self.is_triggered else instant.t_ns
-                if t_ns is None:
-                    continue
-                index, self._n_rows = self._n_rows, self._n_rows + 1
-                row = ExposureRow(
-                    index,
-                    t_ns,
-                    camera,
-                    f"images/{index:05d}.png",
-                    instant.lasers or (),
-                    frame.trigger_id if self.is_triggered else None,
-                )
-                shot = exposure_of(frame, self.setups[camera], instant, camera)
-                self._pending.append((self._writers.submit(self.grown.write_image, row, shot), row))
-                self.pose_of[frame.number] = instant.pose
-                self._rows_of.setdefault(frame.number, []).append(row)
-            self._list_written(MOST_PENDING)
-            if time.monotonic() - self._written > TABLES_EVERY_S:
-                self._written = time.monotonic()
-                self.grown.flush()
+            first = self.n_exposures
+            if self._keeps_times:
+                times = [frame.t_device_ns for frame in instant.frames if frame is not None]
+                instant = replace(instant, t_ns=times[0])
+            super().add_instant(instant)
+            for frame in instant.frames:
+                if frame is not None:
+                    self.pose_of[frame.number] = instant.pose
+                    self._index_of.setdefault(frame.number, first)
 
-    def _list_written(self, most_pending: int) -> None:
-        """List the images that are on disk, and wait until no more than so many are not."""
-        while self._pending and (len(self._pending) > most_pending or self._pending[0][0].done()):
-            done, row = self._pending.popleft()
-            done.result()
-            self.grown.rows.append(row)
-
-    def leave_out(self, first: int) -> None:
+    def leave_out(self, frame: int) -> None:
         """Take what was recorded since a frame, by its number, out of the list."""
         with self._lock:
-            self._list_written(0)
-            since = min((row.index for row in self._rows_of.get(first, ())), default=self._n_rows)
-            self.grown.leave_out([row for row in self.grown.rows if row.index >= since])
-            self.grown.flush()
+            since = self._index_of.get(frame, self.n_exposures)
+            gone = [number for number, index in self._index_of.items() if index >= since]
+            self.n_left_out += len({self._index_of.pop(number) for number in gone})
+            self.take_back(since)
 
     def finish(self) -> None:
-        """Write the tables, with all images that came."""
-        with self._lock:
-            self._list_written(0)
-            self.grown.flush()
+        """Write the file's end; one without an exposure is removed.
+
+        Raises
+        ------
+        OutputError
+            If the disk is full or refuses; says how much is safe.
+        """
+        try:
+            self.close()
+        finally:
+            if not self.status().n_written:
+                self.path.unlink(missing_ok=True)
 
 
 class LiveScan:
@@ -331,18 +318,32 @@ class LiveScan:
         What is scanned with.
     step
         Scan, daily check or latency.
-    folder
-        Of the recording.
+    path
+        Of the recording, ``.mcap``; must not exist.
     scanner
         Places points; None only to show images and record.
+    seeing
+        How lines are seen; None for what the rig's description says.
+
+    Raises
+    ------
+    ArmscanError
+        If the rig has not what the scanner needs, or a camera does not take its settings.
     """
 
     def __init__(
-        self, bench: Bench, step: StepName, folder: Path, scanner: ScannerCalibration | None
+        self,
+        bench: Bench,
+        step: StepName,
+        path: Path,
+        scanner: ScannerCalibration | None,
+        seeing: SeeingSettings | None = None,
     ) -> None:
-        self.bench, self.step, self.folder = bench, step, folder
+        self.bench, self.step, self.path = bench, step, path
         self.rig = bench.scan_rig(step)
-        self.recorder = ScanRecorder(folder, self.rig, is_simulated=bench.is_simulated)
+        self.recorder = ScanRecorder(
+            path, self.rig, is_simulated=bench.is_simulated, keeps_times=bench.has_operator
+        )
         self.events: deque[LiveEvent] = deque(maxlen=50)
         self._scanner = scanner
         self._frame_of: dict[int, int] = {}
@@ -352,22 +353,48 @@ class LiveScan:
         self.session = LiveSession(
             self.rig,
             scanner,
-            options=LiveOptions.of(self.rig.description),
+            options=(seeing or SeeingSettings.of(self.rig.description)).options,
             recorder=self.recorder,
             keep_cloud=self._remember,
         )
         self.session.add_listener(self._hear)
 
     def start(self) -> None:
-        """Begin, or go on after a pause, with a new pass."""
+        """Begin, or go on after a pause, with a new pass.
+
+        Raises
+        ------
+        ArmscanError
+            If a device does not answer, or the file cannot be made; nothing runs then.
+        """
+        if self.snapshot.state == "closed":
+            self.session.open()
+            try:
+                self._wait_for_clocks()
+                make_folder(self.path.parent)
+                self.recorder.begin()
+            except BaseException:
+                self.session.stop()
+                raise
+            self.session.add_listener(self.recorder.hear)
         self.session.start()
         self.bench.hold(False)
+
+    def _wait_for_clocks(self) -> None:
+        end = time.monotonic() + CLOCKS_S
+        while not self.is_timed and time.monotonic() < end:
+            time.sleep(CLOCKS_S / 100.0)
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether what is recorded now can be placed: by ids, or by clocks that are known."""
+        is_by_time = self.rig.arm is not None and not self.rig.description.is_common_trigger
+        return not is_by_time or self.session.is_timed
 
     def pause(self) -> None:
         """Record nothing until `start`."""
         self.bench.hold(True)
         self.session.pause()
-        self.recorder.finish()
 
     def undo_pass(self) -> None:
         """Take the last pass out of the cloud and out of the recording's list."""
@@ -385,7 +412,13 @@ class LiveScan:
             self.recorder.leave_out(min(self._frame_of.values()))
 
     def stop(self) -> None:
-        """End the scan; the recording is whole."""
+        """End the scan; the recording is whole.
+
+        Raises
+        ------
+        OutputError
+            If the disk was full or refused; says how much is safe. All else has ended then.
+        """
         self.bench.hold(True)
         self.session.stop()
         self.recorder.finish()
@@ -397,8 +430,8 @@ class LiveScan:
 
     @property
     def n_recorded(self) -> int:
-        """Exposures in the recording."""
-        return self.recorder.n_rows
+        """Exposures in the recording that were not taken back."""
+        return self.recorder.n_exposures - self.recorder.n_left_out
 
     def drift_mm(self) -> float | None:
         """Median distance of the last pass from the surface of the earlier ones, where they meet.
@@ -441,7 +474,7 @@ class LiveScan:
     def _hear(self, event: LiveEvent) -> None:
         # a simulated hand waits for its images to be rendered, and any hand may pause
         is_silence = event.kind in ("fault", "recovered") and (
-            self.bench.is_simulated or self.session.snapshot().state != "scanning"
+            self.bench.has_operator or self.session.snapshot().state != "scanning"
         )
         if not is_silence:
             self.events.append(event)

@@ -12,7 +12,7 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
@@ -142,9 +142,17 @@ def _response(status: HTTPStatus, content: bytes, kind: str) -> Response:
 def _guarded(door: Door) -> Iterator[None]:
     """Have a server that is made meanwhile ask the door first.
 
-    viser takes no hook for requests: the function with which it begins to listen is replaced while
-    it does, and only then.
+    viser 1.1 takes no hook for requests: it makes its own inside the call that begins to listen,
+    and a second server before it would leave its port open beside the door. So the function with
+    which it begins to listen is replaced while it does, and only then. A viser that begins in
+    another way is not let in: nobody would ask who comes.
+
+    Raises
+    ------
+    OptionError
+        If the server that was made does not ask.
     """
+    asking = threading.Event()
     with _patching:
         serve = sockets.serve
 
@@ -155,6 +163,7 @@ def _guarded(door: Door) -> Iterator[None]:
                     return refused
                 return door.marked(request, process_request(connection, request))
 
+            asking.set()
             return serve(*given, process_request=ask, **named)
 
         sockets.serve = guarded  # type: ignore[assignment,misc]
@@ -162,6 +171,11 @@ def _guarded(door: Door) -> Iterator[None]:
             yield
         finally:
             sockets.serve = serve  # type: ignore[misc]
+    if not asking.is_set():
+        raise OptionError(
+            f"viser {viser.__version__} cannot be told who may come in",
+            remedy="pip install 'viser==1.1.1', and report this",
+        )
 
 
 def open_server(
@@ -197,8 +211,11 @@ def open_server(
     token = secrets.token_urlsafe(24)
     chosen = _free_port(host, PORT if port is None else port, is_asked=port is not None)
     # viser prints a box with its own addresses: ours is told by who opens the console
-    with _guarded(Door(token, folder_of_pages)), redirect_stdout(StringIO()):
-        server = viser.ViserServer(host=host, port=chosen, label="armscan", verbose=False)
+    with ExitStack() as made, redirect_stdout(StringIO()):
+        with _guarded(Door(token, folder_of_pages)):
+            server = viser.ViserServer(host=host, port=chosen, label="armscan", verbose=False)
+            made.callback(server.stop)
+        made.pop_all()
     name = "localhost" if is_loopback(host) else host
     # an address that means all of this computer's is none to open
     name = socket.gethostname() if host in ("0.0.0.0", "::") else name

@@ -27,6 +27,7 @@ from armscan.console.journey import (
     SETTINGS_FILE,
     STEPS,
     Journey,
+    SessionSettings,
     StepName,
     StepResult,
     Verdict,
@@ -34,12 +35,13 @@ from armscan.console.journey import (
     read_settings,
     result_key,
 )
-from armscan.errors import ArmscanError, EstimationError, OptionError
+from armscan.errors import ArmscanError, EstimationError, FileFormatError, OptionError
 from armscan.jobs.camera import calibrate_camera
 from armscan.jobs.hand_eye import Artefact, StripeSource, calibrate_hand_eye, calibrate_latency
 from armscan.jobs.inspection.cad import inspect_cad
 from armscan.jobs.inspection.shapes import inspect_plane, inspect_sphere
 from armscan.jobs.job import Job
+from armscan.jobs.live.recordings import recover_recording
 from armscan.jobs.probe import probe
 from armscan.jobs.reconstruct import StillPaths, reconstruct
 from armscan.jobs.sheets import SheetImages, calibrate_sheets
@@ -51,7 +53,7 @@ from armscan.report.page import Block, Facts, Links, Page, Section, footer, rend
 from armscan.report.quantity import Summary, fact, sentence
 from armscan.storage.arm import ARM_FILE
 from armscan.storage.documents import new_provenance
-from armscan.storage.files import write_files
+from armscan.storage.files import is_file, write_files
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE
@@ -94,8 +96,9 @@ class Worker:
         if self._process is None or not self._process.is_alive():
             context = get_context("spawn")
             self._link, theirs = context.Pipe()
-            self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-            self._process.start()
+            process = context.Process(target=_serve, args=(theirs,), daemon=True)
+            process.start()
+            self._process = process
             theirs.close()
 
     def run(self, work: Callable[..., Result], *given: Any, progress: Progress = silent) -> Result:
@@ -234,7 +237,14 @@ def run_step(
             where=known.title,
             remedy=f"take at least {known.least}, better all",
         )
-    inputs = [path for path in _inputs(journey, step, scan) if path.is_file()]
+    if known.filling == "motion" and not journey.n_taken(step, scan):
+        raise OptionError(
+            "none of the exposures can be used: passes were taken back, parts of images were lost, "
+            "or the clocks of the devices were not known",
+            where=scan or known.title,
+            remedy="scan once more; without a trigger in common at ten images a second or more",
+        )
+    inputs = [path for path in _inputs(journey, step, scan) if is_file(path)]
     rests_on = {path.relative_to(folder).as_posix(): digest_of(path) for path in inputs}
     try:
         result = _judged(step, _work(journey, step, scan, compare, progress))
@@ -253,6 +263,42 @@ def run_step(
     write_files({place: json.dumps(asdict(result), indent=1).encode()}, is_overwriting=True)
     write_report(journey)
     return result
+
+
+def recover_scans(folder: Path, progress: Progress = silent) -> tuple[str, ...]:
+    """Make recordings that were cut short whole again, with all exposures that are.
+
+    Parameters
+    ----------
+    folder
+        The session, which nobody records into.
+    progress
+        Not told.
+
+    Returns
+    -------
+    told
+        A sentence for each; one of which nothing can be used is laid aside as ``NAME.aside``.
+
+    Raises
+    ------
+    OutputError
+        If the disk is full or refuses; nothing is lost then.
+    """
+    said = []
+    for path in Journey(folder, SessionSettings()).cut_short:
+        whole = path.with_name(f".{path.name}")
+        try:
+            found = recover_recording(path, whole, is_overwriting=True)
+        except FileFormatError as error:
+            aside = path.with_suffix(".aside")
+            path.replace(aside)
+            said.append(f"{path.stem} was cut short, and {error.what}: it lies in {aside.name}.")
+            continue
+        whole.replace(path)
+        n = next(one.value for one in found.quantities if one.key == "exposures")
+        said.append(f"{path.stem} was cut short: its {n} exposures were saved.")
+    return tuple(said)
 
 
 def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> tuple[bool, str]:
@@ -318,8 +364,9 @@ def _work(journey: Journey, step: StepName, scan: str, compare: str, progress: P
         return Job(folder / name, is_overwriting=True, command=command, progress=progress)
 
     def scanned() -> Summary:
-        paths = StillPaths((str(place),))
-        return reconstruct(job(f"{scan}.ply"), journey.scanner_file, paths)
+        paths, seeing = StillPaths((str(place),)), settings.seeing
+        options = None if seeing is None else seeing.options.measure
+        return reconstruct(job(f"{scan}.ply"), journey.scanner_file, paths, options=options)
 
     def camera() -> Summary:
         if settings.n_cameras > 1:
@@ -430,7 +477,9 @@ def write_report(journey: Journey) -> Path:
                 blocks.append(Links(((result.page, "All about it"),)))
             sections.append(Section(title, tuple(blocks)))
     files = [journey.folder / SETTINGS_FILE]
-    tables = [journey.recording(step.name) / EXPOSURES_FILE for step in STEPS]
+    places = [journey.recording(step.name) for step in STEPS if step.name not in OF_A_SCAN]
+    places += [journey.recording(StepName.SCAN, scan) for scan in journey.scans]
+    tables = [place / EXPOSURES_FILE for place in places]
     provenance = new_provenance(files, command=("armscan", "console", journey.folder.name))
     page = Page(
         title=f"Session {journey.folder.resolve().name}",
@@ -438,7 +487,7 @@ def write_report(journey: Journey) -> Path:
         cards=(),
         warnings=(),
         sections=tuple(sections),
-        is_simulated=are_simulated([path for path in tables if path.is_file()]),
+        is_simulated=are_simulated([path for path in tables if is_file(path)]),
         footer=footer(provenance),
     )
     path = journey.folder / REPORT_FILE

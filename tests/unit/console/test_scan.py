@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import time
 from collections.abc import Sequence
@@ -14,8 +15,8 @@ import pytest
 
 pytest.importorskip("viser")
 
-import armscan.console.scan as scan_module
-from armscan.console.journey import SessionSettings, StepName
+import armscan.console.journey as journey_module
+from armscan.console.journey import SeeingSettings, SessionSettings, StepName
 from armscan.console.placements import (
     CAMERA,
     HAND_EYE,
@@ -29,69 +30,32 @@ from armscan.console.placements import (
 from armscan.console.rig import DeviceBench, _Hand, _HandArm, _HandCamera, take_back
 from armscan.console.scan import LiveScan
 from armscan.console.scene import ShownPoints, depths_mm, point_colours, range_bar, thinned
+from armscan.console.work import recover_scans
 from armscan.devices.protocols import LaserEvent
-from armscan.devices.sources import ScanSource
-from armscan.errors import OutputError
+from armscan.errors import InputError, OutputError
+from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.scan import ScanOptions, measure_scan
-from armscan.records.recording import ArmTrack, CameraSetup, Session
-from armscan.storage.files import write_files
+from armscan.records.exposure import SensorWindow
 from armscan.storage.recording import read_recording
-from rigs.scan_fake import CAMERA as DRAWN
-from rigs.scan_fake import as_source, fake_scan, scanner
-
-
-def drawn_scan(n: int) -> ScanSource:
-    scan = fake_scan(n)
-    poses = [scan.truth[k] for k in range(n)]
-    track = ArmTrack(
-        t_ns=np.array([row.t_ns for row in scan.rows]),
-        rotations=np.array([pose.rotation for pose in poses]),
-        translations_mm=np.array([pose.translation_mm for pose in poses]),
-        is_known=np.ones(n, dtype=bool),
-        trigger_ids=np.arange(n),
-    )
-    rows = tuple(replace(row, trigger_id=k, lasers=("A",)) for k, row in enumerate(scan.rows))
-    session = Session("scan", (CameraSetup(DRAWN.width_px, DRAWN.height_px),))
-    return as_source(replace(scan, rows=rows, arm=track, session=session))
-
-
-class DrawnBench:
-    """A hand over a drawn scan."""
-
-    def __init__(self, n: int, rate_hz: float = 200.0) -> None:
-        self.hand = _Hand(drawn_scan(n), rate_hz)
-        self.settings = SessionSettings()
-        self.is_simulated = True
-
-    def scan_rig(self, step: StepName) -> Rig:
-        description = RigDescription(("drawn",), is_common_trigger=True)
-        return Rig([_HandCamera(self.hand, 0)], _HandArm(self.hand), None, description)
-
-    def hold(self, is_held: bool) -> None:
-        self.hand.is_held = is_held
-
-    @property
-    def is_over(self) -> bool:
-        return self.hand.is_over
-
-
-def waited(done) -> None:
-    end = time.monotonic() + 20.0
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.01)
+from armscan.storage.recordings import write_mcap
+from rigs.console_rig import DrawnBench, FailingBench, drawn_scan, waited
+from rigs.scan_fake import scanner
 
 
 def test_what_is_recorded_is_what_was_shown(tmp_path: Path) -> None:
     bench = DrawnBench(10)
-    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01", scanner())
+    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01.mcap", scanner())
     live.start()
     waited(lambda: bench.is_over and sum(live.snapshot.counts.values()) == 10)
     live.stop()
-    recorded = read_recording(tmp_path / "scan-01")
+    recorded = read_recording(tmp_path / "scan-01.mcap")
     assert [row.trigger_id for row in recorded.rows] == list(range(10))
     assert {row.lasers for row in recorded.rows} == {("A",)}
+    # a simulated hand's way keeps its times, however long its images took
+    source = drawn_scan(10)
+    assert [row.t_ns for row in recorded.rows] == [row.t_ns for row in source.rows]
+    assert recorded.arm.t_ns.tolist() == source.arm.t_ns.tolist()
     cloud = measure_scan(recorded, scanner(), ScanOptions(has_normals=False)).cloud
     direct = measure_scan(drawn_scan(10), scanner(), ScanOptions(has_normals=False)).cloud
     # poses pass a table of 17 digits
@@ -104,7 +68,7 @@ def test_what_is_recorded_is_what_was_shown(tmp_path: Path) -> None:
 
 def test_a_pass_taken_back_is_in_neither_cloud_nor_recording(tmp_path: Path) -> None:
     bench = DrawnBench(16, rate_hz=20.0)
-    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01", scanner())
+    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01.mcap", scanner())
     live.start()
     waited(lambda: sum(live.snapshot.counts.values()) >= 5)
     live.pause()
@@ -120,39 +84,68 @@ def test_a_pass_taken_back_is_in_neither_cloud_nor_recording(tmp_path: Path) -> 
     live.undo_pass()
     live.stop()
     assert set(live.session.cloud().exposure.tolist()) == before
-    rows = read_recording(tmp_path / "scan-01").rows
+    rows = read_recording(tmp_path / "scan-01.mcap").rows
     # an exposure that arrived while the pause began belongs to no pass that was taken back
     assert n_first - 1 <= len(rows) <= n_first + 1
     assert [row.trigger_id for row in rows][: len(before)] == list(range(len(before)))
 
 
-def test_a_disk_that_refuses_is_told_and_what_was_listed_stays(
+def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> list[int]:
+    """A disk with room for so many bytes; what is in the list is room that came later."""
+    left, write = [room], write_mcap._write_some
+
+    def some(handle, pieces):
+        if left[0] <= 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        left[0] -= sum(map(len, pieces))
+        return write(handle, pieces)
+
+    monkeypatch.setattr(write_mcap, "_write_some", some)
+    return left
+
+
+def test_a_disk_that_is_full_is_told_and_what_was_written_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench, n_written = DrawnBench(30, rate_hz=20.0), 0
-    write = write_files
-
-    def full_after_five(files, **how) -> None:
-        nonlocal n_written
-        n_written += any(path.suffix == ".png" for path in files)
-        if n_written > 5:
-            raise OutputError("the disk is full")
-        write(files, **how)
-
-    monkeypatch.setattr(scan_module, "write_files", full_after_five)
-    monkeypatch.setattr(scan_module, "TABLES_EVERY_S", 0.0)
-    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01", scanner())
+    bench = DrawnBench(40, rate_hz=10.0)
+    path = tmp_path / "recordings" / "scan-01.mcap"
+    live = LiveScan(bench, StepName.SCAN, path, scanner())
+    left = full_disk(monkeypatch, room=400_000)
     live.start()
-    waited(lambda: any("the disk is full" in event.text for event in live.events))
+    waited(lambda: any("No space left" in event.text for event in live.events))
     assert not live.session.is_recording
     n_shown = live.snapshot.n_points
     waited(lambda: live.snapshot.n_points > n_shown)  # it goes on to show
-    live.session.stop()
-    monkeypatch.setattr(scan_module, "write_files", write)
-    live.recorder.grown.flush()
-    recorded = read_recording(tmp_path / "scan-01")
-    assert [row.trigger_id for row in recorded.rows] == list(range(5))
-    assert all(recorded.exposure(k).image.any() for k in range(5))
+    with pytest.raises(OutputError, match=r"of \d+ are safe"):
+        live.stop()
+    left[0] = 1 << 30
+    assert journey_module.Journey(tmp_path, SessionSettings()).cut_short == (path,)
+    assert "were saved" in recover_scans(tmp_path)[0]
+    recorded = read_recording(path)
+    assert 0 < len(recorded.rows) < 40
+    assert [row.trigger_id for row in recorded.rows] == list(range(len(recorded.rows)))
+    assert all(recorded.exposure(k).image.any() for k in range(len(recorded.rows)))
+
+
+def test_a_killed_scan_is_saved_when_the_session_is_opened_again(tmp_path: Path) -> None:
+    bench = DrawnBench(10, rate_hz=40.0)
+    journey = journey_module.open_journey(tmp_path / "s")
+    path = journey.recording(StepName.SCAN, "scan-01")
+    live = LiveScan(bench, StepName.SCAN, path, scanner())
+    live.start()
+    waited(lambda: live.recorder.status().n_written == 10)
+    killed = path.read_bytes()
+    live.stop()
+    assert journey.scans == ("scan-01",) and journey.cut_short == ()
+    path.with_name("scan-02.mcap").write_bytes(killed)
+    path.with_name("scan-03.mcap").write_bytes(killed[:300])
+    assert journey.scans == ("scan-01",) and len(journey.cut_short) == 2
+    saved, lost = recover_scans(journey.folder)
+    assert "10 exposures were saved" in saved and "scan-03.aside" in lost
+    assert journey.scans == ("scan-01", "scan-02") and journey.cut_short == ()
+    assert journey.n_taken(StepName.SCAN, "scan-02") == 10
+    assert journey.new_scan() == "scan-04"
+    assert (path.parent / "scan-03.aside").read_bytes() == killed[:300]
 
 
 def test_devices_are_taken_from_one_placement_at_a_time(tmp_path: Path) -> None:
@@ -213,7 +206,7 @@ def test_lasers_are_on_only_where_the_step_needs_them_and_off_afterwards() -> No
     for step in (StepName.CAMERA, StepName.CAMERA, StepName.HAND_EYE):
         bench.look(step, 0)
     bench.rest()
-    assert lasers.asked == ["start", (), ("A",), "off"]
+    assert lasers.asked == ["start", (), "off", "start", ("A",), "off"]
     bench.close()
 
 
@@ -277,3 +270,29 @@ def test_colours_say_what_they_mean() -> None:
         ShownPoints(np.zeros((9, 3)), np.zeros(9, int), np.ones(9)), "coverage"
     )
     assert covered[0][1] > covered[0][0], "nine points in one cell: green"
+
+
+def test_windows_and_exposures_are_those_of_the_scan_while_it_runs(tmp_path: Path) -> None:
+    bench = FailingBench()
+    seeing = SeeingSettings(
+        windows=((0, 40, 320, 160),), exposure=ExposureSettings(exposure_us=250.0), photo_us=9000.0
+    )
+    bench.see(seeing)
+    camera = bench.cameras[0]
+    assert bench.take(StepName.CAMERA, tmp_path / "photo", 0) is not None
+    # photographs show the whole sensor, in the light of the room
+    assert camera.settings.size_px == (320, 240) and camera.settings.exposure_us == 9000.0
+    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01.mcap", scanner(), seeing)
+    live.start()
+    waited(lambda: live.n_recorded > 2)
+    live.stop()
+    assert camera.settings.size_px == (320, 160) and camera.settings.exposure_us == 250.0
+    assert camera.settings.window == SensorWindow(0, 40)
+    bench.take(StepName.HAND_EYE, tmp_path / "posture", 0)
+    assert camera.settings.size_px == (320, 240)
+    bench.see(None)
+    bench.take(StepName.CAMERA, tmp_path / "photo", 1)
+    assert camera.settings.exposure_us == 1000.0, "the camera's own again"
+    with pytest.raises(InputError, match="2 windows for 1 cameras"):
+        bench.see(replace(seeing, windows=seeing.windows * 2))
+    bench.close()

@@ -131,3 +131,24 @@ def test_all_addresses_of_this_computer_are_told_by_its_name(tmp_path: Path) -> 
         assert ask(port, "/", Host=name, Cookie=f"{COOKIE}=wrong")[0] == 403
     finally:
         close_server(server)
+
+
+class OtherServer:
+    """A library that begins to listen in a way of its own."""
+
+    is_stopped = False
+
+    def __init__(self, **_: object) -> None:
+        """Listen, and ask nobody."""
+
+    def stop(self) -> None:
+        OtherServer.is_stopped = True
+
+
+def test_a_library_that_does_not_ask_who_comes_is_not_let_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viser.ViserServer", OtherServer)
+    with pytest.raises(OptionError, match="who may come in"):
+        open_server(lambda: tmp_path, port=0)
+    assert OtherServer.is_stopped

@@ -22,6 +22,7 @@ from armscan.pipeline.live.acquire import LiveEvent
 from armscan.pipeline.live.rig import Rig
 from armscan.records.recording import NO_TRIGGER, ArmTrack, ExposureRow, PoseForm, Session
 from armscan.storage.arm import ARM_MODEL_FILE, arm_model_toml
+from armscan.storage.recordings.mcap_folder import TAKEN_BACK
 from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions, WriterStatus
 
 BATCH_NS = 100_000_000
@@ -96,6 +97,15 @@ class LiveRecorder:
     def status(self) -> WriterStatus:
         """How far the file is."""
         return self._writer.status()
+
+    @property
+    def n_exposures(self) -> int:
+        """Exposures that came; the next one has this index."""
+        return self._index
+
+    def take_back(self, since: int) -> None:
+        """Have no reader list the exposures so far from an index on; the file keeps them."""
+        self._writer.add_event(time.monotonic_ns(), TAKEN_BACK, {"since": since})
 
     def close(self) -> WriterStatus:
         """Write all that waits, and the file's end.

@@ -78,6 +78,9 @@ CAMERA_TOPICS = "/camera/"
 KEPT_CHUNKS = 4
 """Unpacked and kept: exposures are mostly read one after the other, of each camera."""
 KEPT_FILES = 8
+TAKEN_BACK = "taken-back"
+"""An event: exposures from its ``since`` on that stand before it are in the file, and listed by no
+table."""
 RECOVER_REMEDY = "run `armscan recover` on it first"
 DAMAGE = (
     *(McapError, DecodeError, zstandard.ZstdError, struct.error),
@@ -145,6 +148,8 @@ class RecordedTables:
                 self._take_sample(dict(zip(said["columns"], row, strict=True)))
         elif message.topic == EVENT_TOPIC:
             self.events.append(message.data)
+            if TAKEN_BACK.encode() in message.data:
+                self._take_back(json.loads(message.data))
         elif message.topic not in (TRANSFORM_TOPIC, DOCUMENT_TOPIC):
             raise ValueError("a topic is not one of armscan")
 
@@ -174,6 +179,13 @@ class RecordedTables:
         self.exposures.append(cells)
         self.times.append(said["t_ns"])
         return name
+
+    def _take_back(self, event: dict[str, Any]) -> None:
+        if event["kind"] == TAKEN_BACK:
+            since = int(event["facts"]["since"])
+            kept = [k for k, row in enumerate(self.exposures) if int(row["index"]) < since]
+            self.exposures = [self.exposures[k] for k in kept]
+            self.times = [self.times[k] for k in kept]
 
     def _take_sample(self, cells: dict[str, str]) -> None:
         number = cells.get("trigger_id")

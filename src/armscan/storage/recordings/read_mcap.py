@@ -238,8 +238,10 @@ def extract_recording(path: Path, folder: Path, *, is_recovering: bool = False) 
         if not is_recovering:
             _refuse_lost(grown, stated, where)
         if not grown.tables.exposures:
-            raise FileFormatError("no exposure in the file is whole", where=where,
-                                  remedy="record again, or look for a copy")  # fmt: skip
+            is_whole = bool(grown.n_seen["whole"])
+            fact = "every exposure in it was taken back or set aside" if is_whole else (
+                "no exposure in the file is whole")  # fmt: skip
+            raise FileFormatError(fact, where=where, remedy="record again, or look for a copy")
         return grown.finish(n_stated)
 
 

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page's buttons on a drawn rig: what is told when something fails, and what is left."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("viser")
+
+from armscan.console.journey import StepName
+from armscan.console.pages import ConsolePage
+from armscan.console.server import close_server, open_server
+from armscan.storage.arm import read_probe_tip
+from armscan.storage.recording import read_recording
+from rigs.console_rig import FailingBench, put_scanner, waited
+
+
+@contextmanager
+def opened(folder: Path, bench: FailingBench | None) -> Iterator[ConsolePage]:
+    server, _ = open_server(lambda: folder, port=0)
+    page = ConsolePage(server, folder, bench)
+    try:
+        yield page
+    finally:
+        page.close()
+        close_server(server)
+
+
+def text_of(page: ConsolePage) -> str:
+    """What the column says."""
+    parts = (page._head, page._guide, page._note, page.scanning._facts)
+    return unescape(re.sub(r"<[^>]*>", " ", " ".join(part.content for part in parts)))
+
+
+def begin_scan(page: ConsolePage) -> None:
+    page.choose(StepName.SCAN)
+    page.controls.tried(page.start_or_pause)
+    waited(lambda: page.live is not None and page.live.snapshot.n_points > 0)
+
+
+def test_a_camera_is_unplugged_and_the_arm_stalls_while_scanning(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    bench = FailingBench()
+    with opened(tmp_path / "s", bench) as page:
+        begin_scan(page)
+        bench.cameras[0].is_gone = True
+        waited(lambda: "it was unplugged. The scan goes on by itself" in text_of(page))
+        n_before = page.live.n_recorded
+        bench.cameras[0].is_gone = False
+        waited(lambda: page.live.n_recorded > n_before + 5)
+        waited(lambda: "unplugged" not in text_of(page))
+        bench.arm.is_stalled = True
+        waited(lambda: "arm has delivered nothing for 2" in text_of(page))
+        bench.arm.is_stalled = False
+        waited(lambda: "delivered nothing" not in text_of(page))
+        page.scanning.end()
+    recorded = read_recording(page.journey.recording(StepName.SCAN, "scan-01"))
+    ids = [row.trigger_id or 0 for row in recorded.rows]
+    assert ids == sorted(set(ids)) and len(ids) > n_before + 5
+
+
+def test_a_closed_console_ends_its_scan_and_the_next_one_goes_on_there(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    with opened(tmp_path / "s", FailingBench()) as page:
+        begin_scan(page)
+    n = len(read_recording(tmp_path / "s" / "recordings" / "scan-01.mcap").rows)
+    assert n > 0
+    whole = (tmp_path / "s" / "recordings" / "scan-01.mcap").read_bytes()
+    # and one that was killed: its file has no end
+    (tmp_path / "s" / "recordings" / "scan-02.mcap").write_bytes(whole[: len(whole) - 60])
+    with opened(tmp_path / "s", None) as page:
+        waited(lambda: "scan-02 was cut short" in text_of(page))
+        assert f"its {n} exposures were saved" in text_of(page)
+        assert page.journey.scans == ("scan-01", "scan-02")
+
+
+def test_settings_hold_for_the_session_and_a_wrong_one_is_a_sentence(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    with opened(tmp_path / "s", FailingBench()) as page:
+        panel = page.seeing
+        panel._mode.value, panel._target.value = "automatic", 60.0
+        panel._windows.value, panel._height.value = "0, 40, 320, 160", 12.0
+        panel._lasers.value = "A 50"
+        page.controls.tried(lambda: page._see(panel._read()))
+        assert page.controls.problem == ""
+        kept = page.journey.settings.seeing
+        assert kept.exposure.mode == "automatic" and kept.exposure.target_of(("A",)) == 0.5
+        assert kept.exposure.target == 0.6 and kept.stripes.threshold == 12.0
+        panel._windows.value = "all of it"
+        page.controls.tried(lambda: page._see(panel._read()))
+        assert "not understood" in page.controls.problem
+        assert page.bench.rig.description.windows == ((0, 40, 320, 160),)
+    with opened(tmp_path / "s", FailingBench()) as page:
+        assert page.journey.settings.seeing == kept
+        assert page.bench.rig.description.stripes.threshold == 12.0
+        page.controls.tried(lambda: page._see(None))
+        assert page.bench.rig.description.windows == ()
+
+
+def test_a_plate_is_touched_by_what_the_page_asks_for(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    bench = FailingBench()
+    with opened(tmp_path / "s", bench) as page:
+        page.choose(StepName.PROBING)
+        assert "into 'Tip, mm'" in text_of(page)
+        page.tip._centre.value = "0, 0"
+        page.controls.tried(page.tip._keep)
+        assert "write three numbers" in text_of(page)
+        page.tip._centre.value, page.tip._diameter.value = "0, 0, 120.5", 6.0
+        page.controls.tried(page.tip._keep)
+        assert "into 'Tip, mm'" not in text_of(page) and not page.controls.problem
+        page.controls.tried(page.take_one)
+        assert "Touch 2 of 20" in text_of(page)
+        tip = read_probe_tip(page.journey.recording(StepName.PROBING) / "probe.toml")
+        assert tip.centre_tool_mm.tolist() == [0.0, 0.0, 120.5] and tip.diameter_mm == 6.0

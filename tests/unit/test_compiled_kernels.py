@@ -111,7 +111,7 @@ def test_two_processes_do_not_compile_the_same_kernel(tmp_path: Path) -> None:
     first, second = (one.communicate()[0].split() for one in both)
     assert [one.returncode for one in both] == [0, 0]
     assert not set(first) & set(second)
-    assert {"armscan.kernels.voxels.add_to_cells", "armscan.kernels.voxels.voxel_values"} <= {
+    assert {"armscan.kernels.grids.add_to_cells", "armscan.kernels.grids.voxel_values"} <= {
         *first,
         *second,
     }

@@ -19,7 +19,7 @@ import numpy as np
 
 from armscan.errors import InputError, OutputError
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.kernels.voxels import add_to_cells
+from armscan.kernels.grids import add_to_cells
 
 BLOCK_BITS, PART_BITS = 16, 5
 IN_BLOCK_BITS = 3 * PART_BITS

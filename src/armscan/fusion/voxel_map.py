@@ -22,7 +22,7 @@ import numpy as np
 from armscan.errors import InputError, OptionError
 from armscan.fusion.cell_sums import MOST_BYTES, CellSums
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.kernels.voxels import BLOCK_BITS, MIDDLE, N_VALUES, PART_BITS, voxel_values
+from armscan.kernels.grids import BLOCK_BITS, MIDDLE, N_VALUES, PART_BITS, voxel_values
 from armscan.records.cloud import FUSED, CalibrationMark, CloudFrame, PointCloud
 
 AT_ONCE = 50_000

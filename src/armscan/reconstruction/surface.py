@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, floats, ints
-from armscan.kernels.implicit import add_heights
+from armscan.kernels.grids import add_heights
 from armscan.records.cloud import PointCloud
 
 SIGMA_CELLS = 0.75

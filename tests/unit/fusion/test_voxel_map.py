@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from armscan.errors import InputError, OptionError
 from armscan.fusion.voxel_map import FusedPoints, VoxelMap
 from armscan.geometry.arrays import FloatArray
-from armscan.kernels.voxels import principal_axes
+from armscan.kernels.grids import principal_axes
 from armscan.reconstruction.place import merge_clouds
 from armscan.records.cloud import PointCloud
 from rigs.long_scan import stripes

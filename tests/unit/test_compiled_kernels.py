@@ -97,7 +97,7 @@ def test_a_damaged_cache_is_compiled_anew(
 def test_two_processes_do_not_compile_the_same_kernel(tmp_path: Path) -> None:
     """Both start with an empty cache; what one compiles, the other waits for and takes."""
     program = (
-        "from armscan.kernels import voxels\n"
+        "from armscan.kernels import grids\n"
         "from armscan.kernels.arrays import COMPILED\n"
         "print(*COMPILED)"
     )

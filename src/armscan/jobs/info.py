@@ -22,7 +22,6 @@ from armscan.devices.registry import DriverReport, survey_drivers
 from armscan.devices.sources import driver_names
 from armscan.errors import ArmscanError, FileFormatError
 from armscan.geometry.arrays import IntArray
-from armscan.kernels.arrays import COMPILED, kernel_folder
 from armscan.models.calibration import (
     HAND_EYE_PARAMETER_NAMES,
     CameraCalibration,
@@ -34,7 +33,6 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import StereoCalibration
-from armscan.pipeline.measure import count_cores
 from armscan.reconstruction.sync import exposure_poses, largest_gap_ns
 from armscan.records.cloud import PointCloud
 from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
@@ -608,6 +606,10 @@ def examine_installation(*, warm: bool = False) -> Summary:
     writable = _temporary_folder_fact(problems)
     facts.append(("temporary files", writable))
     facts.append(("compiler", _compiler_fact(problems)))
+    # they bring the compiler with them, for which a look at a file does not wait
+    from armscan.kernels.arrays import COMPILED, kernel_folder
+    from armscan.pipeline.measure import count_cores
+
     facts.append(("cores", f"{count_cores()} for this process, of {os.cpu_count() or 1}"))
     facts.append(("compiled kernels", kernel_folder()))
     compiled: dict[str, float] = {}
@@ -670,6 +672,8 @@ def _compiler_fact(problems: list[str]) -> str:
 
 
 def _compile_kernels(problems: list[str]) -> str:
+    from armscan.kernels.arrays import COMPILED
+
     names = [item.name for item in pkgutil.iter_modules(kernels.__path__)]
     for name in names:
         try:

@@ -400,12 +400,17 @@ class Residuals:
         """
         q = self.by_errors.shape[1]
         matrix, vector = np.zeros((n_groups, q, q)), np.zeros((n_groups, q))
-        order = np.argsort(group, kind="stable")
-        bounds = np.searchsorted(group[order], np.arange(n_groups + 1))
-        rows, weight, wanted = self.by_errors[order], weight[order], wanted[order]
+        rows = self.by_errors
+        if (group[1:] < group[:-1]).any():
+            order = np.argsort(group, kind="stable")
+            rows, weight, wanted = rows[order], weight[order], wanted[order]
+            group = group[order]
+        weighted = rows * weight[:, None]
+        bounds = np.searchsorted(group, np.arange(n_groups + 1)).tolist()
         for k, (first, last) in enumerate(pairwise(bounds)):
-            weighted = rows[first:last].T * weight[first:last]
-            matrix[k], vector[k] = weighted @ rows[first:last], weighted @ wanted[first:last]
+            if last > first:
+                part = weighted[first:last].T
+                matrix[k], vector[k] = part @ rows[first:last], part @ wanted[first:last]
         return matrix, vector
 
     def joined_equations(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -149,6 +149,7 @@ def test_what_arrives_and_cannot_be_matched_is_no_success(
         (["--camera", "webcam:0", "--exposures", "0"], "--exposures: 0"),
         (["--camera", "webcam:0", "--rate", "nan"], "--rate: nan"),
         (["twin:none", "-o", "x.mcap"], "no simulated head"),
+        (["webcam:0", "-o", "x.mcap"], "give it as --camera"),
     ],
 )
 def test_what_cannot_be_recorded_is_refused(

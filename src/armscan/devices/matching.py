@@ -36,10 +36,12 @@ LASER_BOUND_NS = 50_000_000
 """Without trigger ids a frame may be so much later than its laser event: transport delays differ.
 Its lasers are known only if all events that near agree."""
 SAME_TRIGGER_NS = 100_000_000
-"""What bears one trigger id was taken within this, by clocks that are known: another count, before
-a device began to count anew, has the same ids."""
-ARRIVED_TOGETHER_NS = 250_000_000
-"""And arrived within this, while nothing else is known of their clocks."""
+"""What bears one trigger id was taken within this, by the devices' own clocks: another count, of
+before a device began to count anew, has the same ids."""
+SAME_COUNT_NS = 500_000_000
+"""And within this by clocks that were related by arrivals, on a computer that may be overloaded."""
+ARRIVED_TOGETHER_NS = 2_000_000_000
+"""And arrived within this, while nothing else is known: no count ends so soon after its start."""
 SAME_INSTANT = 0.25
 """Frames of two cameras without ids are of one instant within this part of the usual step."""
 
@@ -286,7 +288,7 @@ class InstantMatcher:
             if frame.trigger_id is not None and one.trigger_id is not None:
                 is_same = frame.trigger_id == one.trigger_id
                 if t_ns is not None and one.t_ns is not None:
-                    is_same = is_same and abs(t_ns - one.t_ns) <= SAME_TRIGGER_NS
+                    is_same = is_same and abs(t_ns - one.t_ns) <= SAME_COUNT_NS
             elif t_ns is not None and one.t_ns is not None:
                 is_same = abs(t_ns - one.t_ns) <= SAME_INSTANT * self._frame_step_ns
             else:
@@ -304,18 +306,18 @@ class InstantMatcher:
     def _told(self, of_trigger: dict[int, _Told[T]], one: _Open) -> _Told[T] | None:
         """What was told of an instant's trigger; None for what bears its id from another count.
 
-        By the common clock where it is known; else by how far the two devices' clocks were apart
-        at the trigger before; else by arrival.
+        By how far the two devices' own clocks were apart at the trigger before, which no delay of
+        this computer changes; else by the common clock; else by arrival.
         """
         found = None if one.trigger_id is None else of_trigger.get(one.trigger_id)
         if found is None:
             return None
         camera, frame = next((k, f) for k, f in enumerate(one.frames) if f is not None)
         pair, apart_ns = (id(of_trigger), camera), frame.t_device_ns - found.t_device_ns
-        if one.t_ns is not None and found.t_ns is not None:
-            is_same = abs(one.t_ns - found.t_ns) <= SAME_TRIGGER_NS
-        elif pair in self._apart_ns:
+        if pair in self._apart_ns:
             is_same = abs(apart_ns - self._apart_ns[pair]) <= SAME_TRIGGER_NS
+        elif one.t_ns is not None and found.t_ns is not None:
+            is_same = abs(one.t_ns - found.t_ns) <= SAME_COUNT_NS
         else:
             is_same = abs(one.newest_host_ns - found.t_host_ns) <= ARRIVED_TOGETHER_NS
         if is_same:

@@ -90,6 +90,11 @@ def open_device(kind: DeviceKind, address: str) -> Camera | Arm | LaserControlle
     return driver.open(kind, place)
 
 
+def device_drivers() -> tuple[str, ...]:
+    """Names with which addresses of devices begin, sorted."""
+    return tuple(sorted(entry_points(group=DEVICE_GROUP).names))
+
+
 def find_devices(kind: DeviceKind | None = None) -> tuple[DeviceInfo, ...]:
     """Devices of a kind, or of all, that say themselves that they are there.
 
@@ -101,8 +106,7 @@ def find_devices(kind: DeviceKind | None = None) -> tuple[DeviceInfo, ...]:
 
 def survey_drivers() -> tuple[DriverReport, ...]:
     """Ask all installed drivers, sorted by name, what they find."""
-    names = sorted(entry_points(group=DEVICE_GROUP).names)
-    return tuple(_survey(_entry_point(name, name)) for name in names)
+    return tuple(_survey(_entry_point(name, name)) for name in device_drivers())
 
 
 def _survey(point: EntryPoint) -> DriverReport:

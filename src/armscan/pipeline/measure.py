@@ -11,6 +11,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import cast
 
@@ -204,14 +205,22 @@ def measure_instants(
     depths = options.accepted_depths(sensor)
     cameras, stripes = cameras_of(sensor), stripes_for(sensor, options.stripes)
 
+    def extract_one(both: tuple[ExposurePair, CameraModel]) -> Profile:
+        with clock.stage(EXTRACTION):
+            return extract_profile(*both, stripes, cache)
+
     def extract(images: InstantImages) -> list[Profile]:
         if images.profiles:
             return list(images.profiles)
-        pairs = zip(images.pairs, cameras, strict=True)
-        with clock.stage(EXTRACTION):
-            return [extract_profile(pair, camera, stripes, cache) for pair, camera in pairs]
+        return list(each_camera(extract_one, zip(images.pairs, cameras, strict=True)))
 
-    try:
+    with ExitStack() as stack:
+        if cache is not None:
+            stack.callback(cache.trim)
+        # where no instant is read ahead the cameras of one are the work that there is at a time
+        is_shared = not reads_ahead and len(cameras) > 1 and count_cores() > 1
+        pool = stack.enter_context(ThreadPoolExecutor(len(cameras))) if is_shared else None
+        each_camera = map if pool is None else pool.map
         for n, (images, profiles) in enumerate(
             _in_order(instants, extract, reads_ahead=reads_ahead)
         ):
@@ -226,9 +235,6 @@ def measure_instants(
             with clock.stage(PLACING):
                 measured = MeasuredInstant(images, measure_points(labelled, sensor, depths))
             yield measured
-    finally:
-        if cache is not None:
-            cache.trim()
 
 
 def _in_order(

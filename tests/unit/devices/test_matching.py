@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -98,6 +100,31 @@ def counts_anew(restarts, kinds, *, n=60):
                                      trigger_id=number["frame"]), k),
         ]  # fmt: skip
     return sorted(items, key=lambda item: item[0])
+
+
+def test_images_that_an_overloaded_computer_takes_in_late_keep_their_poses():
+    """Images arrive 0.6 s late for five seconds, so that their clock seems to jump."""
+    items, frames = [], []
+    for k in range(400):
+        t_ns = 10**9 + round(1e9 * k / 40)
+        late_ns = 600_000_000 if 100 <= k < 300 else 4_000_000
+        pose = Pose(np.eye(3), np.array([k, 0.0, 0.0]))
+        sample = ArmSample(k, t_ns, t_ns + 5_000_000, pose=pose, trigger_id=k)
+        frames.append(Frame(IMAGE, k, t_ns, t_ns + late_ns, trigger_id=k))
+        items += [(sample.t_host_ns, sample), (t_ns + late_ns, None)]
+    matcher = InstantMatcher(is_triggered=True, has_controller=False)
+    instants = []
+    in_order = iter(frames)
+    for host, told in sorted(items, key=lambda item: item[0]):
+        if told is None:
+            matcher.add_frame(replace(next(in_order), t_host_ns=host))
+        else:
+            matcher.add_samples((told,))
+        instants += matcher.take(0)
+    instants += matcher.take(10**12)
+    assert matcher.cameras[0].counts.n_jumps > 0 and len(instants) == 400
+    for k, one in enumerate(instants):
+        assert one.pose is not None and one.pose.translation_mm[0] == k
 
 
 KINDS = ("frame", "sample", "event")

@@ -18,7 +18,7 @@ from armscan.devices.matching import InstantMatcher, MatchedInstant
 from armscan.devices.protocols import ArmSample, CameraSettings, Frame, LaserEvent
 from armscan.errors import DeviceError, InputError, OutputError
 from armscan.models.arm import forward, thesis_arm
-from armscan.pipeline.live.acquire import Acquisition, WaitingInstant, WaitingInstants
+from armscan.pipeline.live.acquire import Acquisition, LiveEvent, WaitingInstant, WaitingInstants
 from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
 from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus, exposure_of
@@ -515,7 +515,8 @@ class Held(Kept):
         super().add_frame(camera, frame, status)
 
 
-def test_a_disk_that_is_behind_delays_no_picture_and_loses_nothing() -> None:
+@pytest.mark.parametrize("what", ["pause", "undo", "clear"])
+def test_a_disk_that_is_behind_delays_no_picture_and_loses_nothing(what: str) -> None:
     kept, rig = Held(), rig_of(triggered_scan(8))
     devices: list[Any] = [rig.cameras[0], rig.arm]
     held = [device.elements for device in devices]
@@ -528,8 +529,8 @@ def test_a_disk_that_is_behind_delays_no_picture_and_loses_nothing() -> None:
     waited(lambda: session.snapshot().counts.get(LiveStatus.PLACED) == 8)
     assert kept.instants == []
     threading.Timer(0.1, kept.may_go_on.set).start()
-    session.pause()
-    # a recorder that is taken off has all that was matched before
+    {"pause": session.pause, "undo": session.undo_pass, "clear": session.clear}[what]()
+    # whoever takes the recorder off, or images out of what it lists, finds all that was matched
     assert kept.frames == kept.instants == list(range(8))
     session.stop()
 
@@ -598,6 +599,29 @@ def test_a_full_disk_ends_the_recording_and_not_the_scan() -> None:
     assert [event.text for event in told if event.kind == "warning"] == [
         "the recording ended: the disk is full."
     ]
+
+
+def test_who_hears_that_the_disk_is_full_may_stop_the_scan(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From the thread that records, while the one that matches has no room any more."""
+    monkeypatch.setattr("armscan.pipeline.live.acquire.MOST_TO_KEEP", 1)
+    rig = rig_of(triggered_scan(8))
+    frames, rig.cameras[0].elements = rig.cameras[0].elements, []
+    recorder = FaultyRecorder(OutputError("the disk is full"))
+    session = LiveSession(rig, scanner(), options=ALL, recorder=recorder)
+    ended = threading.Event()
+
+    def hear(event: LiveEvent) -> None:
+        if "disk is full" in event.text:
+            session.stop()
+            ended.set()
+
+    session.add_listener(hear)
+    session.start()
+    rig.cameras[0].elements = frames
+    assert ended.wait(20.0)
+    assert session.snapshot().state == "stopped"
 
 
 def test_a_fault_in_matching_is_told_and_nobody_waits_for_it(

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from armscan.devices.registry import open_device
+from armscan.devices.registry import device_drivers, open_device
 from armscan.errors import DeviceError, OptionError, OutputError
 from armscan.jobs.live.recordings import SUFFIX
 from armscan.models.calibration import ScannerCalibration
@@ -91,6 +91,12 @@ class RecordRequest:
         if self.rig.startswith(TWIN):
             found = _simulated(self.rig)
         elif self.rig:
+            driver, colon, _ = self.rig.partition(":")
+            if colon and driver in device_drivers() and not Path(self.rig).exists():
+                raise OptionError(
+                    f"{self.rig} is the address of one device",
+                    remedy="give it as --camera, --arm or --lasers",
+                )
             found = read_rig(Path(self.rig))
         return replace(
             found,

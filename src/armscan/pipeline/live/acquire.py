@@ -7,6 +7,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -180,11 +181,13 @@ class Acquisition:
             if thread is not threading.current_thread():
                 thread.join()
         self._threads.clear()
-        self._keep_the_rest()
-        if self._keeper is not None:
+        self.wait_until_kept()
+        keeper = self._keeper
+        if keeper is not None and keeper is not threading.current_thread():
             self._to_keep.put(_END)
-            self._keeper.join()
-            self._keeper = None
+            keeper.join()
+        # it ends by itself where it was the one that stopped
+        self._keeper = None
 
     @property
     def recorder(self) -> Recorder | None:
@@ -195,7 +198,7 @@ class Acquisition:
     def recorder(self, recorder: Recorder | None) -> None:
         self._recording = None if recorder is None else _Recording(recorder)
         if recorder is None:
-            self._keep_the_rest()
+            self.wait_until_kept()
 
     @property
     def n_waiting(self) -> int:
@@ -260,8 +263,8 @@ class Acquisition:
         first = found[0] if isinstance(found, tuple) else found
         return bool(first.t_host_ns > self._stopped_ns + LATE_NS)
 
-    def _keep_the_rest(self) -> None:
-        """Wait until what was handed to the recorder is kept."""
+    def wait_until_kept(self) -> None:
+        """Wait until what was matched so far is with the recorder; from any thread."""
         keeper, is_kept = self._keeper, threading.Event()
         if keeper is None or keeper is threading.current_thread():
             return
@@ -342,8 +345,10 @@ class Acquisition:
 
     def _record(self, write: Callable[[Recorder], None]) -> None:
         recording = self._recording
-        if recording is not None:
-            self._to_keep.put((recording, write))
+        while recording is not None and not recording.has_failed:
+            with suppress(queue.Full):
+                self._to_keep.put((recording, write), timeout=READ_S)
+                return
 
     def _keep(self) -> None:
         """Record in the order of matching; a recording that failed is given nothing more."""
@@ -362,6 +367,8 @@ class Acquisition:
                     self._recording = None
                 fact = error if isinstance(error, ArmscanError) else repr(error)
                 self._tell(LiveEvent("warning", f"the recording ended: {fact}", RECORDER))
+                if self._keeper is None:
+                    return
 
     def _press(self, samples: tuple[ArmSample, ...]) -> None:
         for sample in samples:

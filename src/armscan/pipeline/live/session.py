@@ -363,7 +363,8 @@ class LiveSession:
         self._change("paused")
 
     def undo_pass(self) -> None:
-        """Take the last pass out of the live cloud; the recording keeps it."""
+        """Take the last pass out of the live cloud; the recorder has and keeps all of it."""
+        self._acquisition.wait_until_kept()
         with self._lock:
             if self._passes:
                 self._passes.pop()
@@ -372,7 +373,8 @@ class LiveSession:
         self._tell(LiveEvent("pass", "the last pass was taken back"))
 
     def clear(self) -> None:
-        """Empty the live cloud; the recording keeps all."""
+        """Empty the live cloud; the recorder has and keeps all of it."""
+        self._acquisition.wait_until_kept()
         with self._lock:
             self._passes.clear()
             self._next_pass = self._taken_back = self._n_instants

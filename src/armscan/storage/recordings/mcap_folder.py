@@ -197,15 +197,13 @@ class RecordedTables:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the file holds and the tables do not, in words."""
-        found = []
-        if self.aside:
-            why = ", ".join(f"{n} {text}" for text, n in self.aside.items())
-            found.append((self.aside.total(), len(self.exposures), "exposures", why))
-        if n := self.n_samples_aside:
-            found.append((n, len(self.samples), "samples of the arm", f"{n} {REPEATED}"))
+        why = ", ".join(f"{n} {text}" for text, n in self.aside.items())
+        found = [(self.aside.total(), len(self.exposures), "exposures", why)]
+        found.append((self.n_samples_aside, len(self.samples), "samples of the arm", REPEATED))
         return tuple(
-            f"{n} of {n + n_used} {what} in the file are set aside: {why}"
-            for n, n_used, what, why in found
+            f"{n} of {n + n_used} {what} in the file are set aside: {reason}"
+            for n, n_used, what, reason in found
+            if n
         )
 
     def _is_next(self, source: str, t_ns: int, ids: list[tuple[str, str]]) -> bool:
@@ -248,24 +246,16 @@ def stored_image(message: StoredMessage, said: Mapping[str, Any]) -> CompressedI
 def transform_message(t_ns: int, place_mm: FloatArray, quaternion: FloatArray) -> bytes:
     """Where the tool is in Base, as viewers draw it: (3,) mm and (4,) x, y, z, w."""
     shown = FrameTransform(parent_frame_id="base", child_frame_id="tool")
-    _set_time(shown, t_ns)
+    shown.timestamp.seconds, shown.timestamp.nanos = divmod(max(t_ns, 0), NS_PER_S)
     shown.translation.x, shown.translation.y, shown.translation.z = map(float, 1e-3 * place_mm)
     turn = shown.rotation
     turn.x, turn.y, turn.z, turn.w = map(float, quaternion)
-    content: bytes = shown.SerializeToString()
-    return content
-
-
-def _set_time(message: Any, t_ns: int) -> None:
-    message.timestamp.seconds, message.timestamp.nanos = divmod(max(t_ns, 0), NS_PER_S)
+    return bytes(shown.SerializeToString())
 
 
 def _varint(value: int) -> bytes:
-    content = bytearray()
-    while value > 0x7F:
-        content.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes((*content, value))
+    n = max(1, -(-value.bit_length() // 7))
+    return bytes(value >> 7 * k & 0x7F | (k + 1 < n) << 7 for k in range(n))
 
 
 def image_message(
@@ -288,7 +278,7 @@ def image_message(
             step=len(data) // height,
         )  # fmt: skip
         facts = {"stored": "raw", "encoding": encoding, "width_px": width, "height_px": height}
-    _set_time(shown, row.t_ns)
+    shown.timestamp.seconds, shown.timestamp.nanos = divmod(max(row.t_ns, 0), NS_PER_S)
     facts |= {"crc32": zlib.crc32(data), "bytes": len(data)}
     return (shown.SerializeToString(), bytes([tag]) + _varint(len(data)), data), facts
 
@@ -550,11 +540,6 @@ class McapFolder:
     ------
     FileFormatError
         If it is no recording of armscan, unfinished or damaged.
-
-    Attributes
-    ----------
-    notes
-        What is set aside in it, in words.
     """
 
     def __init__(self, path: Path) -> None:
@@ -564,6 +549,7 @@ class McapFolder:
         self._lock = threading.Lock()
         self._images: dict[str, _ImagePlace] = {}
         self.notes: tuple[str, ...] = ()
+        """What is set aside in it, in words."""
         try:
             with opened(path) as file:
                 self._files = self._read_files(file)

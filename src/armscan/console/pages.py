@@ -558,7 +558,7 @@ class ConsolePage:
         wanted = self._n_wanted()
         n, kind = state.n_taken, "Touch" if step.filling == "touches" else "Placement"
         if n >= wanted:
-            return body + paragraph(f"All {wanted} are taken.", GOOD)
+            return body + paragraph(f"All {wanted} are taken: calculate.", GOOD)
         shown = self._placement(n)
         enough = f" At least {step.least} are needed." if n < step.least else ""
         is_twin = self.bench is not None and self.bench.has_operator

@@ -348,7 +348,11 @@ class Journey:
         """
         place = self.folder / RECORDINGS / (scan or step.value)
         is_one_file = BY_NAME[step].filling == "motion" or step in OF_A_SCAN
-        return place.with_name(place.name + MOVED) if is_one_file and not place.is_dir() else place
+        return self.new_file(step, scan) if is_one_file and not place.is_dir() else place
+
+    def new_file(self, step: StepName, scan: str = "") -> Path:
+        """Where a recording is written while the hand moves."""
+        return self.folder / RECORDINGS / f"{scan or step.value}{MOVED}"
 
     @property
     def scans(self) -> tuple[str, ...]:
@@ -455,7 +459,7 @@ class Journey:
             if place.is_dir():
                 place.rename(gone)
                 shutil.rmtree(gone)
-            place.unlink(missing_ok=True)
+            self.new_file(step, scan).unlink(missing_ok=True)
             (self.folder / RESULTS / f"{result_key(step, scan)}.json").unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(

@@ -250,7 +250,7 @@ class ConsolePage:
             self.controls.problem = "Finish the scan first."
             self.refresh()
             return
-        self.step, self._seen = step, None
+        self.step, self._seen, self._said = step, None, ()
         self._rest()
         self.refresh()
         self._show_stored()
@@ -336,12 +336,11 @@ class ConsolePage:
         step, now = self.step, self.journey.settings
         scanner = read_scanner_calibration(self.journey.scanner_file)
         scan = self.journey.new_scan() if step is StepName.SCAN else ""
-        if not scan:
-            self.journey.start_over(step)
-        path, model = self.journey.recording(step, scan), None
+        path, model = self.journey.new_file(step, scan), None
         if step is StepName.SCAN and now.part:
             model = ModelWatch(self.worker, self.journey.folder / now.part)
         live = LiveScan(self._bench(), step, path, scanner, now.seeing)
+        live.open(lambda: None if scan else self.journey.start_over(step))
         self.scanning.begin(live, scanner, model)
         self.scan = scan or self.scan
 
@@ -398,6 +397,8 @@ class ConsolePage:
             if self._choice.options != titles:
                 self._choice.options = titles
             self.choose(self.journey.next_step())
+            if self.journey.cut_short:
+                self._recover()
 
     # what is shown
 
@@ -557,7 +558,7 @@ class ConsolePage:
         wanted = self._n_wanted()
         n, kind = state.n_taken, "Touch" if step.filling == "touches" else "Placement"
         if n >= wanted:
-            return body + paragraph(f"All {wanted} are taken.", GOOD)
+            return body + paragraph(f"All {wanted} are taken: calculate.", GOOD)
         shown = self._placement(n)
         enough = f" At least {step.least} are needed." if n < step.least else ""
         is_twin = self.bench is not None and self.bench.has_operator

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -246,7 +246,7 @@ class ScanRecorder(LiveRecorder):
     Attributes
     ----------
     pose_of
-        The tool's pose by number of the frame.
+        The tool's pose by the exposure's source, as `exposure_of` names it.
     latest_joints_rad
         (J,) angles of the arm, where it gives them.
     n_left_out
@@ -258,10 +258,10 @@ class ScanRecorder(LiveRecorder):
     ) -> None:
         super().__init__(path, rig, is_simulated=is_simulated)
         self.path, self._keeps_times = path, keeps_times
-        self.pose_of: dict[int, Pose[Base, Tool] | None] = {}
+        self.pose_of: dict[str, Pose[Base, Tool] | None] = {}
         self.latest_joints_rad: FloatArray | None = None
         self.n_left_out = 0
-        self._index_of: dict[int, int] = {}
+        self._first_of: dict[str, int] = {}
         self._lock = threading.Lock()
 
     def add_samples(self, samples: tuple[TimedSample, ...]) -> None:
@@ -281,17 +281,20 @@ class ScanRecorder(LiveRecorder):
                 times = [frame.t_device_ns for frame in instant.frames if frame is not None]
                 instant = replace(instant, t_ns=times[0])
             super().add_instant(instant)
-            for frame in instant.frames:
+            for camera, frame in enumerate(instant.frames):
                 if frame is not None:
-                    self.pose_of[frame.number] = instant.pose
-                    self._index_of.setdefault(frame.number, first)
+                    source = f"camera {camera} frame {frame.number}"
+                    self.pose_of[source] = instant.pose
+                    self._first_of[source] = first
 
-    def leave_out(self, frame: int) -> None:
-        """Take what was recorded since a frame, by its number, out of the list."""
+    def leave_out(self, source: str) -> None:
+        """Take what was recorded since an exposure, and what came with it, out of the list."""
         with self._lock:
-            since = self._index_of.get(frame, self.n_exposures)
-            gone = [number for number, index in self._index_of.items() if index >= since]
-            self.n_left_out += len({self._index_of.pop(number) for number in gone})
+            since = self._first_of.get(source, self.n_exposures)
+            gone = [one for one, index in self._first_of.items() if index >= since]
+            for one in gone:
+                self._first_of.pop(one)
+            self.n_left_out += len(gone)
             self.take_back(since)
 
     def finish(self) -> None:
@@ -346,7 +349,7 @@ class LiveScan:
         )
         self.events: deque[LiveEvent] = deque(maxlen=50)
         self._scanner = scanner
-        self._frame_of: dict[int, int] = {}
+        self._source_of: dict[int, str] = {}
         self._starts: list[int] = []
         self._incidence = Incidence()
         self._drift: tuple[int, float | None] = -1, None
@@ -359,24 +362,34 @@ class LiveScan:
         )
         self.session.add_listener(self._hear)
 
-    def start(self) -> None:
-        """Begin, or go on after a pause, with a new pass.
+    def open(self, make_room: Callable[[], object] = lambda: None) -> None:
+        """Start the devices, and make the file; nothing is recorded yet.
+
+        Parameters
+        ----------
+        make_room
+            Removes what lay at its place, once the devices answer.
 
         Raises
         ------
         ArmscanError
             If a device does not answer, or the file cannot be made; nothing runs then.
         """
+        self.session.open()
+        try:
+            self._wait_for_clocks()
+            make_room()
+            make_folder(self.path.parent)
+            self.recorder.begin()
+        except BaseException:
+            self.session.stop()
+            raise
+        self.session.add_listener(self.recorder.hear)
+
+    def start(self) -> None:
+        """Begin, or go on after a pause, with a new pass; raises as `open`, which it may call."""
         if self.snapshot.state == "closed":
-            self.session.open()
-            try:
-                self._wait_for_clocks()
-                make_folder(self.path.parent)
-                self.recorder.begin()
-            except BaseException:
-                self.session.stop()
-                raise
-            self.session.add_listener(self.recorder.hear)
+            self.open()
         self.session.start()
         self.bench.hold(False)
 
@@ -402,14 +415,14 @@ class LiveScan:
             start = self._starts.pop()
             self.session.undo_pass()
             # also what came with it and was not placed
-            self.recorder.leave_out(self._frame_of[start])
+            self.recorder.leave_out(self._source_of[start])
 
     def clear(self) -> None:
         """Take all passes out."""
         self.session.clear()
         self._starts.clear()
-        if self._frame_of:
-            self.recorder.leave_out(min(self._frame_of.values()))
+        if self._source_of:
+            self.recorder.leave_out(self._source_of[min(self._source_of)])
 
     def stop(self) -> None:
         """End the scan; the recording is whole.
@@ -450,7 +463,7 @@ class LiveScan:
         hand_eye = None if self._scanner is None else self._scanner.hand_eye
         seen_from: dict[int, FloatArray] = {}
         for number in np.unique(cloud.exposure).tolist():
-            pose = self.recorder.pose_of.get(self._frame_of.get(number, -1))
+            pose = self.recorder.pose_of.get(self._source_of.get(number, ""))
             if pose is not None and hand_eye is not None:
                 seen_from[number] = (pose @ hand_eye.tool_from_sensor).translation_mm
         return self._incidence.angles_deg(cloud, seen_from)
@@ -464,12 +477,11 @@ class LiveScan:
         return np.array([*axis_frames(model, joints).origins_mm[0], ends[1]])
 
     def _remember(self, number: int, cloud: PointCloud) -> None:
-        """Which frame an instant is, and with which instant a pass begins."""
+        """Which exposure an instant is, and with which instant a pass begins."""
         n_passes = self.session.snapshot().n_passes
         if n_passes != len(self._starts):
             self._starts = [*self._starts[: n_passes - 1], number]
-        for source in cloud.exposure_sources:
-            self._frame_of[number] = int(source.rpartition(" ")[2])
+        self._source_of[number] = cloud.exposure_sources[0]
 
     def _hear(self, event: LiveEvent) -> None:
         # a simulated hand waits for its images to be rendered, and any hand may pause

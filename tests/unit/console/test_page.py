@@ -16,9 +16,10 @@ pytest.importorskip("viser")
 from armscan.console.journey import StepName
 from armscan.console.pages import ConsolePage
 from armscan.console.server import close_server, open_server
+from armscan.errors import DeviceError
 from armscan.storage.arm import read_probe_tip
 from armscan.storage.recording import read_recording
-from rigs.console_rig import FailingBench, put_scanner, waited
+from rigs.console_rig import FailingArm, FailingBench, put_scanner, waited
 
 
 @contextmanager
@@ -119,3 +120,23 @@ def test_a_plate_is_touched_by_what_the_page_asks_for(tmp_path: Path) -> None:
         assert "Touch 2 of 20" in text_of(page)
         tip = read_probe_tip(page.journey.recording(StepName.PROBING) / "probe.toml")
         assert tip.centre_tool_mm.tolist() == [0.0, 0.0, 120.5] and tip.diameter_mm == 6.0
+
+
+def test_what_was_taken_stays_where_a_new_take_does_not_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def silent(arm: FailingArm) -> None:
+        raise DeviceError("it does not answer", where=arm.name)
+
+    put_scanner(tmp_path / "s")
+    with opened(tmp_path / "s", FailingBench()) as page:
+        page.choose(StepName.CHECK)
+        page.controls.tried(page.start_or_pause)
+        waited(lambda: page.live is not None and page.live.n_recorded > 2)
+        page.scanning.end()
+        place = page.journey.recording(StepName.CHECK)
+        before = place.read_bytes()
+        monkeypatch.setattr(FailingArm, "start", silent)
+        page.controls.tried(page.start_or_pause)
+        assert "does not answer" in text_of(page) and page.live is None
+        assert place.read_bytes() == before

@@ -28,14 +28,16 @@ from armscan.console.placements import (
     drawing,
 )
 from armscan.console.rig import DeviceBench, _Hand, _HandArm, _HandCamera, take_back
-from armscan.console.scan import LiveScan
+from armscan.console.scan import LiveScan, ScanRecorder
 from armscan.console.scene import ShownPoints, depths_mm, point_colours, range_bar, thinned
 from armscan.console.work import recover_scans
-from armscan.devices.protocols import LaserEvent
+from armscan.devices.matching import MatchedInstant
+from armscan.devices.protocols import Frame, LaserEvent
 from armscan.errors import InputError, OutputError
 from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.scan import ScanOptions, measure_scan
+from armscan.reconstruction.sync import PoseStatus
 from armscan.records.exposure import SensorWindow
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings import write_mcap
@@ -295,4 +297,27 @@ def test_windows_and_exposures_are_those_of_the_scan_while_it_runs(tmp_path: Pat
     assert camera.settings.exposure_us == 1000.0, "the camera's own again"
     with pytest.raises(InputError, match="2 windows for 1 cameras"):
         bench.see(replace(seeing, windows=seeing.windows * 2))
+    bench.close()
+
+
+def test_both_cameras_of_an_instant_are_taken_back_together(tmp_path: Path) -> None:
+    bench = FailingBench(n_cameras=2)
+    recorder = ScanRecorder(tmp_path / "s.mcap", bench.rig, is_simulated=True)
+    recorder.begin()
+    image = np.full((240, 320), 7, dtype=np.uint8)
+    for k in range(4):
+        # the cameras count their frames by themselves
+        frames = tuple(Frame(image, n, 10**9 * k, 10**9 * k, k) for n in (k, k + 2))
+        recorder.add_instant(
+            MatchedInstant(frames, 10**9 * (k + 1), ("A",), k, None, PoseStatus.NO_TIME)
+        )
+        if k == 2:
+            recorder.leave_out("camera 1 frame 3")
+            assert (recorder.n_exposures, recorder.n_left_out) == (6, 4)
+    recorder.leave_out("camera 0 frame 3")
+    recorder.leave_out("camera 0 frame 3")  # is out already
+    assert recorder.n_left_out == 6
+    recorder.finish()
+    rows = read_recording(tmp_path / "s.mcap").rows
+    assert [(row.index, row.camera) for row in rows] == [(0, 0), (1, 1)]
     bench.close()

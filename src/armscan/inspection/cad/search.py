@@ -41,6 +41,8 @@ CLIPPED = 3.0
 EQUAL_SIGMAS = 4.0
 NEIGHBOURS = 10
 """Points that err together at most, on a real surface, when two poses are compared."""
+WIDENED = 16.0
+"""Robust scales, times 4.7, within which points hold a pose as it begins to be refined."""
 NEARLY = 1.5
 """A pose whose mean square is below this times the best one's fits nearly as well."""
 
@@ -177,16 +179,23 @@ def closer(
     normals: FloatArray | None,
     pose: Pose[Cad, Part],
     rounds: int,
+    *,
+    widened: float = 1.0,
 ) -> Pose[Cad, Part]:
-    """Carry a pose to the nearest best fit (Gauss-Newton, biweight of the robust scale)."""
-    for _ in range(rounds):
+    """Carry a pose to the nearest best fit (Gauss-Newton, biweight of the robust scale).
+
+    ``widened``: so many times the scale holds at first, and half as much each round. Where nearly
+    all points lie on faces along which the part may slide, the few that hold it look like outliers.
+    """
+    for k in range(rounds):
         placed = pose.apply(points_mm)
         towards = None if normals is None else pose.rotate(normals)
         found = surface.distance(placed, towards=towards)
         d = found.signed_mm
         scale = max(robust_scale(d), 1e-9 * surface.diagonal_mm)
         centre = placed.mean(axis=0)
-        weights = tukey_weights(d, scale)
+        wide = max(widened / 2.0**k, 1.0)
+        weights = tukey_weights(d, wide * scale)
         jacobian, normal = fit_step(placed, found.normals, weights, centre)
         radius = float(np.sqrt(np.mean((placed - centre) ** 2) * 3.0))
         unit = np.repeat([radius, 1.0], 3)
@@ -194,7 +203,7 @@ def closer(
         scaled += 1e-6 * np.trace(scaled) / 6.0 * np.eye(6)
         step = -np.linalg.solve(scaled, jacobian.T @ (weights * d) / unit) / unit
         pose = moved(pose, step, centre)
-        if np.linalg.norm(step * unit) < 1e-7 * radius:
+        if wide == 1.0 and np.linalg.norm(step * unit) < 1e-7 * radius:
             break
     return pose
 
@@ -329,7 +338,8 @@ def _refined(
     poses = [closer(surface, points[few], facing, pose, 6) for pose in poses]
     sizes = [_distances(surface, points[few], facing, pose) for pose in poses]
     by_scale = np.argsort([robust_scale(d) for d in sizes])
-    return [closer(surface, points, normals, poses[k], 12) for k in by_scale[: 2 * FINAL]]
+    chosen = [poses[k] for k in by_scale[: 2 * FINAL]]
+    return [closer(surface, points, normals, pose, 16, widened=WIDENED) for pose in chosen]
 
 
 def _rated(

@@ -62,10 +62,12 @@ function drawScenes() {
         context.stroke();
       }
       const image = context.getImageData(0, 0, width, height), pixels = image.data;
-      const size = Math.max(2, Math.round((values ? 2.4 : 1.6) * ratio));
+      // few points are drawn larger, or nothing is seen of a surface
+      const larger = Math.min(3, Math.max(1, Math.sqrt(12000 / Math.max(points.length, 1))));
+      const size = Math.max(2, Math.round((values ? 2.4 : 1.6) * larger * ratio));
       const depths = new Float32Array(width * height).fill(Infinity), depthAt = depthOf();
       for (let k = 0; k < points.length; k += 3) {
-        const [px, py] = place(points, k).map(Math.round);
+        const [px, py] = place(points, k).map((at) => Math.round(at - (size - 1) / 2));
         const depth = depthAt(points[k] - centre[0], points[k + 1] - centre[1], points[k + 2] - centre[2]);
         for (let j = py; j < py + size; j++) for (let i = px; i < px + size; i++) {
           if (i < 0 || j < 0 || i >= width || j >= height) continue;

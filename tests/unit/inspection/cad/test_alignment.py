@@ -23,7 +23,7 @@ from armscan.inspection.cad.comparison import CadComparison, CadOptions, compare
 from armscan.inspection.cad.datums import align_datums
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import PartModel, part_of
-from armscan.inspection.cad.search import even_turns, spread_rows
+from armscan.inspection.cad.search import closer, even_turns, spread_rows
 from armscan.inspection.cad.units import scale_mismatch
 from rigs.inspection_clouds import cloud_of
 from rigs.parts import box_corners, turned, wedge_part
@@ -283,3 +283,22 @@ def test_rows_are_spread_over_the_surface_however_dense() -> None:
     rows = spread_rows(np.concatenate([dense, thin]), 400)
     assert len(np.unique(rows)) == 400
     assert 120 < int((rows >= 20_000).sum()) < 280
+
+
+def test_few_points_that_alone_hold_a_motion_are_not_taken_for_outliers() -> None:
+    """A plate seen from above, with 25 points on each side: where it begins 0.3 mm off, these lie
+    beyond 4.7 robust standard deviations. Weighted so from the start, it stayed there.
+    """
+    random = np.random.default_rng(3)
+    flat = np.column_stack([random.uniform([0, 0], [100, 80], (2900, 2)), np.full(2900, 5.0)])
+    ends = random.uniform([0, 0, 0], [100, 80, 5], (100, 3))
+    ends[:50, 0] = np.repeat([0.0, 100.0], 25)
+    ends[50:, 1] = np.repeat([0.0, 80.0], 25)
+    points = np.concatenate([flat, ends]) + random.normal(0.0, 0.02, (3000, 3))
+    off: Pose[Cad, Part] = Pose(np.eye(3), np.array([0.3, -0.3, 0.0]))
+    surface = PartSurface(PLATE)
+    stuck = closer(surface, points, None, off, 16)
+    found = closer(surface, points, None, off, 16, widened=search.WIDENED)
+    assert np.abs(stuck.translation_mm).max() > 0.2
+    five_sigma = 5.0 * 0.02 / np.sqrt(50)
+    assert np.abs(found.translation_mm).max() < five_sigma

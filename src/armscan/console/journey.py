@@ -323,6 +323,7 @@ class Journey:
     def __init__(self, folder: Path, settings: SessionSettings) -> None:
         self.folder = folder
         self.settings = settings
+        self._known: dict[tuple[Path, int, int], bool] = {}
 
     def change(self, **settings: Any) -> None:
         """Write other settings.
@@ -359,8 +360,20 @@ class Journey:
         """Names of the scans, in their order."""
         place = self.folder / RECORDINGS
         found = place.glob("scan-*") if place.is_dir() else []
-        names = {one.name.removesuffix(MOVED) for one in found if is_file(one / EXPOSURES_FILE)}
+        names = {one.name.removesuffix(MOVED) for one in found if self._has_exposures(one)}
         return tuple(sorted(names))
+
+    def _has_exposures(self, place: Path) -> bool:
+        """Whether a recording lists any; a file that did not change is not opened again."""
+        if place.suffix != MOVED:
+            return is_file(place / EXPOSURES_FILE)
+        with suppress(OSError):
+            facts = place.stat()
+            key = place, facts.st_mtime_ns, facts.st_size
+            if key not in self._known:
+                self._known[key] = is_file(place / EXPOSURES_FILE)
+            return self._known[key]
+        return False
 
     @property
     def cut_short(self) -> tuple[Path, ...]:

@@ -16,6 +16,7 @@ from armscan.kernels.arrays import (
     Image,
     ImageOut,
     IntsOut,
+    Mask,
     Row,
     RowOut,
     Table,
@@ -143,6 +144,7 @@ def mark_lit(
 def find_runs(
     image: Image,
     background: Image,
+    is_lit_cell: Mask,
     cell_px: int,
     rise: float,
     longest_px: int,
@@ -151,7 +153,8 @@ def find_runs(
     """Find runs of pixels more than ``rise`` above the background in one pass over the image.
 
     ``image``: (H, W) grey levels. ``background``: (rows, columns) background per cell of
-    ``cell_px`` pixels, interpolated in between. ``cell_px``: Side of a background cell. ``rise``:
+    ``cell_px`` pixels, interpolated in between. ``is_lit_cell``: (rows, columns) 0 for cells that
+    are passed over unread. ``cell_px``: Side of a cell. ``rise``:
     Height above the background. ``longest_px``: Longer runs are no cross-sections of a line and are
     left out. ``runs``: (capacity, 3) output rows: ``x, y`` of the centroid above the threshold, and
     the axis (0: the run goes down a column, 1: along a row).
@@ -173,9 +176,12 @@ def find_runs(
     count = 0
     lift = np.float32(rise)
     fraction = np.float32(0.0)
+    n_columns = 0
     for y in range(height + 1):
         row_start = -1
         is_lit[:] = 0
+        if n_columns == 0 and (y == height or not is_lit_cell[y // cell_px].any()):
+            continue
         if y < height:
             v = min(max((y + 0.5) / cell_px - 0.5, 0.0), background.shape[0] - 1.0)
             cell = int(v)
@@ -193,7 +199,7 @@ def find_runs(
                 # most of the image is dark, and is passed over by a cell's width at once
                 low = k * cell_px
                 high = min(low + cell_px, width)
-                if is_any_above(row[low:high], quiet[k]):
+                if is_lit_cell[y // cell_px, k] and is_any_above(row[low:high], quiet[k]):
                     own = slice(low, high)
                     mark_lit(row[own], upper[own], lower[own], v - cell, rise, is_lit[low:])
         for word in range(n_words):
@@ -204,6 +210,7 @@ def find_runs(
                     if start[x] < 0:
                         start[x] = y
                         n_open[word] += 1
+                        n_columns += 1
                     if row_start < 0:
                         row_start = x
                     if x < width - 1:
@@ -218,6 +225,7 @@ def find_runs(
                             )
                         start[x] = -1
                         n_open[word] -= 1
+                        n_columns -= 1
                     stop = x - 1
                 if row_start >= 0:
                     if stop - row_start < longest_px:

@@ -189,7 +189,7 @@ def _end_of_scan(data: bytes, position: int) -> int:
 
 
 def _scan_defect(codes: bytes, header: bytes, picture: _Picture) -> str:
-    from armscan.kernels.jpeg_entropy import WHOLE, walk_scan  # compiled: only JPEGs wait for it
+    from armscan.kernels.compressed import WHOLE, walk_scan  # compiled: only JPEGs wait for it
 
     if not picture.is_sequential:
         return ""

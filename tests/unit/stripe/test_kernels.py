@@ -12,11 +12,8 @@ from armscan.kernels.profile_fit import (
     CENTRE,
     SIGMA,
     VARIANCE,
-    bin_residuals,
-    common_terms,
     fit_profiles,
     read_sides,
-    weigh_section,
 )
 from armscan.kernels.ridge import (
     BLOCK_PX,
@@ -30,6 +27,7 @@ from armscan.kernels.ridge import (
     sample_across,
     shared_derivatives_at,
 )
+from armscan.kernels.section import bin_residuals, common_terms, weigh_section
 
 FLOAT32 = 3e-5
 """Rounding of 32-bit sums over a few hundred pixels of grey level 255, relative to 1."""
@@ -94,7 +92,9 @@ def test_runs_match_the_twin() -> None:
     rng = np.random.default_rng(2)
     image = np.where(rng.uniform(size=(50, 70)) > 0.7, 100.0, 0.0).astype(np.float32)
     runs = np.zeros((4000, 3))
-    count = find_runs(image, np.zeros((1, 2), np.float32), 64, 20.0, 6, runs)
+    count = find_runs(
+        image, np.zeros((1, 2), np.float32), np.ones((1, 2), np.uint8), 64, 20.0, 6, runs
+    )
     rows = runs[:count]
     axis = rows[:, 2].astype(int)
     line = np.where(axis == 0, rows[:, 0], rows[:, 1]).astype(int)
@@ -109,7 +109,9 @@ def test_two_humps_on_one_foot_become_two_candidates() -> None:
     profile = 150.0 * (np.exp(-0.5 * ((x - 22) / 3) ** 2) + np.exp(-0.5 * ((x - 37) / 3) ** 2))
     image = np.tile(profile + 12.0, (2, 1)).astype(np.float32)
     runs = np.zeros((200, 3))
-    count = find_runs(image, np.zeros((1, 1), np.float32), 64, 10.0, 90, runs)
+    count = find_runs(
+        image, np.zeros((1, 1), np.float32), np.ones((1, 1), np.uint8), 64, 10.0, 90, runs
+    )
     along = runs[:count][runs[:count, 2] == 1]
     assert along[:, 0] == pytest.approx([22.0, 37.0] * 2, abs=0.2)
 
@@ -117,7 +119,15 @@ def test_two_humps_on_one_foot_become_two_candidates() -> None:
 def test_capacity_is_reported() -> None:
     image = np.zeros((20, 40), np.float32)
     image[:, ::2] = 100.0
-    needed = find_runs(image, np.zeros((1, 1), np.float32), 64, 20.0, 90, np.zeros((5, 3)))
+    needed = find_runs(
+        image,
+        np.zeros((1, 1), np.float32),
+        np.ones((1, 1), np.uint8),
+        64,
+        20.0,
+        90,
+        np.zeros((5, 3)),
+    )
     assert needed == 20 * 20 + 20
 
 
@@ -136,9 +146,9 @@ def test_runs_follow_a_sloping_background() -> None:
     grid = (0.5 * centres[None, :] + 0.3 * centres[:, None]).astype(np.float32)
     image = ground.astype(np.float32)
     runs = np.zeros((100, 3))
-    assert find_runs(image, grid, 64, 0.1, 90, runs) == 0
+    assert find_runs(image, grid, np.ones(grid.shape, np.uint8), 64, 0.1, 90, runs) == 0
     image[100, 40] += 5.0
-    assert find_runs(image, grid, 64, 0.1, 90, runs) == 2
+    assert find_runs(image, grid, np.ones(grid.shape, np.uint8), 64, 0.1, 90, runs) == 2
 
 
 @pytest.mark.parametrize("centre", [20.0, 20.37, 20.5])
@@ -414,6 +424,18 @@ def test_shared_columns_give_the_same_derivatives(pixel: tuple[int, int]) -> Non
         derivatives_at(image, x, y, taps, radius, np.zeros_like(taps), own)
         shared_derivatives_at(image, x, y, taps, radius, kept, rows, shared)
         assert shared == pytest.approx(own, abs=255.0 * FLOAT32)
+
+
+def test_dark_cells_are_not_read() -> None:
+    image = np.zeros((128, 192), np.float32)
+    image[30:34, 20:170] = 100.0
+    image[100:104, 20:170] = 100.0
+    grid, lit = np.zeros((2, 3), np.float32), np.array([[1, 0, 1], [0, 0, 0]], np.uint8)
+    runs = np.zeros((400, 3))
+    runs = runs[: find_runs(image, grid, lit, 64, 10.0, 90, runs)]
+    down = runs[runs[:, 2] == 0.0]
+    assert set(down[:, 0]) == {*range(20, 64), *range(128, 170)}
+    assert down[:, 1] == pytest.approx(31.5)
 
 
 def test_chains_walk_ends_first_then_loops() -> None:

@@ -192,7 +192,7 @@ def _unpacked(data: bytes, header: _Header, where: str) -> NDArray[Any]:
             remedy="copy the file again",
         )
     # numba is asked for only here: it takes a second to load
-    from armscan.kernels.lzf import decompress
+    from armscan.kernels.compressed import decompress
 
     plain = np.zeros(size, np.uint8)
     if decompress(np.frombuffer(data, np.uint8, packed, start), plain) != size:

@@ -1,15 +1,56 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Walk through the entropy-coded data of a sequential JPEG without making a picture of it.
-
-Decoders fill what is missing with grey and say so on stderr at most; here the codes themselves are
-counted (ITU T.81, annex F.2.2).
-"""
+"""Compressed bytes: LZF of PCD files, and the entropy-coded data of sequential JPEGs."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from armscan.kernels.arrays import Bytes, IntTable, compiled
+from armscan.kernels.arrays import Bytes, BytesOut, IntTable, compiled
+
+LITERALS = 32
+"""First bytes below this count literals; others begin a reference of 3 to 8, or more, bytes."""
+
+
+@compiled()
+def decompress(data: Bytes, plain: BytesOut) -> int:
+    """Write the bytes that LZF ``data`` (N,) stands for to ``plain`` (M,); 0 for damaged ones.
+
+    LZF is runs of literal bytes and references to bytes before. Returns the bytes' count.
+    A byte ``c < 32`` is followed by ``c + 1`` literals. Otherwise the length is ``(c >> 5) + 2``,
+    a length of 9 being followed by a byte that is added, and the distance back one more than the
+    13 bits of the rest of ``c`` and the next byte.
+    """
+    n, size, i, k = len(data), len(plain), 0, 0
+    while i < n:
+        control = int(data[i])
+        i += 1
+        if control < LITERALS:
+            length = control + 1
+            if i + length > n or k + length > size:
+                return 0
+            for j in range(length):
+                plain[k + j] = data[i + j]
+            i += length
+            k += length
+            continue
+        length = (control >> 5) + 2
+        if length == 9:
+            if i >= n:
+                return 0
+            length += int(data[i])
+            i += 1
+        if i >= n:
+            return 0
+        back = ((control & 31) << 8) + int(data[i]) + 1
+        i += 1
+        if back > k or k + length > size:
+            return 0
+        # it may overlap what it writes: byte by byte
+        for j in range(length):
+            plain[k + j] = plain[k + j - back]
+        k += length
+    return k
+
 
 WHOLE, NO_CODE, TOO_SHORT, OUT_OF_BLOCK, NO_RESTART = range(5)
 BLOCK = 64
@@ -23,7 +64,10 @@ def walk_scan(
     n_units: int,
     restart: int,
 ) -> tuple[int, int]:
-    """Decode all codes of one scan.
+    """Walk through all codes of one scan of a JPEG without making a picture of it.
+
+    Decoders fill what is missing with grey and say so on stderr at most; here the codes themselves
+    are counted (ITU T.81, annex F.2.2).
 
     ``data``: (N,) from behind the scan's header to the marker that ends it. ``tables``: (T, 65536)
     of each Huffman table, by the next 16 bits: 256 times the length of the code plus its value; 0

@@ -16,16 +16,13 @@ from armscan.kernels.profile_fit import (
     read_sides,
 )
 from armscan.kernels.ridge import (
-    BLOCK_PX,
-    KEPT_ROWS,
-    MARGIN_PX,
+    derivatives_along,
     derivatives_at,
     find_runs,
     gaussian_taps,
     interpolate_columns,
     refine_candidates,
     sample_across,
-    shared_derivatives_at,
 )
 from armscan.kernels.section import bin_residuals, common_terms, weigh_section
 
@@ -332,6 +329,24 @@ def test_section_is_what_the_fit_leaves() -> None:
     assert np.std(pixels[2, :count]) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * count))
 
 
+def test_a_narrow_section_is_told_however_far_is_looked() -> None:
+    """Wide lines of an image decide how far is looked; the bell of a narrow one is 0 there."""
+    image = np.full((3, 401), 5.0, np.float32)
+    image[:, 180:221] = gaussian_row(20.3)
+    points = np.tile([200.0, 1.0, 1.0, 0.0, 0.0, 1.0], (1, 1))
+    fits = np.array([[200.3, 100.0, 0.6, 0.1, 0.0, 1.0, 0.0, 0.0]])
+    none, noise, section = np.zeros((1, 1), np.uint8), np.array([0.01, 0.1, 1.0]), np.full(4, 0.01)
+    told = []
+    for reach in (12, 190):
+        said, pixels = np.zeros((1, 8)), np.zeros((3, 2 * reach + 1))
+        given = (image, none, EVEN, points, np.full((1, 2), 5.0), fits, noise, section)
+        n = weigh_section(*given, reach, said, pixels)
+        told.append((said, pixels[:, :n]))
+    for near, far in zip(*told, strict=True):
+        assert np.isfinite(far).all()
+        assert far == pytest.approx(near, rel=1e-9)
+
+
 def test_residuals_are_binned_by_the_lines_own_level() -> None:
     rng = np.random.default_rng(9)
     pixels = np.stack([rng.uniform(-5, 130, 5000), rng.uniform(-20, 150, 5000), np.zeros(5000)])
@@ -410,20 +425,17 @@ def test_sums_along_chains_are_those_of_each_chain() -> None:
     assert sums == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("pixel", [(60, 17), (2, 3), (127, 39), (64, 0)])
-def test_shared_columns_give_the_same_derivatives(pixel: tuple[int, int]) -> None:
+@pytest.mark.parametrize("row", [17, 0, 39])
+def test_pixels_of_a_row_share_their_columns(row: int) -> None:
     image = np.random.default_rng(1).uniform(0, 255, (40, 128)).astype(np.float32)
     taps = gaussian_taps(1.7)
     radius = taps.shape[1] // 2
-    own, shared = np.zeros(5), np.zeros(5)
-    n_blocks = (128 + 2 * MARGIN_PX) // BLOCK_PX + 1
-    kept = np.zeros((3 * KEPT_ROWS, n_blocks * BLOCK_PX), np.float32)
-    rows = np.full(KEPT_ROWS * n_blocks, -1)
-    for shift in (0, 1, 0, KEPT_ROWS, 0):
-        x, y = pixel[0], (pixel[1] + shift) % 40
-        derivatives_at(image, x, y, taps, radius, np.zeros_like(taps), own)
-        shared_derivatives_at(image, x, y, taps, radius, kept, rows, shared)
-        assert shared == pytest.approx(own, abs=255.0 * FLOAT32)
+    own, along = np.zeros(5), np.zeros((5, 40), np.float32)
+    derivatives_along(image, 60, 37, row, taps, radius, np.zeros((3, 80), np.float32), along)
+    for k in (0, 20, 36):
+        derivatives_at(image, 60 + k, row, taps, radius, np.zeros_like(taps), own)
+        assert along[:, k] == pytest.approx(own, rel=FLOAT32, abs=255.0 * FLOAT32)
+    assert not along[:, 37:].any()
 
 
 def test_dark_cells_are_not_read() -> None:

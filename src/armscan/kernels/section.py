@@ -272,6 +272,7 @@ def weigh_section(
         n_lanes = min(LANES, points.shape[0] - block)
         seen[:] = NOT_SEEN
         lanes[:] = 0.0
+        low, high = size, 0
         for k in range(n_lanes):
             i = block + k
             is_column = int(points[i, 5]) == COLUMN
@@ -283,11 +284,13 @@ def weigh_section(
             lanes[AT_CENTRE * LANES + k] = fits[i, CENTRE] - first
             lanes[STEP * LANES + k] = 1.0 / fits[i, SIGMA]
             lanes[AT_AMPLITUDE * LANES + k] = fits[i, AMPLITUDE]
+            low = min(low, math.floor(fits[i, CENTRE] - first - REACH_SIGMAS * sigma))
+            high = max(high, math.ceil(fits[i, CENTRE] - first + REACH_SIGMAS * sigma))
             lanes[THIRD * LANES + k] = section[0] if is_column else section[2]
             lanes[FOURTH * LANES + k] = section[1] if is_column else section[3]
         for at in range(size):
             own = seen[at * PROFILE_ROWS * LANES : (at + 1) * PROFILE_ROWS * LANES]
-            if said.shape[0] > 0:
+            if said.shape[0] > 0 and low <= at <= high:
                 add_pixel(own, at, noise, lanes)
             if pixels.shape[1] > 0:
                 leave_pixel(own, at, lanes, left[3 * at * LANES : 3 * (at + 1) * LANES])

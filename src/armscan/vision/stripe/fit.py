@@ -219,8 +219,7 @@ class ProfileFits:
 
 def axis_component(table: FloatArray) -> FloatArray:
     """(N,) size of the normal's component along the fitted column or row."""
-    rows = np.arange(len(table))
-    return np.abs(table[rows, 3 - table[:, 5].astype(np.int64)])
+    return np.abs(np.where(table[:, 5] == COLUMN, table[:, 3], table[:, 2]))
 
 
 def fit_ridge(
@@ -284,16 +283,19 @@ def fit_ridge(
         plane.image, plane.clipped, ground, table, sigma, sides, noise, section, reach, values
     )
     good = values[:, VARIANCE] > 0.0
+    if not good.all():
+        ridge, values, sides = ridge.select(good), values[good], sides[good]
+        side_sigma, neighbour = side_sigma[good], neighbour[good]
     return ProfileFits(
-        ridge.select(good),
-        values[good],
-        sides[good],
-        side_sigma[good],
-        neighbour[good],
+        ridge,
+        values,
+        sides,
+        side_sigma,
+        neighbour,
         noise,
         section,
         is_noise_assumed=noise is guess,
-        ground=_ground(plane, table[good], values[good]),
+        ground=_ground(plane, ridge.table, values),
     )
 
 
@@ -332,7 +334,9 @@ class _Sample:
 def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatArray:
     """(N, 2) mean reflectance under each line, and how much of it the ground differs there."""
     if plane.reflectance.size == 1 or not len(points):
-        return np.tile([1.0, 0.0], (len(points), 1))
+        even = np.zeros((len(points), 2))
+        even[:, 0] = 1.0
+        return even
     reach = int(np.ceil(REACH_SIGMAS * float(np.quantile(fits[:, SIGMA], 0.9))))
     height, width = plane.image.shape
     is_column = (points[:, 5] == COLUMN)[:, None]

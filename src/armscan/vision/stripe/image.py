@@ -251,7 +251,7 @@ def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
     )
 
 
-FILLED_CELLS = 3
+FILLED_CELLS = 2
 """Around lit cells, copied too: as far as a filter, a fit and the background beside it look."""
 
 

@@ -127,7 +127,9 @@ def _cell_quantiles(image: FloatImage | ImageArray) -> FloatImage:
     # of single precision: smaller numbers are sorted more slowly
     sample = image[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].astype(np.float32)
     missing = (rows * steps - sample.shape[0], columns * steps - sample.shape[1])
-    filled = np.pad(sample, ((0, missing[0]), (0, missing[1])), mode="edge")
+    filled = (
+        np.pad(sample, ((0, missing[0]), (0, missing[1])), mode="edge") if any(missing) else sample
+    )
     cells = filled.reshape(rows, steps, columns, steps).swapaxes(1, 2)
     k = int(BACKGROUND_QUANTILE * steps * steps)
     ordered = np.partition(cells.reshape(rows, columns, steps * steps), k, axis=2)
@@ -136,6 +138,7 @@ def _cell_quantiles(image: FloatImage | ImageArray) -> FloatImage:
 
 def _brightest(sample: FloatImage | ImageArray, factor: np.float32) -> float:
     """The level that a share of `PEAK_QUANTILE` of the pixels stays below, times a factor."""
+    sample = np.ascontiguousarray(sample)
     few = np.sort(sample[::8, ::8], axis=None)
     # nearly all pixels are dark: the bright ones are sorted alone
     bright = sample[sample > few[int(0.98 * (len(few) - 1))]].astype(np.float32) * factor
@@ -185,7 +188,8 @@ def mean_along(values: FloatArray, weights: FloatArray, chain: IntArray, half: i
 def chain_lengths_px(points_px: FloatArray, chain: IntArray) -> FloatArray:
     """Arc length (N,) of each point's chain."""
     n = int(chain.max()) + 1 if len(chain) else 0
-    step = np.hypot(*np.diff(points_px, axis=0).T) * (np.diff(chain) == 0)
+    x, y = np.diff(points_px[:, 0]), np.diff(points_px[:, 1])
+    step = np.sqrt(x * x + y * y) * (chain[1:] == chain[:-1])
     total = np.bincount(chain[1:], weights=step, minlength=n) if n else np.zeros(0)
     return np.asarray(total[chain])
 

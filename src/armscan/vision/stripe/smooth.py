@@ -104,11 +104,11 @@ class Neighbourhoods:
         self._laid[CHAIN, self._own] = course.chain
         self._laid[WEIGHT, self._own] = course.weight
         self._moments = np.zeros(n_blocks * LANES * len(windows_px) * MOMENTS)
-        is_asked = np.ones(n_blocks, np.int64)
+        self._asked = np.ones(n_blocks, np.int64)
         if asked is not None:
-            is_asked[:] = 0
-            is_asked[np.flatnonzero(asked) // LANES + 1] = 1
-        gather_moments(self._laid, windows_px, is_asked, self._moments)
+            self._asked[:] = 0
+            self._asked[np.flatnonzero(asked) // LANES + 1] = 1
+        gather_moments(self._laid, windows_px, self._asked, self._moments)
 
     def leave_out(self, rows: IntArray) -> None:
         """Let points (M,) of the polyline count no longer."""
@@ -129,7 +129,7 @@ class Neighbourhoods:
         """
         result = np.zeros((SMOOTH_ROWS, len(sigma)))
         given = (self._laid, self._moments, scale, sigma, self._windows, inflation)
-        choose_windows(*given, CONFIDENCE, result)
+        choose_windows(*given, CONFIDENCE, self._asked, result)
         return result
 
 
@@ -195,9 +195,10 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     slope = np.where(used, result[SLOPE], 0.0)
     tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
     turned = normals - slope[:, None] * tangents
+    length = np.sqrt(turned[:, 0] ** 2 + turned[:, 1] ** 2)
     return SmoothedCentres(
         course.points + shift[:, None] * normals,
-        turned / np.linalg.norm(turned, axis=1, keepdims=True),
+        turned / length[:, None],
         np.where(used, result[SMOOTH_SIGMA], course.sigma),
         sigma_sum,
         is_outlier,
@@ -319,6 +320,7 @@ def _filter_residuals(course: Polyline, half: int) -> FloatArray:
     offset += (points[middle, 1] - smooth_y) * normals[middle, 1]
     residual = np.full(n, np.nan)
     residual[middle] = np.where(inside, offset / course.sigma[middle], np.nan)
-    limit = 5.0 * max(float(np.nanmedian(np.abs(residual))), 0.3) if inside.any() else 0.0
+    told = np.abs(residual[middle][inside])
+    limit = 5.0 * max(float(np.median(told)), 0.3) if len(told) else 0.0
     residual[np.abs(residual) > limit * MAD_TO_SIGMA] = np.nan
     return residual

@@ -384,12 +384,16 @@ def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
     ``points``: Rows as in `RidgePoints.table`. ``shape``: Rows and columns of the image.
     """
     n = len(points)
-    owner = np.zeros(shape, np.int32)
+    # a map of the part of the image that has points
+    placed, corner = points.copy(), np.floor(points[:, :2].min(axis=0, initial=max(shape)))
+    placed[:, :2] -= corner
+    columns, rows = placed[:, :2].max(axis=0, initial=0.0).astype(np.int64) + 2
+    owner = np.zeros((rows, columns), np.int32)
     is_kept = np.zeros(n, np.int64)
-    place_points(points, owner, is_kept)
+    place_points(placed, owner, is_kept)
     ahead = np.full(n, -1, np.int64)
     behind = np.full(n, -1, np.int64)
-    find_neighbours(points, owner, ahead, behind)
+    find_neighbours(placed, owner, ahead, behind)
     order = np.zeros(n, np.int64)
     chain = np.zeros(n, np.int64)
     count = walk_chains(ahead, behind, order, chain)

@@ -74,7 +74,7 @@ def measure_level(
     noise = _noise(rows, 1)
     clutter = max(_noise(rows, CLUTTER_LAG_PX), noise)
     if threshold is None:
-        peak = _brightest(image[::2, ::2], factor) - float(np.median(background))
+        peak = _brightest(image[::2, ::2].copy(), factor) - float(np.median(background))
         threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
     # between cells the background is linear: never below the least of them
     least = minimum_filter(background, 3, mode="nearest") + (threshold - ROUNDING)
@@ -138,7 +138,6 @@ def _cell_quantiles(image: FloatImage | ImageArray) -> FloatImage:
 
 def _brightest(sample: FloatImage | ImageArray, factor: np.float32) -> float:
     """The level that a share of `PEAK_QUANTILE` of the pixels stays below, times a factor."""
-    sample = np.ascontiguousarray(sample)
     few = np.sort(sample[::8, ::8], axis=None)
     # nearly all pixels are dark: the bright ones are sorted alone
     bright = sample[sample > few[int(0.98 * (len(few) - 1))]].astype(np.float32) * factor

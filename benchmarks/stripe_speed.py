@@ -25,8 +25,8 @@ from armscan.geometry.arrays import FloatArray
 from armscan.kernels.ridge import gaussian_taps
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import mono_plane
-from armscan.vision.stripe.ridge import find_candidates, measure_level, trace_ridges
+from armscan.vision.stripe.image import lit_plane
+from armscan.vision.stripe.ridge import find_candidates, trace_ridges
 from rigs.stripe_image import SimulatedStripe, StripeScene, WaveCurve
 
 SIGMA_PX = 3.0
@@ -106,8 +106,7 @@ def read_once(image: np.ndarray) -> FloatArray:
 
 def ridge_points(exposure: Exposure) -> FloatArray:
     """Candidates, Hessian at the candidates and linking alone, line width given."""
-    plane = mono_plane(exposure, None)
-    level = measure_level(plane.image, None)
+    plane, level = lit_plane(exposure, None)
     runs = find_candidates(plane.image, level)
     return trace_ridges(plane.image, runs, SIGMA_PX, level.rise).table[:, :2]
 

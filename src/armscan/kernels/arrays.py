@@ -56,6 +56,7 @@ _TYPES: dict[str, Any] = {
     "TableOut": types.Array(types.float64, 2, "C"),
     "FloatsOut": types.Array(types.float64, 1, "C"),
     "IntsOut": types.Array(types.int64, 1, "C"),
+    "np.float32": types.float32,
     "float": types.float64,
     "int": types.int64,
     "None": types.void,

@@ -16,6 +16,7 @@ from armscan.kernels.arrays import (
     Image,
     ImageOut,
     IntsOut,
+    Mask,
     Row,
     RowOut,
     Table,
@@ -143,6 +144,7 @@ def mark_lit(
 def find_runs(
     image: Image,
     background: Image,
+    is_lit_cell: Mask,
     cell_px: int,
     rise: float,
     longest_px: int,
@@ -151,7 +153,8 @@ def find_runs(
     """Find runs of pixels more than ``rise`` above the background in one pass over the image.
 
     ``image``: (H, W) grey levels. ``background``: (rows, columns) background per cell of
-    ``cell_px`` pixels, interpolated in between. ``cell_px``: Side of a background cell. ``rise``:
+    ``cell_px`` pixels, interpolated in between. ``is_lit_cell``: (rows, columns) 0 for cells that
+    are passed over unread. ``cell_px``: Side of a cell. ``rise``:
     Height above the background. ``longest_px``: Longer runs are no cross-sections of a line and are
     left out. ``runs``: (capacity, 3) output rows: ``x, y`` of the centroid above the threshold, and
     the axis (0: the run goes down a column, 1: along a row).
@@ -173,9 +176,12 @@ def find_runs(
     count = 0
     lift = np.float32(rise)
     fraction = np.float32(0.0)
+    n_columns = 0
     for y in range(height + 1):
         row_start = -1
         is_lit[:] = 0
+        if n_columns == 0 and (y == height or not is_lit_cell[y // cell_px].any()):
+            continue
         if y < height:
             v = min(max((y + 0.5) / cell_px - 0.5, 0.0), background.shape[0] - 1.0)
             cell = int(v)
@@ -193,7 +199,7 @@ def find_runs(
                 # most of the image is dark, and is passed over by a cell's width at once
                 low = k * cell_px
                 high = min(low + cell_px, width)
-                if is_any_above(row[low:high], quiet[k]):
+                if is_lit_cell[y // cell_px, k] and is_any_above(row[low:high], quiet[k]):
                     own = slice(low, high)
                     mark_lit(row[own], upper[own], lower[own], v - cell, rise, is_lit[low:])
         for word in range(n_words):
@@ -204,6 +210,7 @@ def find_runs(
                     if start[x] < 0:
                         start[x] = y
                         n_open[word] += 1
+                        n_columns += 1
                     if row_start < 0:
                         row_start = x
                     if x < width - 1:
@@ -218,6 +225,7 @@ def find_runs(
                             )
                         start[x] = -1
                         n_open[word] -= 1
+                        n_columns -= 1
                     stop = x - 1
                 if row_start >= 0:
                     if stop - row_start < longest_px:
@@ -254,21 +262,50 @@ def gaussian_taps(sigma_px: float) -> Image:
 
 
 @compiled(fastmath=True)
-def combine_columns(down0: Row, down1: Row, down2: Row, taps: Image, result: FloatsOut) -> None:
-    """Derivatives (5,) of columns that were smoothed and differentiated once and twice, (m,)."""
-    taps0, taps1, taps2 = taps[0], taps[1], taps[2]
-    gx = gy = gxx = gxy = gyy = np.float32(0.0)
-    for i in range(taps0.shape[0]):
-        gx += taps1[i] * down0[i]
-        gxx += taps2[i] * down0[i]
-        gxy += taps1[i] * down1[i]
-        gy += taps0[i] * down1[i]
-        gyy += taps0[i] * down2[i]
-    result[0] = gx
-    result[1] = gy
-    result[2] = gxx
-    result[3] = gxy
-    result[4] = gyy
+def smooth_columns(
+    image: Image, left: int, n: int, y: int, taps: Image, radius: int, columns: ImageOut
+) -> None:
+    """Smooth and differentiate ``n`` columns from ``left`` on, once and twice, down around ``y``.
+
+    ``image``: (H, W) grey levels, of which the columns are a part; beyond its first and last row it
+    is continued constantly. ``taps``: (3, m) from `gaussian_taps`. ``radius``: Theirs; more columns
+    of the taps are 0. ``columns``: (3, >= n) output.
+    """
+    height = image.shape[0]
+    # views, because an index that might be negative keeps the loops from being vectorised
+    down0, down1, down2 = columns[0, :n], columns[1, :n], columns[2, :n]
+    middle = image[y, left : left + n]
+    smooth, bend = taps[0, radius], taps[2, radius]
+    for i in range(n):
+        down0[i] = smooth * middle[i]
+        down1[i] = np.float32(0.0)
+        down2[i] = bend * middle[i]
+    for j in range(1, radius + 1):
+        upper = image[max(y - j, 0), left : left + n]
+        lower = image[min(y + j, height - 1), left : left + n]
+        smooth, slope, bend = taps[0, radius + j], taps[1, radius + j], taps[2, radius + j]
+        for i in range(n):
+            both = lower[i] + upper[i]
+            apart = lower[i] - upper[i]
+            down0[i] += smooth * both
+            down1[i] += slope * apart
+            down2[i] += bend * both
+
+
+@compiled(fastmath=True)
+def smooth_border(
+    image: Image, left: int, n: int, y: int, taps: Image, radius: int, columns: ImageOut
+) -> None:
+    """As `smooth_columns`, of columns of which some lie beyond the image's border."""
+    height, width = image.shape
+    columns[:, :n] = np.float32(0.0)
+    for j in range(2 * radius + 1):
+        row = min(max(y + j - radius, 0), height - 1)
+        for i in range(n):
+            value = image[row, min(max(left + i, 0), width - 1)]
+            columns[0, i] += taps[0, j] * value
+            columns[1, i] += taps[1, j] * value
+            columns[2, i] += taps[2, j] * value
 
 
 @compiled(fastmath=True)
@@ -285,177 +322,144 @@ def derivatives_at(
 
     ``image``: (H, W) grey levels. ``x``, ``y``: Pixel. ``taps``: (3, m) from `gaussian_taps`, of
     which the first 2 radius + 1 columns count and the rest is 0.
-    ``columns``: (3, m) scratch. ``result``: (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
+    ``columns``: (3, >= m) scratch. ``result``: (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
     """
-    height, width = image.shape
     m = taps.shape[1]
     left = x - radius
-    is_inside = left >= 0 and left + m <= width
-    # views, because an index that might be negative keeps the loops from being vectorised
-    down0, down1, down2 = columns[0], columns[1], columns[2]
+    if left >= 0 and left + m <= image.shape[1]:
+        smooth_columns(image, left, m, y, taps, radius, columns)
+    else:
+        smooth_border(image, left, m, y, taps, radius, columns)
+    down0, down1, down2 = columns[0, :m], columns[1, :m], columns[2, :m]
     taps0, taps1, taps2 = taps[0], taps[1], taps[2]
-    down0[:] = np.float32(0.0)
-    down1[:] = np.float32(0.0)
-    down2[:] = np.float32(0.0)
-    for j in range(2 * radius + 1):
-        row = min(max(y + j - radius, 0), height - 1)
-        smooth = taps0[j]
-        slope = taps1[j]
-        bend = taps2[j]
-        if is_inside:
-            pixels = image[row, left : left + m]
-            for i in range(m):
-                value = pixels[i]
-                down0[i] += smooth * value
-                down1[i] += slope * value
-                down2[i] += bend * value
-        else:
-            for i in range(m):
-                value = image[row, min(max(left + i, 0), width - 1)]
-                down0[i] += smooth * value
-                down1[i] += slope * value
-                down2[i] += bend * value
-    combine_columns(down0, down1, down2, taps, result)
-
-
-BLOCK_PX = 32
-"""Columns that are smoothed together where a line runs along a row."""
-KEPT_ROWS = 8
-"""Rows whose columns are kept: a walk to the ridge leaves the row of its candidate."""
-MARGIN_PX = 2 * BLOCK_PX
-"""Columns kept beyond either border; taps reach no farther."""
+    gx = gy = gxx = gxy = gyy = np.float32(0.0)
+    for i in range(m):
+        gx += taps1[i] * down0[i]
+        gxx += taps2[i] * down0[i]
+        gxy += taps1[i] * down1[i]
+        gy += taps0[i] * down1[i]
+        gyy += taps0[i] * down2[i]
+    result[0] = gx
+    result[1] = gy
+    result[2] = gxx
+    result[3] = gxy
+    result[4] = gyy
 
 
 @compiled(fastmath=True)
-def smooth_block(
-    image: Image, block: int, y: int, taps: Image, radius: int, kept: ImageOut
-) -> None:
-    """Smooth and differentiate `BLOCK_PX` columns down around row ``y`` into ``kept``.
-
-    The others: As for `shared_derivatives_at`.
-    """
-    height, width = image.shape
-    left = block * BLOCK_PX - MARGIN_PX
-    is_inside = left >= 0 and left + BLOCK_PX <= width
-    own = slice(block * BLOCK_PX, (block + 1) * BLOCK_PX)
-    down0, down1, down2 = kept[0, own], kept[1, own], kept[2, own]
-    down0[:] = np.float32(0.0)
-    down1[:] = np.float32(0.0)
-    down2[:] = np.float32(0.0)
-    for j in range(2 * radius + 1):
-        row = min(max(y + j - radius, 0), height - 1)
-        smooth = taps[0, j]
-        slope = taps[1, j]
-        bend = taps[2, j]
-        if is_inside:
-            pixels = image[row, left : left + BLOCK_PX]
-            for i in range(BLOCK_PX):
-                value = pixels[i]
-                down0[i] += smooth * value
-                down1[i] += slope * value
-                down2[i] += bend * value
-        else:
-            for i in range(BLOCK_PX):
-                value = image[row, min(max(left + i, 0), width - 1)]
-                down0[i] += smooth * value
-                down1[i] += slope * value
-                down2[i] += bend * value
-
-
-@compiled()
-def shared_derivatives_at(
+def derivatives_along(
     image: Image,
     x: int,
+    n: int,
     y: int,
     taps: Image,
     radius: int,
-    kept: ImageOut,
-    row_of_block: IntsOut,
-    result: FloatsOut,
+    columns: ImageOut,
+    result: ImageOut,
 ) -> None:
-    """As `derivatives_at`, with columns that neighbours in the same row share.
+    """As `derivatives_at`, at ``n`` pixels of a row from ``x`` on, which share their columns.
 
-    ``kept``: (3 `KEPT_ROWS`, W + 2 `MARGIN_PX` and up to a block more) columns, and
-    ``row_of_block`` (`KEPT_ROWS` blocks,) the row around which each block was smoothed; -1 for
-    none. Rows with the same remainder share a place.
+    All columns lie inside the image. ``columns``: (3, >= n + 2 radius) scratch. ``result``:
+    (5, >= n) output.
     """
-    first = x - radius + MARGIN_PX
-    stop = first + taps.shape[1]
-    n_blocks = row_of_block.shape[0] // KEPT_ROWS
-    at = y % KEPT_ROWS
-    own = kept[3 * at : 3 * at + 3]
-    for block in range(first // BLOCK_PX, (stop - 1) // BLOCK_PX + 1):
-        if row_of_block[at * n_blocks + block] != y:
-            row_of_block[at * n_blocks + block] = y
-            smooth_block(image, block, y, taps, radius, own)
-    combine_columns(own[0, first:stop], own[1, first:stop], own[2, first:stop], taps, result)
+    smooth_columns(image, x - radius, n + 2 * radius, y, taps, radius, columns)
+    gx, gy, gxx, gxy, gyy = (
+        result[0, :n],
+        result[1, :n],
+        result[2, :n],
+        result[3, :n],
+        result[4, :n],
+    )
+    result[:, :n] = np.float32(0.0)
+    for i in range(2 * radius + 1):
+        down0, down1, down2 = columns[0, i : i + n], columns[1, i : i + n], columns[2, i : i + n]
+        smooth, slope, bend = taps[0, i], taps[1, i], taps[2, i]
+        for k in range(n):
+            gx[k] += slope * down0[k]
+            gxx[k] += bend * down0[k]
+            gxy[k] += slope * down1[k]
+            gy[k] += smooth * down1[k]
+            gyy[k] += smooth * down2[k]
+
+
+NO_RIDGE, FOUND, MOVED = range(3)
+
+
+@compiled()
+def step_across(derivatives: Floats, x: int, y: int, radius: int, result: FloatsOut) -> int:
+    """One Newton step across the line from a pixel.
+
+    The eigenvector of the eigenvalue of largest curvature is the normal ``n``; along it the Taylor
+    polynomial has its maximum at ``t = -(g . n) / (n' H n)``.
+
+    ``derivatives``: (5,) of `derivatives_at`. ``result``: (5,) output: x, y, normal x, normal y,
+    negative second derivative along the normal; x and y alone where the step leaves the pixel.
+    Returns `NO_RIDGE`, `FOUND`, or `MOVED`.
+    """
+    half = 0.5 * (derivatives[2] - derivatives[4])
+    gxy = derivatives[3]
+    root = math.sqrt(half * half + gxy * gxy)
+    bend = 0.5 * (derivatives[2] + derivatives[4]) - root
+    if bend >= 0.0 or root <= 0.0:
+        return NO_RIDGE
+    nx = root - half if half < 0.0 else -gxy
+    ny = -gxy if half < 0.0 else root + half
+    length = math.sqrt(nx * nx + ny * ny)
+    nx /= length
+    ny /= length
+    step = -(derivatives[0] * nx + derivatives[1] * ny) / bend
+    dx = step * nx
+    dy = step * ny
+    result[0] = x + dx
+    result[1] = y + dy
+    if abs(dx) <= 0.6 and abs(dy) <= 0.6:
+        result[2] = nx
+        result[3] = ny
+        result[4] = -bend
+        return FOUND
+    return NO_RIDGE if abs(step) > radius else MOVED
 
 
 @compiled()
 def step_to_ridge(
     image: Image,
-    x_px: float,
-    y_px: float,
+    x: int,
+    y: int,
+    rounds: int,
     taps: Image,
     radius: int,
     scratch: ImageOut,
-    kept: ImageOut,
-    row_of_block: IntsOut,
-    is_shared: bool,
     derivatives: FloatsOut,
     result: FloatsOut,
 ) -> bool:
-    """Walk from a start to the nearest ridge; False if there is none.
+    """Walk from a pixel to the nearest ridge; False if there is none.
 
-    The eigenvector of the eigenvalue of largest curvature is the normal ``n``; along it the Taylor
-    polynomial has its maximum at ``t = -(g . n) / (n' H n)``. The expansion point is moved while
-    the step leaves its pixel.
+    The expansion point is moved while the step leaves its pixel, in so many ``rounds`` at most.
 
-    ``image``, ``taps``, ``radius``, ``scratch``: As for `derivatives_at`. ``x_px``,
-    ``y_px``: Start. ``kept``, ``row_of_block``: As for `shared_derivatives_at`, which is taken if
-    ``is_shared``. ``derivatives``: (5,) scratch. ``result``: (5,) output: x, y, normal x, normal
-    y, negative second derivative along the normal.
+    ``image``, ``taps``, ``radius``, ``scratch``: As for `derivatives_at`. ``derivatives``: (5,)
+    scratch. ``result``: (5,) output of `step_across`.
     """
     height, width = image.shape
-    x = math.floor(x_px + 0.5)
-    y = math.floor(y_px + 0.5)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         if x < 0 or y < 0 or x >= width or y >= height:
             return False
-        if is_shared:
-            shared_derivatives_at(image, x, y, taps, radius, kept, row_of_block, derivatives)
-        else:
-            derivatives_at(image, x, y, taps, radius, scratch, derivatives)
-        half = 0.5 * (derivatives[2] - derivatives[4])
-        gxy = derivatives[3]
-        root = math.sqrt(half * half + gxy * gxy)
-        bend = 0.5 * (derivatives[2] + derivatives[4]) - root
-        if bend >= 0.0 or root <= 0.0:
-            return False
-        nx = root - half if half < 0.0 else -gxy
-        ny = -gxy if half < 0.0 else root + half
-        length = math.sqrt(nx * nx + ny * ny)
-        nx /= length
-        ny /= length
-        step = -(derivatives[0] * nx + derivatives[1] * ny) / bend
-        dx = step * nx
-        dy = step * ny
-        if abs(dx) <= 0.6 and abs(dy) <= 0.6:
-            result[0] = x + dx
-            result[1] = y + dy
-            result[2] = nx
-            result[3] = ny
-            result[4] = -bend
-            return True
-        if abs(step) > radius:
-            return False
-        x += math.floor(dx + 0.5)
-        y += math.floor(dy + 0.5)
+        derivatives_at(image, x, y, taps, radius, scratch, derivatives)
+        state = step_across(derivatives, x, y, radius, result)
+        if state != MOVED:
+            return state == FOUND
+        x = math.floor(result[0] + 0.5)
+        y = math.floor(result[1] + 0.5)
     return False
 
 
+BLOCK_PX = 32
+"""Columns by which candidates of a row are sorted, and so found together."""
+MOST_BLOCKS = 3
+"""Blocks of a row that are looked at together where a line runs along it."""
+MOST_APART = 6
+"""Pixels of a row for each candidate up to which its columns are smoothed together."""
 SHARED_FROM = 3
-"""Candidates in one row and block from which on smoothing the whole block is worth its time."""
+"""Candidates beside each other from which on sharing columns is worth its time."""
 
 
 @compiled()
@@ -464,7 +468,7 @@ def sort_candidates(runs: Table, n_runs: int, cell: IntsOut, order: IntsOut) -> 
 
     ``runs``, ``n_runs``: As for `refine_candidates`. ``cell``: (n_runs,) output: number of the row
     and block of each. ``order``: (n_runs,) output: candidates by rising cell. Returns count of
-    cells.
+    blocks of a row.
     """
     blocks = rows = 0
     for r in range(n_runs):
@@ -480,50 +484,61 @@ def sort_candidates(runs: Table, n_runs: int, cell: IntsOut, order: IntsOut) -> 
     for r in range(n_runs):
         order[place[cell[r]]] = r
         place[cell[r]] += 1
-    return rows * blocks
+    return blocks
 
 
 @compiled()
 def find_ridges(image: Image, runs: Table, n_runs: int, taps: Image, ridges: TableOut) -> None:
     """Walk from each candidate to its ridge; ``ridges``: (n_runs, 5) output, 0 where there is none.
 
-    The others, and the columns: As for `refine_candidates` and `step_to_ridge`.
+    The others: As for `refine_candidates` and `step_across`.
     """
-    width = image.shape[1]
+    height, width = image.shape
     radius = taps.shape[1] // 2
     # whole registers: what is left over of a row would take as long as the rest
     padded = np.zeros((3, -(-taps.shape[1] // LANES) * LANES), np.float32)
     padded[:, : taps.shape[1]] = taps
-    scratch = np.zeros(padded.shape, np.float32)
+    widest = MOST_BLOCKS * BLOCK_PX
+    scratch = np.zeros((3, max(widest + 2 * radius, padded.shape[1])), np.float32)
+    along = np.zeros((5, widest), np.float32)
     derivatives = np.zeros(5)
-    n_blocks = (width + 2 * MARGIN_PX) // BLOCK_PX + 1
-    kept = np.zeros((3 * KEPT_ROWS, n_blocks * BLOCK_PX), np.float32)
-    row_of_block = np.full(KEPT_ROWS * n_blocks, -1, np.int64)
-    is_narrow = padded.shape[1] <= MARGIN_PX
     cell = np.zeros(n_runs, np.int64)
     order = np.zeros(n_runs, np.int64)
-    sort_candidates(runs, n_runs, cell, order)
+    blocks = sort_candidates(runs, n_runs, cell, order)
     first = 0
     while first < n_runs:
-        stop = first + 1
-        while stop < n_runs and cell[order[stop]] == cell[order[first]]:
+        stop = first
+        low, high = width, -1
+        row = cell[order[first]] // blocks
+        last = min(cell[order[first]] + MOST_BLOCKS, (row + 1) * blocks)
+        while stop < n_runs and cell[order[stop]] < last:
+            x = math.floor(runs[order[stop], 0] + 0.5)
+            low, high = min(low, x), max(high, x)
             stop += 1
-        is_shared = is_narrow and stop - first >= SHARED_FROM
+        n = high - low + 1
+        is_shared = (stop - first >= SHARED_FROM) & (n <= MOST_APART * (stop - first))
+        is_shared &= (low >= radius) & (high + radius < width) & (0 <= row < height)
+        if is_shared:
+            derivatives_along(image, low, n, row, padded, radius, scratch, along)
         for k in range(first, stop):
             r = order[k]
-            if not step_to_ridge(
-                image,
-                runs[r, 0],
-                runs[r, 1],
-                padded,
-                radius,
-                scratch,
-                kept,
-                row_of_block,
-                is_shared,
-                derivatives,
-                ridges[r],
-            ):
+            x = math.floor(runs[r, 0] + 0.5)
+            y = math.floor(runs[r, 1] + 0.5)
+            state = MOVED
+            rounds = ROUNDS
+            if is_shared:
+                for m in range(5):
+                    derivatives[m] = along[m, x - low]
+                state = step_across(derivatives, x, y, radius, ridges[r])
+                x = math.floor(ridges[r, 0] + 0.5)
+                y = math.floor(ridges[r, 1] + 0.5)
+                rounds -= 1
+            if state == MOVED:
+                is_found = step_to_ridge(
+                    image, x, y, rounds, padded, radius, scratch, derivatives, ridges[r]
+                )
+                state = FOUND if is_found else NO_RIDGE
+            if state != FOUND:
                 ridges[r, 4] = 0.0
         first = stop
 

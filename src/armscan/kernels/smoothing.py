@@ -262,6 +262,7 @@ def choose_windows(
     windows_px: Floats,
     inflation: Floats,
     confidence: float,
+    is_asked: Ints,
     result: TableOut,
 ) -> None:
     """Smooth every point along its chain by a local quadratic in its own tangent frame.
@@ -274,7 +275,8 @@ def choose_windows(
     ``scale``: Variance of the points over what their weights say. ``sigma_px``: (N,) standard
     deviation along the normal. ``inflation``: (K,) factor on the variance of each window because
     neighbours' noise is correlated. ``confidence``: Half width of the confidence intervals in
-    sigmas. ``result``: (8, N) output: shift along the normal, slope of the line against the
+    sigmas. ``is_asked``: (P / `LANES`,) 0 for blocks whose results stay as they are. ``result``:
+    (8, N) output: shift along the normal, slope of the line against the
     tangent, its second derivative (curvature) and that one's sigma, sigma of the shift, half window
     (0: not smoothed), prediction of the point's shift by its neighbours alone, and that
     prediction's sigma (0: there is none).
@@ -285,6 +287,8 @@ def choose_windows(
     state = np.zeros(STATE_ROWS * LANES)
     for first in range(0, n, LANES):
         block = first // LANES + 1
+        if is_asked[block] == 0:
+            continue
         last = min(n - first, LANES)
         state[:] = 0.0
         state[LOWER * LANES : (LOWER + 1) * LANES] = -BEYOND

@@ -12,24 +12,19 @@ from armscan.kernels.profile_fit import (
     CENTRE,
     SIGMA,
     VARIANCE,
-    bin_residuals,
-    common_terms,
     fit_profiles,
     read_sides,
-    weigh_section,
 )
 from armscan.kernels.ridge import (
-    BLOCK_PX,
-    KEPT_ROWS,
-    MARGIN_PX,
+    derivatives_along,
     derivatives_at,
     find_runs,
     gaussian_taps,
     interpolate_columns,
     refine_candidates,
     sample_across,
-    shared_derivatives_at,
 )
+from armscan.kernels.section import bin_residuals, common_terms, weigh_section
 
 FLOAT32 = 3e-5
 """Rounding of 32-bit sums over a few hundred pixels of grey level 255, relative to 1."""
@@ -94,7 +89,9 @@ def test_runs_match_the_twin() -> None:
     rng = np.random.default_rng(2)
     image = np.where(rng.uniform(size=(50, 70)) > 0.7, 100.0, 0.0).astype(np.float32)
     runs = np.zeros((4000, 3))
-    count = find_runs(image, np.zeros((1, 2), np.float32), 64, 20.0, 6, runs)
+    count = find_runs(
+        image, np.zeros((1, 2), np.float32), np.ones((1, 2), np.uint8), 64, 20.0, 6, runs
+    )
     rows = runs[:count]
     axis = rows[:, 2].astype(int)
     line = np.where(axis == 0, rows[:, 0], rows[:, 1]).astype(int)
@@ -109,7 +106,9 @@ def test_two_humps_on_one_foot_become_two_candidates() -> None:
     profile = 150.0 * (np.exp(-0.5 * ((x - 22) / 3) ** 2) + np.exp(-0.5 * ((x - 37) / 3) ** 2))
     image = np.tile(profile + 12.0, (2, 1)).astype(np.float32)
     runs = np.zeros((200, 3))
-    count = find_runs(image, np.zeros((1, 1), np.float32), 64, 10.0, 90, runs)
+    count = find_runs(
+        image, np.zeros((1, 1), np.float32), np.ones((1, 1), np.uint8), 64, 10.0, 90, runs
+    )
     along = runs[:count][runs[:count, 2] == 1]
     assert along[:, 0] == pytest.approx([22.0, 37.0] * 2, abs=0.2)
 
@@ -117,7 +116,15 @@ def test_two_humps_on_one_foot_become_two_candidates() -> None:
 def test_capacity_is_reported() -> None:
     image = np.zeros((20, 40), np.float32)
     image[:, ::2] = 100.0
-    needed = find_runs(image, np.zeros((1, 1), np.float32), 64, 20.0, 90, np.zeros((5, 3)))
+    needed = find_runs(
+        image,
+        np.zeros((1, 1), np.float32),
+        np.ones((1, 1), np.uint8),
+        64,
+        20.0,
+        90,
+        np.zeros((5, 3)),
+    )
     assert needed == 20 * 20 + 20
 
 
@@ -136,9 +143,9 @@ def test_runs_follow_a_sloping_background() -> None:
     grid = (0.5 * centres[None, :] + 0.3 * centres[:, None]).astype(np.float32)
     image = ground.astype(np.float32)
     runs = np.zeros((100, 3))
-    assert find_runs(image, grid, 64, 0.1, 90, runs) == 0
+    assert find_runs(image, grid, np.ones(grid.shape, np.uint8), 64, 0.1, 90, runs) == 0
     image[100, 40] += 5.0
-    assert find_runs(image, grid, 64, 0.1, 90, runs) == 2
+    assert find_runs(image, grid, np.ones(grid.shape, np.uint8), 64, 0.1, 90, runs) == 2
 
 
 @pytest.mark.parametrize("centre", [20.0, 20.37, 20.5])
@@ -322,6 +329,24 @@ def test_section_is_what_the_fit_leaves() -> None:
     assert np.std(pixels[2, :count]) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * count))
 
 
+def test_a_narrow_section_is_told_however_far_is_looked() -> None:
+    """Wide lines of an image decide how far is looked; the bell of a narrow one is 0 there."""
+    image = np.full((3, 401), 5.0, np.float32)
+    image[:, 180:221] = gaussian_row(20.3)
+    points = np.tile([200.0, 1.0, 1.0, 0.0, 0.0, 1.0], (1, 1))
+    fits = np.array([[200.3, 100.0, 0.6, 0.1, 0.0, 1.0, 0.0, 0.0]])
+    none, noise, section = np.zeros((1, 1), np.uint8), np.array([0.01, 0.1, 1.0]), np.full(4, 0.01)
+    told = []
+    for reach in (12, 190):
+        said, pixels = np.zeros((1, 8)), np.zeros((3, 2 * reach + 1))
+        given = (image, none, EVEN, points, np.full((1, 2), 5.0), fits, noise, section)
+        n = weigh_section(*given, reach, said, pixels)
+        told.append((said, pixels[:, :n]))
+    for near, far in zip(*told, strict=True):
+        assert np.isfinite(far).all()
+        assert far == pytest.approx(near, rel=1e-9)
+
+
 def test_residuals_are_binned_by_the_lines_own_level() -> None:
     rng = np.random.default_rng(9)
     pixels = np.stack([rng.uniform(-5, 130, 5000), rng.uniform(-20, 150, 5000), np.zeros(5000)])
@@ -400,20 +425,29 @@ def test_sums_along_chains_are_those_of_each_chain() -> None:
     assert sums == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("pixel", [(60, 17), (2, 3), (127, 39), (64, 0)])
-def test_shared_columns_give_the_same_derivatives(pixel: tuple[int, int]) -> None:
+@pytest.mark.parametrize("row", [17, 0, 39])
+def test_pixels_of_a_row_share_their_columns(row: int) -> None:
     image = np.random.default_rng(1).uniform(0, 255, (40, 128)).astype(np.float32)
     taps = gaussian_taps(1.7)
     radius = taps.shape[1] // 2
-    own, shared = np.zeros(5), np.zeros(5)
-    n_blocks = (128 + 2 * MARGIN_PX) // BLOCK_PX + 1
-    kept = np.zeros((3 * KEPT_ROWS, n_blocks * BLOCK_PX), np.float32)
-    rows = np.full(KEPT_ROWS * n_blocks, -1)
-    for shift in (0, 1, 0, KEPT_ROWS, 0):
-        x, y = pixel[0], (pixel[1] + shift) % 40
-        derivatives_at(image, x, y, taps, radius, np.zeros_like(taps), own)
-        shared_derivatives_at(image, x, y, taps, radius, kept, rows, shared)
-        assert shared == pytest.approx(own, abs=255.0 * FLOAT32)
+    own, along = np.zeros(5), np.zeros((5, 40), np.float32)
+    derivatives_along(image, 60, 37, row, taps, radius, np.zeros((3, 80), np.float32), along)
+    for k in (0, 20, 36):
+        derivatives_at(image, 60 + k, row, taps, radius, np.zeros_like(taps), own)
+        assert along[:, k] == pytest.approx(own, rel=FLOAT32, abs=255.0 * FLOAT32)
+    assert not along[:, 37:].any()
+
+
+def test_dark_cells_are_not_read() -> None:
+    image = np.zeros((128, 192), np.float32)
+    image[30:34, 20:170] = 100.0
+    image[100:104, 20:170] = 100.0
+    grid, lit = np.zeros((2, 3), np.float32), np.array([[1, 0, 1], [0, 0, 0]], np.uint8)
+    runs = np.zeros((400, 3))
+    runs = runs[: find_runs(image, grid, lit, 64, 10.0, 90, runs)]
+    down = runs[runs[:, 2] == 0.0]
+    assert set(down[:, 0]) == {*range(20, 64), *range(128, 170)}
+    assert down[:, 1] == pytest.approx(31.5)
 
 
 def test_chains_walk_ends_first_then_loops() -> None:

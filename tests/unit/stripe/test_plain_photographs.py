@@ -2,9 +2,11 @@
 """What ordinary photographs do to a stripe: thick saturated lines, crops, patterns."""
 
 import numpy as np
+import pytest
 
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.stripe.image import lit_plane, mono_plane
 from armscan.vision.stripe.ridge import find_candidates, find_line_sigma, measure_level
 from rigs.stripe_image import StripeScene
 from rigs.stripe_scenes import line
@@ -57,3 +59,24 @@ def test_a_crop_of_a_binned_window_counts_sensor_pixels() -> None:
     crop = image.cropped(5, 7, 25, 37)
     assert (crop.width_px, crop.height_px) == (20, 30)
     assert crop.window == SensorWindow(110, 214, 2)
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+def test_what_is_dark_need_not_be_copied(bits: int) -> None:
+    """Lines found in the part that is copied are those of the whole image, to the last bit."""
+    image = np.full((530, 700), 9, np.uint8)
+    image[:200, :300] = thick_line(1, 2.0)[:200, :300]
+    deep = image.astype(np.uint16) * 16 + 3
+    exposure = Exposure(image if bits == 8 else deep, "corner", bits_used=bits)
+    plane, level = lit_plane(exposure, None)
+    whole = mono_plane(exposure, None).image
+    every = measure_level(whole, None)
+    assert (level.rise, level.noise, level.clutter) == (every.rise, every.noise, every.clutter)
+    np.testing.assert_array_equal(level.background, every.background)
+    runs = find_candidates(plane.image, level)
+    assert len(runs) > 200
+    np.testing.assert_array_equal(runs, find_candidates(whole, every))
+    assert (plane.image[:320, :420] == whole[:320, :420]).all()
+    assert not plane.image[470:, 570:].any()
+    bright = every.lit.repeat(64, axis=0).repeat(64, axis=1)[:530, :700] > 0
+    assert whole[~bright].max() < every.background.max() + every.rise

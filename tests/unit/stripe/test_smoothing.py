@@ -112,3 +112,13 @@ def test_points_that_are_left_out_are_as_if_they_had_never_counted() -> None:
     before = Neighbourhoods(course, WINDOWS).fit_parabolas(INFLATION, course.sigma)
     assert np.array_equal(around.fit_parabolas(INFLATION, course.sigma), anew)
     assert not np.array_equal(before, anew)
+
+
+def test_points_that_are_asked_are_as_if_all_were() -> None:
+    course, windows = wavy(3), np.array([4.0, 8.0])
+    asked = np.arange(len(course)) % 97 == 0
+    ones = np.ones(2)
+    found = Neighbourhoods(course, windows, asked).fit_parabolas(ones, course.sigma)
+    every = Neighbourhoods(course, windows).fit_parabolas(ones, course.sigma)
+    assert (every[WINDOW, asked] > 0.0).any()
+    np.testing.assert_array_equal(found[:, asked], every[:, asked])

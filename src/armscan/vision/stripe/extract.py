@@ -22,16 +22,19 @@ from armscan.vision.stripe.flags import (
 )
 from armscan.vision.stripe.image import (
     EVEN,
+    NORMAL_SCALE,
     StripeOptions,
     StripePlane,
     check_background,
     colour_plane,
     has_laser_colour,
     is_on_known_ground,
+    lit_plane,
     mono_plane,
     relative_reflectance,
 )
 from armscan.vision.stripe.ridge import (
+    ImageLevel,
     RidgePoints,
     find_candidates,
     find_line_sigma,
@@ -55,6 +58,15 @@ MOST_PULL = 0.5
 MOST_LEFT = 0.2
 """Of an edge's pull: the blur leaves more of it on lines of sigma below 3.2 px. Edges lie beside
 only a part of such lines, and the points there are better left out."""
+
+SHARPEST_BEND = 0.01
+"""In 1/px: a line across a bump of 100 px."""
+BEND_SPAN = 12
+"""Points to both sides by which a sharper bend is seen, 0.001 to 0.002 of noise beside it."""
+BEND_MARGIN = 3.0
+"""Times what is seen of a bend, for it is seen roughly."""
+LEAST_PULL = 0.03
+"""Of a centre's sigma: where not even the sharpest bend pulls so much, none is looked for."""
 
 
 def extract_stripes(
@@ -91,33 +103,37 @@ def extract_stripes(
     options = options or StripeOptions()
     if background is not None:
         check_background(exposure, background)
+    full_scale = exposure.full_scale / NORMAL_SCALE
+    threshold = None if options.threshold is None else options.threshold / full_scale
+    if exposure.colour == "mono" and background is None and options.method == "fit":
+        return _find(exposure, *lit_plane(exposure, threshold), options, threshold)
     if exposure.colour == "mono":
         plane = mono_plane(exposure, background)
     else:
         plane = colour_plane(exposure, background, options.laser_colour)
-    threshold = options.threshold
-    if threshold is not None:
-        threshold /= plane.grey_levels_per_unit
     if background is not None and options.on_print and options.method == "fit":
         ground = relative_reflectance(background, options.laser_colour)
         plane = replace(plane, reflectance=ground)
-    return _find(exposure, plane, options, threshold)
+    return _find(exposure, plane, measure_level(plane.image, threshold), options, threshold)
 
 
 def _find(
-    exposure: Exposure, plane: StripePlane, options: StripeOptions, threshold: float | None
+    exposure: Exposure,
+    plane: StripePlane,
+    level: ImageLevel,
+    options: StripeOptions,
+    threshold: float | None,
 ) -> Profile:
     """Points of the lines in a plane, without its ground's reflectance if they are too thin."""
     bare = replace(plane, reflectance=EVEN)
-    image, level = plane.image, measure_level(plane.image, threshold)
-    noise = level.noise
+    image, whole, noise = plane.image, level, level.noise
     if plane.reflectance.size > 1:
         image = plane.on_even_ground(image, noise)
         level = measure_level(image, threshold)
     runs = find_candidates(image, level)
     sigma = options.line_sigma_px or find_line_sigma(image, runs, level)
     if _is_too_thin(plane, sigma):
-        return _find(exposure, bare, options, threshold)
+        return _find(exposure, bare, whole, options, threshold)
     if options.method == "fit":
         ridge = trace_ridges(image, runs, sigma, level.rise)
     else:
@@ -132,7 +148,7 @@ def _find(
     width = profile.width_px[profile.is_accepted] / exposure.window.binning
     # where cores are clipped, runs are wider than the line's own sigma
     if len(width) and _is_too_thin(plane, float(np.median(width))):
-        return _find(exposure, bare, options, threshold)
+        return _find(exposure, bare, whole, options, threshold)
     return profile
 
 
@@ -221,7 +237,7 @@ def to_profile(
         width_px=width * binning,
         intensity=fits.values[:, AMPLITUDE] * fits.ground[:, 0] * plane.grey_levels_per_unit,
         flags=flags,
-        segment=np.unique(chain, return_inverse=True)[1],
+        segment=np.cumsum(np.diff(chain, prepend=chain[:1]) != 0),
         noise_length=np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0),
     )
 
@@ -248,8 +264,28 @@ def straighten(course: Polyline, fits: ProfileFits) -> Polyline:
     along = 1 - table[:, 5].astype(np.int64)
     n = course.normals[rows, along]
     sigma_along = fits.values[:, SIGMA]
-    bend = curvature(course)
-    cubic = bend * (1.0 - n * n) * sigma_along / (2.0 * n)
+    by_bend = fits.values[:, BEND_GAIN] * (1.0 - n * n) * sigma_along**2 / (2.0 * n)
+    sharpest = np.maximum(BEND_MARGIN * seen_bend(course), SHARPEST_BEND)
+    bend = curvature(course, np.abs(by_bend) * sharpest > LEAST_PULL * course.sigma)
     corrected = course.points.copy()
-    corrected[rows, along] -= fits.values[:, BEND_GAIN] * sigma_along * cubic
+    corrected[rows, along] -= bend * by_bend
     return replace(course, points=corrected)
+
+
+def seen_bend(course: Polyline) -> FloatArray:
+    """Curvature (N,) in 1/px of the circle through a point and those `BEND_SPAN` to both sides.
+
+    Infinite where the chain ends so near.
+    """
+    bend = np.full(len(course), np.inf)
+    if len(course) <= 2 * BEND_SPAN:
+        return bend
+    before, own = slice(0, -2 * BEND_SPAN), slice(BEND_SPAN, len(course) - BEND_SPAN)
+    after = slice(2 * BEND_SPAN, None)
+    across, square = np.zeros(len(bend[own])), np.full(len(bend[own]), 1e-12)
+    for place, normal in zip(course.points.T, course.normals.T, strict=True):
+        across += (place[before] + place[after] - 2.0 * place[own]) * normal[own]
+        square += (place[after] - place[before]) ** 2
+    is_one = course.chain[before] == course.chain[after]
+    bend[own] = np.where(is_one, 4.0 * np.abs(across) / square, np.inf)
+    return bend

@@ -14,26 +14,28 @@ from armscan.kernels.arrays import COLUMN, ROW
 from armscan.kernels.chains import find_other_lines
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
+    CENTRE,
+    FIT_COLUMNS,
+    REACH_SIGMAS,
+    SIDE_SPAN,
+    SIGMA,
+    VARIANCE,
+    fit_profiles,
+    read_sides,
+)
+from armscan.kernels.section import (
     BIN_MEANS,
     BLACK_NORMAL,
     BLACK_SCORE,
-    CENTRE,
-    FIT_COLUMNS,
     HAS_CORE,
     NORMAL_00,
     NORMAL_01,
     NORMAL_11,
-    REACH_SIGMAS,
     SCORE_0,
     SCORE_1,
     SECTION_COLUMNS,
-    SIDE_SPAN,
-    SIGMA,
-    VARIANCE,
     bin_residuals,
     common_terms,
-    fit_profiles,
-    read_sides,
     weigh_section,
 )
 from armscan.vision.stripe.image import StripePlane
@@ -64,7 +66,7 @@ def estimate_noise(pixels: FloatArray, peak: float, fallback: FloatArray) -> Flo
     The residuals are binned by the line's own grey level ``m``; each bin gives a robust variance,
     and non-negative least squares gives the three terms.
 
-    ``pixels``: (3, N) of `kernels.profile_fit.weigh_section`. ``peak``: amplitude of the bright
+    ``pixels``: (3, N) of `kernels.section.weigh_section`. ``peak``: amplitude of the bright
     ones. ``fallback``: (3,) what to return if there are too few residuals.
     """
     bins = np.zeros((len(BIN_EDGES) - 1, BIN_MEANS))
@@ -101,7 +103,7 @@ def estimate_section(
     profiles share are therefore made part of the model; what single profiles have beside them
     stays the sign of an edge.
 
-    ``said``: (N, 8) of `kernels.profile_fit.weigh_section`. ``section``: (4,) of the fit.
+    ``said``: (N, 8) of `kernels.section.weigh_section`. ``section``: (4,) of the fit.
     ``is_usable``: (N,) profiles whose core is not clipped and that no other line is near.
     ``axis``: (N,) along which each was fitted. ``chain``: (N,) increasing numbers.
     """
@@ -130,7 +132,7 @@ def estimate_black(said: FloatArray) -> float:
     A camera that shows darkness as some grey levels, and ink that is not as dark for the laser as
     for the room's light, make dark print seem lighter or darker than it is under the line.
 
-    ``said``: (N, 8) of `kernels.profile_fit.weigh_section`.
+    ``said``: (N, 8) of `kernels.section.weigh_section`.
     """
     normal, score = said[:, BLACK_NORMAL], said[:, BLACK_SCORE]
     size = np.sqrt(np.maximum(normal, 1e-12))
@@ -217,8 +219,7 @@ class ProfileFits:
 
 def axis_component(table: FloatArray) -> FloatArray:
     """(N,) size of the normal's component along the fitted column or row."""
-    rows = np.arange(len(table))
-    return np.abs(table[rows, 3 - table[:, 5].astype(np.int64)])
+    return np.abs(np.where(table[:, 5] == COLUMN, table[:, 3], table[:, 2]))
 
 
 def fit_ridge(
@@ -265,15 +266,14 @@ def fit_ridge(
             continue
         at = pick[good]
         peak = float(np.quantile(sample[good, AMPLITUDE], 0.9))
-        fitted = (plane, table[at], sides[at], sample[good])
-        noise = estimate_noise(_weighed(*fitted, noise=noise, section=section)[1], peak, noise)
-        said, _ = _weighed(*fitted, noise=noise, section=section)
+        fitted = _Sample(plane, table[at], sides[at], sample[good])
+        noise = estimate_noise(fitted.left(section), peak, noise)
+        said = fitted.said(noise, section)
         is_usable = (reach[at] >= REACH_SIGMAS) & (said[:, HAS_CORE] > 0.0)
         axis = table[at, 5].astype(np.int64)
         section = estimate_section(said, section, is_usable, axis, ridge.chain[at])
         if plane.reflectance.size > 1:
-            said, _ = _weighed(*fitted, noise=noise, section=section)
-            black += estimate_black(said)
+            black += estimate_black(fitted.said(noise, section))
             plane = bare.with_black(black)
             sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
     values = np.zeros((len(table), FIT_COLUMNS))
@@ -283,41 +283,60 @@ def fit_ridge(
         plane.image, plane.clipped, ground, table, sigma, sides, noise, section, reach, values
     )
     good = values[:, VARIANCE] > 0.0
+    if not good.all():
+        ridge, values, sides = ridge.select(good), values[good], sides[good]
+        side_sigma, neighbour = side_sigma[good], neighbour[good]
     return ProfileFits(
-        ridge.select(good),
-        values[good],
-        sides[good],
-        side_sigma[good],
-        neighbour[good],
+        ridge,
+        values,
+        sides,
+        side_sigma,
+        neighbour,
         noise,
         section,
         is_noise_assumed=noise is guess,
-        ground=_ground(plane, table[good], values[good]),
+        ground=_ground(plane, ridge.table, values),
     )
 
 
-def _weighed(
-    plane: StripePlane,
-    points: FloatArray,
-    sides: FloatArray,
-    fits: FloatArray,
-    *,
-    noise: FloatArray,
-    section: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Outputs (N, 8) and (3, M) of `weigh_section`."""
-    reach = int(np.ceil(np.quantile(fits[:, SIGMA], 0.9) * SIDE_SPAN / 2.0))
-    said = np.zeros((len(fits), SECTION_COLUMNS))
-    pixels = np.zeros((3, len(fits) * (2 * reach + 1)))
-    images = (plane.image, plane.clipped, plane.reflectance)
-    n = weigh_section(*images, points, sides, fits, noise, section, reach, said, pixels)
-    return said, pixels[:, :n]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sample:
+    """Profiles that were fitted, of which noise and section are told; as for `fit_profiles`."""
+
+    plane: StripePlane
+    points: FloatArray
+    sides: FloatArray
+    fits: FloatArray
+
+    def left(self, section: FloatArray) -> FloatArray:
+        """(3, M) pixels of `weigh_section`."""
+        pixels = np.zeros((3, len(self.fits) * (2 * self._reach() + 1)))
+        n = self._weigh(np.zeros(3), section, np.zeros((0, SECTION_COLUMNS)), pixels)
+        return pixels[:, :n]
+
+    def said(self, noise: FloatArray, section: FloatArray) -> FloatArray:
+        """(N, 8) of `weigh_section`."""
+        said = np.zeros((len(self.fits), SECTION_COLUMNS))
+        self._weigh(noise, section, said, np.zeros((3, 0)))
+        return said
+
+    def _reach(self) -> int:
+        return int(np.ceil(np.quantile(self.fits[:, SIGMA], 0.9) * SIDE_SPAN / 2.0))
+
+    def _weigh(
+        self, noise: FloatArray, section: FloatArray, said: FloatArray, pixels: FloatArray
+    ) -> int:
+        images = (self.plane.image, self.plane.clipped, self.plane.reflectance)
+        fitted = (self.points, self.sides, self.fits)
+        return weigh_section(*images, *fitted, noise, section, self._reach(), said, pixels)
 
 
 def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatArray:
     """(N, 2) mean reflectance under each line, and how much of it the ground differs there."""
     if plane.reflectance.size == 1 or not len(points):
-        return np.tile([1.0, 0.0], (len(points), 1))
+        even = np.zeros((len(points), 2))
+        even[:, 0] = 1.0
+        return even
     reach = int(np.ceil(REACH_SIGMAS * float(np.quantile(fits[:, SIGMA], 0.9))))
     height, width = plane.image.shape
     is_column = (points[:, 5] == COLUMN)[:, None]

@@ -67,9 +67,12 @@ def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:
         return found
     height, width = saturated.shape
     x, y = np.rint(points).astype(np.int64).T
+    columns = [np.clip(x + dx, 0, width - 1) for dx in (-1, 0, 1)]
+    masks = saturated.ravel()
     for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            found |= saturated[np.clip(y + dy, 0, height - 1), np.clip(x + dx, 0, width - 1)] > 0
+        row = np.clip(y + dy, 0, height - 1) * width
+        for column in columns:
+            found |= masks.take(row + column) > 0
     return found
 
 

@@ -9,14 +9,22 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import maximum_filter, uniform_filter
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.models.calibration import LaserColour
 from armscan.records.exposure import Exposure
-from armscan.vision.stripe.ridge import SAMPLE_STEP_PX, FloatImage, mean_along, strong_median
+from armscan.vision.stripe.ridge import (
+    CELL_PX,
+    SAMPLE_STEP_PX,
+    FloatImage,
+    ImageLevel,
+    mean_along,
+    measure_level,
+    strong_median,
+)
 
 StripeMethod = Literal["fit", "threshold", "centroid", "template", "hessian"]
 MaskImage: TypeAlias = NDArray[np.uint8]
@@ -241,6 +249,31 @@ def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
         grey_levels_per_unit=exposure.full_scale / NORMAL_SCALE,
         unknown=_unknown(background, None),
     )
+
+
+FILLED_CELLS = 2
+"""Around lit cells, copied too: as far as a filter, a fit and the background beside it look."""
+
+
+def lit_plane(exposure: Exposure, threshold: float | None) -> tuple[StripePlane, ImageLevel]:
+    """Plane of a grey exposure of which only what lies near lines is copied, and its level.
+
+    Farther away its image is 0. ``threshold``: As for `measure_level`, of full scale 255.
+    """
+    scale = NORMAL_SCALE / exposure.full_scale
+    raw = exposure.image
+    level = measure_level(raw, threshold, scale)
+    image = np.zeros(raw.shape, np.float32)
+    near = maximum_filter(level.lit, 2 * FILLED_CELLS + 1, mode="constant")
+    for row, cells in enumerate(near):
+        edges = np.flatnonzero(np.diff(cells, prepend=0, append=0)) * CELL_PX
+        for left, right in zip(edges[::2], edges[1::2], strict=True):
+            own = np.s_[row * CELL_PX : (row + 1) * CELL_PX, left:right]
+            np.multiply(raw[own], np.float32(scale), out=image[own], casting="unsafe")
+    clipped = _saturated(raw, exposure.full_scale)
+    units = exposure.full_scale / NORMAL_SCALE
+    plane = StripePlane(image=image, clipped=clipped, saturated=clipped, grey_levels_per_unit=units)
+    return plane, level
 
 
 CHANNELS = ("red", "green", "blue")

@@ -10,12 +10,19 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
 from armscan.kernels.chains import find_neighbours, place_points, sum_windows, walk_chains
-from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates, sample_across
+from armscan.kernels.ridge import (
+    ROUNDING,
+    find_runs,
+    gaussian_taps,
+    refine_candidates,
+    sample_across,
+)
 
 FloatImage: TypeAlias = NDArray[np.float32]
 
@@ -41,28 +48,38 @@ class ImageLevel:
     ``noise``: Standard deviation of a background pixel against its neighbour. ``clutter``: The same
     at a distance of `CLUTTER_LAG_PX`, where compression blocks, chroma subsampling and surface
     texture show; never less than ``noise``. ``rise``: Height above the background at which a line
-    begins.
+    begins. ``lit``: (rows, columns) uint8, 1 for the cells that have a pixel so far above the
+    background.
     """
 
     background: FloatImage
     noise: float
     clutter: float
     rise: float
+    lit: NDArray[np.uint8]
 
 
-def measure_level(image: FloatImage, threshold: float | None) -> ImageLevel:
+def measure_level(
+    image: FloatImage | ImageArray, threshold: float | None, scale: float = 1.0
+) -> ImageLevel:
     """Estimate background and noise from a sample of the pixels.
 
-    ``image``: (H, W) float32. ``threshold``: Least height of a line above the background, or None
-    to set it from the noise.
+    ``image``: (H, W) float32, or as the camera delivered it. ``threshold``: Least height of a line
+    above the background, or None to set it from the noise. ``scale``: What ``image`` is to be
+    multiplied by; level and threshold are then of that.
     """
-    background = _cell_quantiles(image)
-    noise = _noise(image, 1)
-    clutter = max(_noise(image, CLUTTER_LAG_PX), noise)
+    factor = np.float32(scale)
+    background = np.asarray(_cell_quantiles(image) * factor, dtype=np.float32)
+    rows = image[:: 2 * SAMPLE_STEP_PX].astype(np.float32) * factor
+    noise = _noise(rows, 1)
+    clutter = max(_noise(rows, CLUTTER_LAG_PX), noise)
     if threshold is None:
-        peak = _brightest(image[::2, ::2]) - float(np.median(background))
+        peak = _brightest(image[::2, ::2].copy(), factor) - float(np.median(background))
         threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
-    return ImageLevel(background, noise, clutter, threshold)
+    # between cells the background is linear: never below the least of them
+    least = minimum_filter(background, 3, mode="nearest") + (threshold - ROUNDING)
+    lit = np.asarray(_cell_peaks(image) * factor > least).astype(np.uint8)
+    return ImageLevel(background, noise, clutter, threshold, lit)
 
 
 BAND_PX, BAND_SIGMAS = 40, 8.0
@@ -93,32 +110,45 @@ def near_lines(image: FloatImage) -> BoolArray:
     return keep
 
 
-def _cell_quantiles(image: FloatImage) -> FloatImage:
+def _cell_peaks(image: FloatImage | ImageArray) -> FloatImage:
+    """(rows, columns) brightest pixel of each cell."""
+    height, width = image.shape
+    whole = height // CELL_PX
+    bands = image[: whole * CELL_PX].reshape(whole, CELL_PX, width).max(axis=1)
+    if whole * CELL_PX < height:
+        bands = np.concatenate([bands, image[whole * CELL_PX :].max(axis=0, keepdims=True)])
+    return np.maximum.reduceat(bands, np.arange(0, width, CELL_PX), axis=1).astype(np.float32)
+
+
+def _cell_quantiles(image: FloatImage | ImageArray) -> FloatImage:
     height, width = image.shape
     rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
     steps = CELL_PX // SAMPLE_STEP_PX
-    sample = image[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
+    # of single precision: smaller numbers are sorted more slowly
+    sample = image[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].astype(np.float32)
     missing = (rows * steps - sample.shape[0], columns * steps - sample.shape[1])
-    filled = np.pad(sample, ((0, missing[0]), (0, missing[1])), mode="edge")
+    filled = (
+        np.pad(sample, ((0, missing[0]), (0, missing[1])), mode="edge") if any(missing) else sample
+    )
     cells = filled.reshape(rows, steps, columns, steps).swapaxes(1, 2)
     k = int(BACKGROUND_QUANTILE * steps * steps)
     ordered = np.partition(cells.reshape(rows, columns, steps * steps), k, axis=2)
     return np.ascontiguousarray(ordered[:, :, k])
 
 
-def _brightest(sample: FloatImage) -> float:
-    """The level that a share of `PEAK_QUANTILE` of the pixels stays below."""
+def _brightest(sample: FloatImage | ImageArray, factor: np.float32) -> float:
+    """The level that a share of `PEAK_QUANTILE` of the pixels stays below, times a factor."""
     few = np.sort(sample[::8, ::8], axis=None)
     # nearly all pixels are dark: the bright ones are sorted alone
-    bright = sample[sample > few[int(0.98 * (len(few) - 1))]]
+    bright = sample[sample > few[int(0.98 * (len(few) - 1))]].astype(np.float32) * factor
     n_above = (1.0 - PEAK_QUANTILE) * (sample.size - 1)
     if len(bright) - 1 <= n_above:
-        return float(np.quantile(sample, PEAK_QUANTILE))
+        return float(np.quantile(sample.astype(np.float32) * factor, PEAK_QUANTILE))
     return float(np.quantile(bright, 1.0 - n_above / (len(bright) - 1)))
 
 
-def _noise(image: FloatImage, lag: int) -> float:
-    rows = image[:: 2 * SAMPLE_STEP_PX]
+def _noise(rows: FloatImage, lag: int) -> float:
+    """Standard deviation of pixels against others of their row (K, W) at a distance."""
     if rows.shape[1] <= lag:
         return LEAST_NOISE
     step = np.abs(rows[:, lag::3] - rows[:, : rows.shape[1] - lag : 3])
@@ -157,7 +187,8 @@ def mean_along(values: FloatArray, weights: FloatArray, chain: IntArray, half: i
 def chain_lengths_px(points_px: FloatArray, chain: IntArray) -> FloatArray:
     """Arc length (N,) of each point's chain."""
     n = int(chain.max()) + 1 if len(chain) else 0
-    step = np.hypot(*np.diff(points_px, axis=0).T) * (np.diff(chain) == 0)
+    x, y = np.diff(points_px[:, 0]), np.diff(points_px[:, 1])
+    step = np.sqrt(x * x + y * y) * (chain[1:] == chain[:-1])
     total = np.bincount(chain[1:], weights=step, minlength=n) if n else np.zeros(0)
     return np.asarray(total[chain])
 
@@ -314,7 +345,8 @@ def find_candidates(image: FloatImage, level: ImageLevel) -> FloatArray:
     capacity = max(1000, height * width // 32)
     while True:
         runs = np.zeros((capacity, 3))
-        count = find_runs(image, level.background, CELL_PX, level.rise, LONGEST_RUN_PX, runs)
+        cells = (level.background, level.lit, CELL_PX)
+        count = find_runs(image, *cells, level.rise, LONGEST_RUN_PX, runs)
         if count <= capacity:
             return runs[:count]
         capacity = count
@@ -351,12 +383,16 @@ def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
     ``points``: Rows as in `RidgePoints.table`. ``shape``: Rows and columns of the image.
     """
     n = len(points)
-    owner = np.zeros(shape, np.int32)
+    # a map of the part of the image that has points
+    placed, corner = points.copy(), np.floor(points[:, :2].min(axis=0, initial=max(shape)))
+    placed[:, :2] -= corner
+    columns, rows = placed[:, :2].max(axis=0, initial=0.0).astype(np.int64) + 2
+    owner = np.zeros((rows, columns), np.int32)
     is_kept = np.zeros(n, np.int64)
-    place_points(points, owner, is_kept)
+    place_points(placed, owner, is_kept)
     ahead = np.full(n, -1, np.int64)
     behind = np.full(n, -1, np.int64)
-    find_neighbours(points, owner, ahead, behind)
+    find_neighbours(placed, owner, ahead, behind)
     order = np.zeros(n, np.int64)
     chain = np.zeros(n, np.int64)
     count = walk_chains(ahead, behind, order, chain)

@@ -85,8 +85,14 @@ class Neighbourhoods:
     They are gathered once, and again only where points no longer count.
     """
 
-    def __init__(self, course: Polyline, windows_px: FloatArray) -> None:
-        """Gather the neighbours; ``windows_px``: (K,) half widths, increasing."""
+    def __init__(
+        self, course: Polyline, windows_px: FloatArray, asked: BoolArray | None = None
+    ) -> None:
+        """Gather the neighbours.
+
+        ``windows_px``: (K,) half widths, increasing. ``asked``: (N,) points without which others
+        tell nothing; the rest may be left out, and is then not smoothed. None for all.
+        """
         n = len(course)
         self._windows = windows_px
         self._own = slice(LANES, LANES + n)
@@ -98,7 +104,11 @@ class Neighbourhoods:
         self._laid[CHAIN, self._own] = course.chain
         self._laid[WEIGHT, self._own] = course.weight
         self._moments = np.zeros(n_blocks * LANES * len(windows_px) * MOMENTS)
-        gather_moments(self._laid, windows_px, np.ones(n_blocks, np.int64), self._moments)
+        self._asked = np.ones(n_blocks, np.int64)
+        if asked is not None:
+            self._asked[:] = 0
+            self._asked[np.flatnonzero(asked) // LANES + 1] = 1
+        gather_moments(self._laid, windows_px, self._asked, self._moments)
 
     def leave_out(self, rows: IntArray) -> None:
         """Let points (M,) of the polyline count no longer."""
@@ -119,7 +129,7 @@ class Neighbourhoods:
         """
         result = np.zeros((SMOOTH_ROWS, len(sigma)))
         given = (self._laid, self._moments, scale, sigma, self._windows, inflation)
-        choose_windows(*given, CONFIDENCE, result)
+        choose_windows(*given, CONFIDENCE, self._asked, result)
         return result
 
 
@@ -185,9 +195,10 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     slope = np.where(used, result[SLOPE], 0.0)
     tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
     turned = normals - slope[:, None] * tangents
+    length = np.sqrt(turned[:, 0] ** 2 + turned[:, 1] ** 2)
     return SmoothedCentres(
         course.points + shift[:, None] * normals,
-        turned / np.linalg.norm(turned, axis=1, keepdims=True),
+        turned / length[:, None],
         np.where(used, result[SMOOTH_SIGMA], course.sigma),
         sigma_sum,
         is_outlier,
@@ -195,12 +206,15 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     )
 
 
-def curvature(course: Polyline) -> FloatArray:
+def curvature(course: Polyline, asked: BoolArray) -> FloatArray:
     """Curvature (N,) of the chains in 1/px, positive where they bend towards their normals.
 
-    Shrunk towards zero by its own noise, so that straight lines are not disturbed.
+    Shrunk towards zero by its own noise, so that straight lines are not disturbed. ``asked``: (N,)
+    points where it matters; elsewhere it may be 0.
     """
-    around = Neighbourhoods(course, BEND_WINDOWS_PX)
+    if not asked.any():
+        return np.zeros(len(course))
+    around = Neighbourhoods(course, BEND_WINDOWS_PX, asked)
     result = around.fit_parabolas(np.ones(len(BEND_WINDOWS_PX)), course.sigma)
     square = result[BEND] ** 2
     noise = result[BEND_SIGMA] ** 2
@@ -296,16 +310,17 @@ def _filter_residuals(course: Polyline, half: int) -> FloatArray:
     size = 2 * half + 1
     if n < size:
         return np.full(n, np.nan)
-    span = np.lib.stride_tricks.sliding_window_view
-    inside = (chain[: n - size + 1] == chain[size - 1 :]) & span(course.is_used, size).all(axis=1)
+    n_used = np.concatenate([[0], np.cumsum(course.is_used)])
+    inside = (chain[: n - size + 1] == chain[size - 1 :]) & (n_used[size:] - n_used[:-size] == size)
     weights = _weights(half)
-    smooth_x = span(points[:, 0], size) @ weights
-    smooth_y = span(points[:, 1], size) @ weights
+    smooth_x = np.convolve(points[:, 0], weights, "valid")
+    smooth_y = np.convolve(points[:, 1], weights, "valid")
     middle = slice(half, n - half)
     offset = (points[middle, 0] - smooth_x) * normals[middle, 0]
     offset += (points[middle, 1] - smooth_y) * normals[middle, 1]
     residual = np.full(n, np.nan)
     residual[middle] = np.where(inside, offset / course.sigma[middle], np.nan)
-    limit = 5.0 * max(float(np.nanmedian(np.abs(residual))), 0.3) if inside.any() else 0.0
+    told = np.abs(residual[middle][inside])
+    limit = 5.0 * max(float(np.median(told)), 0.3) if len(told) else 0.0
     residual[np.abs(residual) > limit * MAD_TO_SIGMA] = np.nan
     return residual

@@ -1,0 +1,390 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the fitted sections of a stripe have in common: their shape, and the noise they leave."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from armscan.kernels.arrays import (
+    COLUMN,
+    Floats,
+    FloatsOut,
+    Image,
+    Mask,
+    Table,
+    TableOut,
+    compiled,
+)
+from armscan.kernels.profile_fit import (
+    AMPLITUDE,
+    CENTRE,
+    COUNTS,
+    FARTHEST_SQUARE,
+    GROUND_LEVEL,
+    LANES,
+    LEVEL,
+    PROFILE_ROWS,
+    REACH_SIGMAS,
+    REFLECTANCE,
+    SIDE_SPAN,
+    SIGMA,
+    exponential,
+)
+
+NORMAL_00, NORMAL_01, NORMAL_11, SCORE_0, SCORE_1, HAS_CORE, BLACK_NORMAL, BLACK_SCORE = range(8)
+SECTION_COLUMNS = 8
+"""Columns of what one profile says of what all have in common: section, and black of the ground."""
+SIDE_FROM, SIDE_TO = 3.4, 4.2
+"""Sigmas between which pixels beside the line tell the noise of the background."""
+CORE_SIGMAS = 1.3
+"""Profiles that are clipped farther out say nothing of the section: their flanks alone are left."""
+FIT_PARAMETERS = 3.0
+LEAST_DETERMINANT = 1e-12
+MAD_TO_SIGMA = 1.4826022185056018
+LEAST_GROUND = 1e-6
+"""Reflectance by which nothing is divided that is smaller."""
+
+
+N_SUMS = 26
+AT_CENTRE, STEP, AT_AMPLITUDE, THIRD, FOURTH, SUMS = range(6)
+LANE_ROWS = SUMS + N_SUMS
+NOT_SEEN = -1.0
+"""Own grey level of pixels that tell nothing."""
+
+
+@compiled(fastmath=True, error_model="numpy")
+def leave_pixel(pixels: Floats, at: int, lanes: Floats, left: FloatsOut) -> None:
+    """What the fit leaves of one pixel of each lane.
+
+    ``pixels``, ``at``, ``lanes``: As for `add_pixel`. ``left``: (3 `LANES`,) output: the line's own
+    grey level, the same with the background, the residual.
+    """
+    for k in range(LANES):
+        u = (at - lanes[AT_CENTRE * LANES + k]) * lanes[STEP * LANES + k]
+        uu = u * u
+        is_seen = (uu < REACH_SIGMAS**2) | ((uu > SIDE_FROM**2) & (uu < SIDE_TO**2))
+        shape = 1.0 + lanes[THIRD * LANES + k] * (u * (uu - 3.0))
+        shape += lanes[FOURTH * LANES + k] * (uu * (uu - 6.0) + 3.0)
+        bell = exponential(-0.5 * min(uu, FARTHEST_SQUARE)) * lanes[AT_AMPLITUDE * LANES + k]
+        m = bell * pixels[REFLECTANCE * LANES + k] * max(shape, 0.0)
+        left[k] = m if is_seen & (pixels[COUNTS * LANES + k] >= 0.0) else NOT_SEEN
+        left[LANES + k] = m + pixels[GROUND_LEVEL * LANES + k]
+        left[2 * LANES + k] = pixels[LEVEL * LANES + k] - m
+
+
+@compiled(fastmath=True, error_model="numpy")
+def add_pixel(pixels: Floats, at: int, noise: Floats, lanes: FloatsOut) -> None:
+    """Add one pixel of each lane to the sums over its profile.
+
+    ``pixels``: (4 `LANES`,) grey level less background, background, 1 where the pixel is not
+    clipped (`NOT_SEEN` beyond the profile), and reflectance. ``at``: Its place in the profiles.
+    ``noise``: (3,). ``lanes``: (31 `LANES`,) centre, 1 over sigma, amplitude and section of each
+    lane, then sums: weighted products of the derivatives by centre, amplitude and width (00 01 02
+    11 12 22), of each with the terms of third (6 7 8) and fourth order (9 10 11), of these terms
+    (12 13 14), of the residual with all five (15 to 19), count of clipped pixels beyond the core,
+    and of the light that too large a reflectance would add the products with the three (21 22 23),
+    itself and the residual.
+    """
+    square, linear, constant = noise[0], noise[1], noise[2]
+    for k in range(LANES):
+        c3, c4 = lanes[THIRD * LANES + k], lanes[FOURTH * LANES + k]
+        counts = pixels[COUNTS * LANES + k]
+        u = (at - lanes[AT_CENTRE * LANES + k]) * lanes[STEP * LANES + k]
+        uu = u * u
+        is_line = (uu < REACH_SIGMAS**2) & (counts >= 0.0)
+        bell = exponential(-0.5 * min(uu, FARTHEST_SQUARE)) * pixels[REFLECTANCE * LANES + k]
+        bell *= lanes[AT_AMPLITUDE * LANES + k]
+        third = u * (uu - 3.0)
+        fourth = uu * (uu - 6.0) + 3.0
+        shape = 1.0 + c3 * third + c4 * fourth
+        m = bell * max(shape, 0.0)
+        behind = pixels[GROUND_LEVEL * LANES + k]
+        r = pixels[LEVEL * LANES + k] - m
+        w = 1.0 / (square * m * m + linear * max(m + behind, 0.0) + constant)
+        w = w if is_line & (counts > 0.0) else 0.0
+        j0 = bell * (u * shape - 3.0 * c3 * (uu - 1.0) - 4.0 * c4 * third)
+        j2 = j0 * u
+        third *= bell
+        fourth *= bell
+        light = -m / max(pixels[REFLECTANCE * LANES + k], LEAST_GROUND)
+        w0, w1, w2, w3, w4, wr = w * j0, w * m, w * j2, w * third, w * fourth, w * r
+        lanes[SUMS * LANES + k] += w0 * j0
+        lanes[(SUMS + 1) * LANES + k] += w0 * m
+        lanes[(SUMS + 2) * LANES + k] += w0 * j2
+        lanes[(SUMS + 3) * LANES + k] += w1 * m
+        lanes[(SUMS + 4) * LANES + k] += w1 * j2
+        lanes[(SUMS + 5) * LANES + k] += w2 * j2
+        lanes[(SUMS + 6) * LANES + k] += w0 * third
+        lanes[(SUMS + 7) * LANES + k] += w1 * third
+        lanes[(SUMS + 8) * LANES + k] += w2 * third
+        lanes[(SUMS + 9) * LANES + k] += w0 * fourth
+        lanes[(SUMS + 10) * LANES + k] += w1 * fourth
+        lanes[(SUMS + 11) * LANES + k] += w2 * fourth
+        lanes[(SUMS + 12) * LANES + k] += w3 * third
+        lanes[(SUMS + 13) * LANES + k] += w3 * fourth
+        lanes[(SUMS + 14) * LANES + k] += w4 * fourth
+        lanes[(SUMS + 15) * LANES + k] += wr * j0
+        lanes[(SUMS + 16) * LANES + k] += wr * m
+        lanes[(SUMS + 17) * LANES + k] += wr * j2
+        lanes[(SUMS + 18) * LANES + k] += wr * third
+        lanes[(SUMS + 19) * LANES + k] += wr * fourth
+        is_cut = is_line & (counts == 0.0) & (uu > CORE_SIGMAS**2)
+        lanes[(SUMS + 20) * LANES + k] += 1.0 if is_cut else 0.0
+        lanes[(SUMS + 21) * LANES + k] += w0 * light
+        lanes[(SUMS + 22) * LANES + k] += w1 * light
+        lanes[(SUMS + 23) * LANES + k] += w2 * light
+        lanes[(SUMS + 24) * LANES + k] += w * light * light
+        lanes[(SUMS + 25) * LANES + k] += wr * light
+
+
+@compiled()
+def read_profile(
+    image: Image,
+    clipped: Mask,
+    reflectance: Image,
+    point: Floats,
+    side: Floats,
+    sigma: float,
+    first: int,
+    n: int,
+    lane: FloatsOut,
+) -> None:
+    """Copy ``n`` pixels from ``first`` on of a point's column or row, less their background.
+
+    ``lane``: From the lane's first number on: pixels as for `add_pixel`. The others: One point's of
+    `weigh_section`.
+    """
+    is_column = int(point[5]) == COLUMN
+    start = point[1] if is_column else point[0]
+    line = int(point[0] if is_column else point[1])
+    has_clipped = clipped.shape[0] == image.shape[0] and clipped.shape[1] == image.shape[1]
+    has_ground = reflectance.shape[0] == image.shape[0] and reflectance.shape[1] == image.shape[1]
+    middle = 0.5 * (side[0] + side[1])
+    ramp = (side[1] - side[0]) / (SIDE_SPAN * sigma)
+    for k in range(n):
+        at = first + k
+        own = k * PROFILE_ROWS * LANES
+        ground = 1.0
+        if has_ground:
+            ground = float(reflectance[at, line] if is_column else reflectance[line, at])
+        behind = (middle + ramp * (at - start)) * ground
+        counts = 1.0
+        if has_clipped and (clipped[at, line] if is_column else clipped[line, at]):
+            counts = 0.0
+        lane[own + LEVEL * LANES] = (image[at, line] if is_column else image[line, at]) - behind
+        lane[own + GROUND_LEVEL * LANES] = behind
+        lane[own + COUNTS * LANES] = counts
+        lane[own + REFLECTANCE * LANES] = ground
+
+
+@compiled(error_model="numpy")
+def leave_fitted(sums: Floats, said: FloatsOut) -> None:
+    """Normal matrix and right-hand side of what the fitted parameters do not take up of the terms.
+
+    ``sums``: (26,) of `add_pixel`. ``said``: (8,) output; zeros where the parameters themselves
+    are not determined.
+    """
+    said[:] = 0.0
+    a, b, c, d, e, f = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * c00 + b * c01 + c * c02
+    if not determinant > LEAST_DETERMINANT * a * d * f:
+        return
+    c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
+    for term in range(3):
+        at = 21 if term == 2 else 6 + 3 * term
+        x, y, z = sums[at], sums[at + 1], sums[at + 2]
+        t0 = (c00 * x + c01 * y + c02 * z) / determinant
+        t1 = (c01 * x + c11 * y + c12 * z) / determinant
+        t2 = (c02 * x + c12 * y + c22 * z) / determinant
+        taken = t0 * sums[15] + t1 * sums[16] + t2 * sums[17]
+        own = t0 * x + t1 * y + t2 * z
+        if term == 0:
+            said[NORMAL_00], said[SCORE_0] = sums[12] - own, sums[18] - taken
+            said[NORMAL_01] = sums[13] - t0 * sums[9] - t1 * sums[10] - t2 * sums[11]
+        elif term == 1:
+            said[NORMAL_11], said[SCORE_1] = sums[14] - own, sums[19] - taken
+        else:
+            said[BLACK_NORMAL], said[BLACK_SCORE] = sums[24] - own, sums[25] - taken
+    said[HAS_CORE] = 1.0 if sums[20] == 0.0 else 0.0
+
+
+@compiled(error_model="numpy")
+def keep_left(left: Floats, size: int, lanes: Floats, k: int, pixels: TableOut, count: int) -> int:
+    """Append what the fit leaves of one lane's ``size`` pixels to ``pixels``; the new count."""
+    centre, step = lanes[AT_CENTRE * LANES + k], lanes[STEP * LANES + k]
+    n = 0
+    for at in range(size):
+        is_line = abs((at - centre) * step) < REACH_SIGMAS
+        n += 1 if is_line and left[3 * at * LANES + k] != NOT_SEEN else 0
+    freedom = math.sqrt(n / max(n - FIT_PARAMETERS, 1.0))
+    for at in range(size):
+        own = left[3 * at * LANES + k]
+        if own == NOT_SEEN:
+            continue
+        is_line = abs((at - centre) * step) < REACH_SIGMAS
+        pixels[0, count] = own
+        pixels[1, count] = left[(3 * at + 1) * LANES + k]
+        pixels[2, count] = left[(3 * at + 2) * LANES + k] * (freedom if is_line else 1.0)
+        count += 1
+    return count
+
+
+@compiled(error_model="numpy")
+def weigh_section(
+    image: Image,
+    clipped: Mask,
+    reflectance: Image,
+    points: Table,
+    sides: Table,
+    fits: Table,
+    noise: Floats,
+    section: Floats,
+    reach: int,
+    said: TableOut,
+    pixels: TableOut,
+) -> int:
+    """What fitted profiles leave: for the terms of their common section, and for the noise.
+
+    Of the terms of third and fourth order of `accumulate`, only what centre, amplitude and width
+    do not take up counts.
+
+    ``image``, ``clipped``, ``reflectance``, ``points``, ``sides``, ``noise``, ``section``: As for
+    `fit_profiles`, which gave ``fits`` (N, 8). ``reach``: Pixels looked at on both sides. ``said``:
+    (N, 8) output: normal matrix of the two terms as 00 01 11, their right-hand side, 1 where no
+    pixel beyond the core is clipped, and both for what the reflectance is too large by; (0, 8) if
+    not asked for. ``pixels``: (3, >= N (2 reach + 1)) output: the line's own grey level, the same
+    with the background, and the residual, widened by the freedom that the fit took, of every pixel
+    of the lines and of those beside them; (3, 0) if not asked for.
+
+    Returns count of pixels.
+    """
+    height, width = image.shape
+    size = 2 * reach + 1
+    seen = np.zeros(size * PROFILE_ROWS * LANES)
+    left = np.zeros(size * 3 * LANES)
+    lanes = np.zeros(LANE_ROWS * LANES)
+    sums = np.zeros(N_SUMS)
+    count = 0
+    for block in range(0, points.shape[0], LANES):
+        n_lanes = min(LANES, points.shape[0] - block)
+        seen[:] = NOT_SEEN
+        lanes[:] = 0.0
+        low, high = size, 0
+        for k in range(n_lanes):
+            i = block + k
+            is_column = int(points[i, 5]) == COLUMN
+            start = points[i, 1] if is_column else points[i, 0]
+            first = max(int(np.rint(start)) - reach, 0)
+            n = min(int(np.rint(start)) + reach + 1, height if is_column else width) - first
+            sigma, lane = fits[i, SIGMA], seen[k:]
+            read_profile(image, clipped, reflectance, points[i], sides[i], sigma, first, n, lane)
+            lanes[AT_CENTRE * LANES + k] = fits[i, CENTRE] - first
+            lanes[STEP * LANES + k] = 1.0 / fits[i, SIGMA]
+            lanes[AT_AMPLITUDE * LANES + k] = fits[i, AMPLITUDE]
+            low = min(low, math.floor(fits[i, CENTRE] - first - REACH_SIGMAS * sigma))
+            high = max(high, math.ceil(fits[i, CENTRE] - first + REACH_SIGMAS * sigma))
+            lanes[THIRD * LANES + k] = section[0] if is_column else section[2]
+            lanes[FOURTH * LANES + k] = section[1] if is_column else section[3]
+        for at in range(size):
+            own = seen[at * PROFILE_ROWS * LANES : (at + 1) * PROFILE_ROWS * LANES]
+            if said.shape[0] > 0 and low <= at <= high:
+                add_pixel(own, at, noise, lanes)
+            if pixels.shape[1] > 0:
+                leave_pixel(own, at, lanes, left[3 * at * LANES : 3 * (at + 1) * LANES])
+        for k in range(n_lanes):
+            if said.shape[0] > 0:
+                for m in range(N_SUMS):
+                    sums[m] = lanes[(SUMS + m) * LANES + k]
+                leave_fitted(sums, said[block + k])
+            if pixels.shape[1] > 0:
+                count = keep_left(left, size, lanes, k, pixels, count)
+    return count
+
+
+BIN_MEANS = 4
+"""Columns of what is told of the residuals at one grey level."""
+CLIPPED_RESIDUAL = 3.5
+
+
+@compiled()
+def bin_residuals(pixels: Table, edges: Floats, bins: TableOut) -> None:
+    """What the residuals are at each of the line's own grey levels.
+
+    ``pixels``: (3, M) of `weigh_section`. ``edges``: (B + 1,) increasing levels. ``bins``: (B, 4)
+    output: count, means of the level's square and of all light (not below 0), and mean square of
+    the residuals, those beyond `CLIPPED_RESIDUAL` robust sigmas taken as so large.
+    """
+    n_bins = bins.shape[0]
+    bins[:] = 0.0
+    begin = np.zeros(n_bins + 1, np.int64)
+    place = np.full(pixels.shape[1], -1, np.int64)
+    for k in range(pixels.shape[1]):
+        if not edges[0] <= pixels[0, k] < edges[n_bins]:
+            continue
+        b = 0
+        while pixels[0, k] >= edges[b + 1]:
+            b += 1
+        place[k] = b
+        begin[b + 1] += 1
+        bins[b, 1] += pixels[0, k] * pixels[0, k]
+        bins[b, 2] += max(pixels[1, k], 0.0)
+    for b in range(n_bins):
+        bins[b, 0] = begin[b + 1]
+        begin[b + 1] += begin[b]
+    size = np.zeros(begin[n_bins])
+    stop = begin[:-1].copy()
+    for k in range(pixels.shape[1]):
+        if place[k] >= 0:
+            size[stop[place[k]]] = abs(pixels[2, k])
+            stop[place[k]] += 1
+    for b in range(n_bins):
+        n = int(bins[b, 0])
+        if n == 0:
+            continue
+        own = size[begin[b] : begin[b + 1]]
+        limit = CLIPPED_RESIDUAL * MAD_TO_SIGMA * np.median(own)
+        total = 0.0
+        for i in range(n):
+            total += min(own[i], limit) ** 2
+        bins[b, 1] /= n
+        bins[b, 2] /= n
+        bins[b, 3] = total / n
+
+
+@compiled()
+def common_terms(said: Table, rounds: int, clipped_score: float, terms: FloatsOut) -> None:
+    """Terms (2,) that profiles share, robustly: a score counts little beyond the median's scatter.
+
+    ``said``: (N, 8) of `weigh_section`. ``rounds``: Of weighing. ``clipped_score``: Of one profile,
+    in scatters, beyond which it counts the less. ``terms``: (2,) output.
+    """
+    n = said.shape[0]
+    ratio = np.zeros((2, n))
+    limit = np.full(2, np.inf)
+    terms[:] = 0.0
+    for _ in range(rounds):
+        a = b = c = d = e = f = 0.0
+        for i in range(n):
+            k0 = min(1.0, limit[0] / max(abs(ratio[0, i]), 1e-12))
+            k1 = min(1.0, limit[1] / max(abs(ratio[1, i]), 1e-12))
+            a += k0 * said[i, NORMAL_00]
+            b += k0 * said[i, NORMAL_01]
+            c += k1 * said[i, NORMAL_01]
+            d += k1 * said[i, NORMAL_11]
+            e += k0 * said[i, SCORE_0]
+            f += k1 * said[i, SCORE_1]
+        determinant = a * d - b * c
+        if not abs(determinant) > LEAST_DETERMINANT * a * d:
+            return
+        terms[0] = (d * e - b * f) / determinant
+        terms[1] = (a * f - c * e) / determinant
+        for i in range(n):
+            left = said[i, SCORE_0] - said[i, NORMAL_00] * terms[0] - said[i, NORMAL_01] * terms[1]
+            right = said[i, SCORE_1] - said[i, NORMAL_01] * terms[0] - said[i, NORMAL_11] * terms[1]
+            ratio[0, i] = left / math.sqrt(max(said[i, NORMAL_00], 1e-12))
+            ratio[1, i] = right / math.sqrt(max(said[i, NORMAL_11], 1e-12))
+        for term in range(2):
+            limit[term] = clipped_score * max(MAD_TO_SIGMA * np.median(np.abs(ratio[term])), 1.0)

@@ -104,7 +104,7 @@ def test_after_an_interrupt_what_is_done_is_not_done_again(
         assert run()[0] == 130
     told_first, told_last = (line for line in said if " of 3 " in line)
     assert re.fullmatch(r"1 of 3  a: done  \([\d.]+ exposures/s, [\d.]+ min left\)", told_first)
-    assert told_last == "1 of 3 were made; the same command goes on"
+    assert told_last == "1 of 3 are through; the same command goes on"
     code, told = run()
     assert code == 2 and measured == ["b", "c"]
     assert told["scans"]["a"]["is_old"] and "is_old" not in told["scans"]["b"]
@@ -114,13 +114,41 @@ def test_a_result_of_other_inputs_is_replaced_only_by_force(
     week: Path, run: Run, measured: list[str]
 ) -> None:
     run()
+    cloud = week.parent / "clouds" / "a.ply"
+    before = cloud.read_bytes()
     table = week / "a" / "exposures.csv"
-    table.write_text(table.read_text().rsplit("\n", 2)[0] + "\n")
-    measured.clear()
-    code, told = run()
-    assert code == 2 and measured == ["c"] and "--force" in told["scans"]["a"]["failed"]
+    whole = table.read_text()
+    table.write_text(whole.rsplit("\n", 2)[0] + "\n")
+    for _ in range(2):  # to be refused once is not to be owned then
+        measured.clear()
+        code, told = run()
+        assert code == 2 and measured == ["c"] and "--force" in told["scans"]["a"]["failed"]
+        assert cloud.read_bytes() == before
+    table.write_text(whole)
+    assert run()[1]["scans"]["a"]["is_old"]
+    image = next((week / "a").rglob("*.png"))
+    image.write_bytes(image.read_bytes())
+    assert "--force" in run()[1]["scans"]["a"]["failed"]
     measured.clear()
     assert "data" in run("--force")[1]["scans"]["a"] and measured == ["a", "c"]
+
+
+def test_a_page_that_is_left_ends_no_other(week: Path, run: Run, measured: list[str]) -> None:
+    clouds = week.parent / "clouds"
+    clouds.mkdir()
+    (clouds / "a.html").write_text("mine")
+    told = run()[1]["scans"]
+    assert "a.html exists" in told["a"]["failed"] and measured == ["b", "c"]
+    assert (clouds / "a.html").read_text() == "mine" and "data" in told["b"]
+
+
+def test_images_beside_recordings_are_told_of(
+    week: Path, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (week / "photo.png").write_bytes(b"")
+    scanner_file = str(week.parent / "scanner.json")
+    assert main(["reconstruct", str(week), "--scanner", scanner_file, "-o", "clouds"]) == 2
+    assert "image photo.png lies beside the recording a" in capsys.readouterr().err
 
 
 def test_what_is_wrong_for_all_is_said_once(

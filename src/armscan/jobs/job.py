@@ -242,8 +242,8 @@ class Batch:
     def run(self, items: Sequence[BatchItem]) -> dict[str, LedgerEntry]:
         """Make what is not there yet; what is known of each result, by name.
 
-        An entry has ``failed``, the reason, or ``seconds`` and ``data``, the result's own; and
-        ``is_old`` where it was there before.
+        An entry has ``failed``, the reason, or ``seconds`` and ``data``, the result's own;
+        ``is_old`` where it was there before, and ``kept``, the file of other inputs that was left.
 
         Raises
         ------
@@ -263,10 +263,11 @@ class Batch:
             try:
                 found[item.name] = entry = self._result(item, total)
             except KeyboardInterrupt:
-                self._tell(f"{k} of {len(waiting)} were made; the same command goes on")
+                self._tell(f"{k} of {len(waiting)} are through; the same command goes on")
                 raise
             self._n_before += item.n_steps
-            self._write(item.name, {**entry, "mark": item.mark})
+            if "kept" not in entry:
+                self._write(item.name, {**entry, "mark": item.mark})
             what = f"failed: {entry['failed']}" if "failed" in entry else "done"
             if "seconds" in entry:
                 made = made[0] + item.n_steps, made[1] + entry["seconds"]
@@ -302,8 +303,11 @@ class Batch:
     def _result(self, item: BatchItem, total: int) -> LedgerEntry:
         place = self._place(item.name)
         is_own = self._ledger.get(item.name, {}).get("mark") == item.mark
-        if place.exists() and not (is_own or self._job.is_overwriting):
-            return {"failed": f"{place.name} exists and is of other inputs; --force replaces it"}
+        there = [one for one in (place, place.with_suffix(".html")) if one.exists()]
+        if there and not (is_own or self._job.is_overwriting):
+            kept = there[0].name
+            reason = f"{kept} exists and is of other inputs; --force replaces it"
+            return {"failed": reason, "kept": kept}
         self._write(item.name, {"mark": item.mark})
         own = replace(
             self._job,

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from armscan.errors import InputError, OptionError
+from armscan.errors import ArmscanError, InputError, OptionError
 from armscan.fusion.digest import CloudDigest
 from armscan.fusion.point_spool import PointSpool
 from armscan.fusion.voxel_map import VoxelMap
@@ -234,7 +234,7 @@ def reconstruct(
         if recordings:
             return measure(recordings[0], job)
         files = [path for path in (calibration, arm) if path is not None]
-        asked = f"{chosen!r} {voxel_mm} {is_profiled}"
+        asked = f"{chosen!r} {voxel_mm}"
         return _scans(Batch(job, ".ply", tell or _unheard), several, files, asked, measure)
     of_scans = {
         "--volume": volume,
@@ -274,7 +274,7 @@ def _scans(
     items = [
         BatchItem(
             recording_name(folder),
-            recording_mark(folder, given.hexdigest()),
+            _mark(folder, given.hexdigest()),
             count_exposures(folder),
             partial(measure, folder),
         )
@@ -299,6 +299,14 @@ def _scans(
         written=(batch.folder,),
         extra={"kind": "scans", "n_failed": len(failed), "scans": found},
     )  # fmt: skip
+
+
+def _mark(recording: Path, given: str) -> str:
+    """As `recording_mark`; nothing for one that cannot be read, which its own job will tell."""
+    try:
+        return recording_mark(recording, given)
+    except (ArmscanError, OSError):
+        return ""
 
 
 def _stills(

@@ -172,6 +172,25 @@ def test_exposures_that_disagree_by_more_than_the_cloud_says_have_a_larger_sigma
     assert held >= 33  # of 40 at 95 %: fewer once in a thousand times
 
 
+@pytest.mark.parametrize("stated_mm", [0.0001, 0.0005])
+def test_exposures_that_err_a_hundred_times_as_much_as_the_cloud_says(stated_mm: float) -> None:
+    """A mount that slipped, or a clock that lags: no calibration states what they make."""
+    found = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        outward = ball_stripes(16, 30)
+        exposure = np.repeat(np.arange(16), 30)
+        points = RADIUS_MM * outward + rng.normal(0.0, 100 * stated_mm, (16, 3))[exposure]
+        points += outward * rng.normal(0.0, 0.004, (len(points), 1))
+        cloud = cloud_of(points, exposure, sigma_mm=stated_mm, noise_mm=0.004, noise_along=outward)
+        one = inspect_sphere(cloud, 2 * RADIUS_MM)
+        assert not isinstance(one, FitFailure)
+        found.append(one.diameter)
+    scatter = float(np.std([one.value_mm for one in found], ddof=1))
+    told = float(np.sqrt(np.mean([one.sigma_mm**2 for one in found])))
+    assert 0.5 < scatter / told < 1.0 + 3.3 / math.sqrt(2 * 12)
+
+
 def test_too_few_exposures_say_nothing_of_their_scatter() -> None:
     points = RADIUS_MM * ball_stripes(12, 30)
     exposure = np.repeat(np.arange(12) * 3 // 12, 30)

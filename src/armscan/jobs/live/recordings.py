@@ -8,7 +8,7 @@ from __future__ import annotations
 from hashlib import sha256
 from pathlib import Path
 
-from armscan.errors import FileFormatError, OptionError, OutputError
+from armscan.errors import FileFormatError, InputError, OptionError, OutputError
 from armscan.report.quantity import Quantity, Summary
 from armscan.storage.clouds import CLOUD_SUFFIXES
 from armscan.storage.files import (
@@ -29,13 +29,25 @@ SUFFIX = ".mcap"
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Recordings in a folder that is none itself and holds no images, by name."""
+    """Recordings in a folder that is none itself, by name.
+
+    Raises
+    ------
+    InputError
+        If images lie beside them: it does not tell which of the two is meant.
+    """
     if not is_folder(folder) or is_recording(folder):
         return []
     there = sorted(folder.iterdir())
-    if any(path.suffix.lower() in IMAGE_SUFFIXES for path in there):
-        return []
-    return [path for path in there if is_recording(path)]
+    found = [path for path in there if is_recording(path)]
+    images = [path.name for path in there if path.suffix.lower() in IMAGE_SUFFIXES]
+    if found and images:
+        raise InputError(
+            f"image {images[0]} lies beside the recording {found[0].name}",
+            where=str(folder),
+            remedy="put images and recordings into folders of their own",
+        )
+    return found
 
 
 def count_exposures(recording: Path) -> int:
@@ -50,16 +62,18 @@ def count_exposures(recording: Path) -> int:
 
 
 def recording_mark(recording: Path, given: str) -> str:
-    """Hash of what a result follows from: a recording's tables, or its file's size and time, and
-    what else was ``given``.
+    """Hash of what a result follows from: a recording's tables, its images' or its file's sizes and
+    times, and what else was ``given``.
     """
     mark = sha256(given.encode())
+    files = [recording]
     if is_folder(recording):
         for path in recording_tables(recording):
             mark.update(path.name.encode() + read_bytes(path))
-    else:
-        facts = recording.stat()
-        mark.update(f"{facts.st_size} {facts.st_mtime_ns}".encode())
+        files = sorted(one for one in recording.rglob("*") if one.suffix.lower() in IMAGE_SUFFIXES)
+    for path in files:
+        facts = path.stat()
+        mark.update(f"{path.name} {facts.st_size} {facts.st_mtime_ns}".encode())
     return mark.hexdigest()
 
 

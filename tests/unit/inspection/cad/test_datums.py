@@ -436,8 +436,8 @@ def test_markers_are_paired_with_or_without_numbers(by_number: bool) -> None:
 def test_a_list_of_markers_without_covariances_says_what_is_assumed(tmp_path: Path) -> None:
     nominal, measured = tmp_path / "nominal.csv", tmp_path / "measured.csv"
     places = TRUE.inverse().apply(NOMINAL)
-    for path, points in ((nominal, NOMINAL), (measured, places)):
-        rows = "".join("{},{},{}\n".format(*row) for row in points.tolist())
+    for path, rows_mm in ((nominal, NOMINAL), (measured, places)):
+        rows = "".join("{},{},{}\n".format(*row) for row in rows_mm.tolist())
         path.write_text("x_mm,y_mm,z_mm\n" + rows)
     points = read_reference_markers(nominal, measured, "Base")
     assert isinstance(points, ReferencePoints)

@@ -141,6 +141,18 @@ def test_what_cannot_be_done_is_one_sentence(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_cloud_without_points_is_not_blamed_on_a_region(
+    files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 0\n"
+    named = "".join(f"property float {name}\n" for name in "xyz")
+    (files / "empty.ply").write_text(head + named + "end_header\n")
+    assert inspect(files, cloud="empty.ply") == 2
+    said = capsys.readouterr().err
+    assert "the cloud holds no points" in said
+    assert "--region" not in said
+
+
 def test_metres_are_noticed_and_cured(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert inspect(files, "--align", "none", part="metres.stl") == 2
     assert "--unit m" in capsys.readouterr().err

@@ -77,8 +77,8 @@ def test_a_ply_file_of_another_program(tmp_path: Path) -> None:
     [
         ("empty.xyz", "", "is empty"),
         ("heads.csv", "x,y,z\n", "holds no points"),
-        ("two.xyz", "1 2 3\n4 5\n", "not understood"),
-        ("words.xyz", "1 2 3\nfour five six\n", "not understood"),
+        ("two.xyz", "1 2 3\n4 5\n", "not understood: line 2 is '4 5'"),
+        ("words.xyz", "x y z\n\n1 2 3\n4 five 6\n", "not understood: line 4 is '4 five 6'"),
         ("nan.xyz", "1 2 3\nnan 5 6\n", "not finite"),
         ("comma.csv", "1,5;2,5;3,5\n4,5;5,5;6,5\n", "commas"),
         ("comma.xyz", "1 2 3\n1,5 2,5 3,5\n", "commas"),

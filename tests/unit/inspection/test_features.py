@@ -26,6 +26,7 @@ from armscan.inspection.results import MeasuredLength
 from armscan.inspection.search import WantedFeature
 from armscan.inspection.selection import InspectionOptions
 from armscan.records.cloud import PointCloud
+from armscan.report.inspection.features import relation_report
 from rigs.feature_clouds import BALL_MM, BORE_MM, BOSS_MM, CONE_DEG, workpiece
 from rigs.inspection_clouds import cloud_of
 
@@ -81,6 +82,17 @@ def test_a_cone_and_a_plane(part: PointCloud) -> None:
     assert relation.angle is not None
     assert math.degrees(relation.angle.value_rad) == pytest.approx(90.0, abs=0.2)
     assert relation.distance is None
+
+
+def test_a_relation_tells_which_feature_has_outliers(part: PointCloud) -> None:
+    one, two = found(part, BORE), found(part, WantedFeature("plane"))
+    poor = replace(two, counts=replace(two.counts, n_fitted=two.counts.n_feature // 2))
+    told = [
+        [text for text in relation_report(relate(part, *pair), part).warnings if "outliers" in text]
+        for pair in ((one, poor), (poor, one))
+    ]
+    assert any("of the second feature's points" in text for text in told[0])
+    assert any("of the first feature's points" in text for text in told[1])
 
 
 def test_two_axes(part: PointCloud) -> None:

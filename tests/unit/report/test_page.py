@@ -53,6 +53,13 @@ def test_names_from_outside_are_escaped() -> None:
     assert text.count("<img>") == 2
 
 
+def test_print_parts_no_heading_and_its_first_words_from_what_follows() -> None:
+    """A browser printed heading and text at the foot of a page, the pictures on the next one."""
+    text = render_page(page()).decode()
+    rule = next(line for line in text.splitlines() if "break-after: avoid" in line)
+    assert {"h2", "h2 + p"} <= {one.strip() for one in rule.partition("{")[0].split(",")}
+
+
 def test_simulated_data_are_called_so() -> None:
     assert b"simulated" not in render_page(page())
     assert render_page(page(is_simulated=True)).count(b"simulated") >= 3

@@ -121,9 +121,10 @@ def inspect_cad(
     if box is not None:
         cloud = cloud.select(box.holds(cloud.points_mm))
     if len(cloud) == 0:
-        raise InputError(
-            "no point is left of the cloud", where=str(cloud_path), remedy="give another --region"
-        )
+        what, remedy = "the cloud holds no points", "give a cloud that was measured"
+        if box is not None:
+            what, remedy = "no point is left of the cloud", "give another --region"
+        raise InputError(what, where=str(cloud_path), remedy=remedy)
     errors_known = bool(cloud.covariance_mm2.any()) and not np.isfinite(options.uncertainty_mm)
     surface = PartSurface(part)
     _tell(job, 2, how.align)

@@ -72,7 +72,7 @@ def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...
     a, overall = found.alignment, found.overall
     sigma = np.sqrt(np.maximum(np.diag(a.step_covariance), 0.0))
     beyond = found.n_given - len(found)
-    seen = sum(one.statistics.n > 0 for one in found.faces)
+    seen = sum(one.decision != "not seen" for one in found.faces)
     told = [
         Quantity("part.triangles", "Model", len(part.triangles), meaning=_model_text(part)),
         Quantity(
@@ -90,7 +90,8 @@ def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...
         Quantity("faces.n_seen", "Faces seen", seen, meaning=f"of {len(found.faces)}"),
         Quantity("alignment.method", "Alignment", a.method, shown=ALIGNMENTS[a.method]),
         Quantity(
-            "alignment.rms_mm", "Alignment rms", a.rms_mm, unit="mm",
+            "alignment.rms_mm", "Alignment rms" if math.isfinite(a.rms_mm) else "", a.rms_mm,
+            unit="mm",
             meaning=f"of the {a.n_used:,} points that it used",
         ),
         Quantity("alignment.n_used", "", a.n_used),
@@ -373,7 +374,7 @@ def _width(found: CadComparison) -> str:
 
 def _cards(told: Sequence[Quantity]) -> tuple[Quantity, ...]:
     keys = ("verdict", "deviation.rms_mm", "deviation.mean_mm", "alignment.rms_mm", "points.n")
-    return only(told, *keys)
+    return tuple(one for one in only(told, *keys) if one.label)
 
 
 def _alignment_facts(found: CadComparison, told: Sequence[Quantity]) -> tuple[Quantity, ...]:
@@ -381,7 +382,7 @@ def _alignment_facts(found: CadComparison, told: Sequence[Quantity]) -> tuple[Qu
     rows = "\n".join("  ".join(f"{value:12.7f}" for value in row) for row in matrix[:3])
     held = ", ".join(one.text for one in found.alignment.free) or "all motions are held"
     return (
-        *only(told, "alignment.method", "alignment.rms_mm"),
+        *(one for one in only(told, "alignment.method", "alignment.rms_mm") if one.label),
         *(item for item in told if item.label == "Sigma of the alignment"),
         fact("Not held", held),
         fact("Cad from the cloud's frame", rows, "rotation, and translation in mm"),
@@ -487,9 +488,9 @@ def deviation_chart(found: CadComparison) -> Picture:
 
 
 def face_charts(found: CadComparison) -> tuple[Picture, ...]:
-    """Histograms of faces: those that did not pass, then those of most points."""
+    """Histograms of faces: those that did not pass, then by points; those not judged last."""
     seen = [item for item in _urgent(found) if item[1].statistics.n]
-    seen.sort(key=lambda item: (URGENCY.get(item[1].decision, 0), -item[1].statistics.n))
+    seen.sort(key=lambda item: (URGENCY.get(item[1].decision, len(URGENCY)), -item[1].statistics.n))
     charts = []
     for k, one in seen[:MOST_FACES]:
         rows = np.flatnonzero((found.face == k) & ~found.is_beside_edge)
@@ -512,9 +513,14 @@ def _face_blocks(found: CadComparison) -> tuple[Gallery | Text, ...]:
     if n <= MOST_FACES:
         return (shown,)
     text = (
-        f"{MOST_FACES} of the {n} faces that were seen: those that did not pass, then the largest."
+        f"{MOST_FACES} of the {n} faces with points: those that did not pass, then those of most "
+        "points; those that were not judged come last."
     )
     return (Text(text), shown)
+
+
+STRAYS = 2.5
+"""So many points far off do not widen a picture in which the others would be one bar."""
 
 
 def _histogram(
@@ -527,7 +533,9 @@ def _histogram(
     caption: str,
 ) -> Picture:
     """Numbers of points by deviation, as the thesis's figures 5.12, 5.14, 5.28 and 5.41."""
-    reach = max(1.15 * float(np.percentile(np.abs(d), 99.5)), *(1.3 * t for t in limits), 1e-3)
+    outside = min(max(0.005, STRAYS / len(d)), 0.05)
+    far = 1.15 * float(np.quantile(np.abs(d), 1.0 - outside))
+    reach = max(far, *(1.3 * t for t in limits), 1e-3)
     counted = histogram(d, reach)
     with styled():
         figure = new_figure(*size)
@@ -547,13 +555,13 @@ def _histogram(
             text = f"{share_text(100.0 * share)} within the limits"
             axes.set_title(text, loc="left")
     beyond = counted.n_below + counted.n_above
-    outside = f" {beyond:,} lie outside the picture." if beyond else ""
+    told = f" {beyond:,} lie outside the picture." if beyond else ""
     dashed = " Dashed: limits." if limits else ""
     width = float(counted.edges_mm[1] - counted.edges_mm[0])
     return Picture(
         chart_markup(figure, f"Histogram of deviations: {name}"),
         title=name,
-        caption=f"{caption} Classes of {significant(width, 'mm', 2)}.{outside}{dashed}",
+        caption=f"{caption} Classes of {significant(width, 'mm', 2)}.{told}{dashed}",
     )
 
 

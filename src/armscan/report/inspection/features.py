@@ -231,7 +231,10 @@ def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
             label = f"{place.capitalize()}: {item.label}" if item.key in SHOWN else ""
             told.append(replace(item, key=key, label=label))
     both = (found.first, found.second)
-    warnings = {text for one in both for text in point_warnings(one.counts, cloud)}
+    warnings = (
+        *point_warnings(found.first.counts, cloud, "first feature"),
+        *point_warnings(found.second.counts, cloud, "second feature"),
+    )
     deviations = np.concatenate([one.fitted.deviations_mm for one in both])
     return InspectionReport(
         title=f"Relation of {names}",
@@ -256,5 +259,5 @@ def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
             ),
         ),
         counts=_counts(found.first.counts, found.second.counts),
-        warnings=tuple(sorted(warnings)),
+        warnings=tuple(dict.fromkeys(warnings)),
     )

@@ -418,14 +418,16 @@ def point_subtitle(counts: PointCounts, cloud: PointCloud) -> str:
     return f"{counts.n_feature:,} points in {frame}"
 
 
-def point_warnings(counts: PointCounts, cloud: PointCloud) -> tuple[str, ...]:
-    """What is weak about the points."""
+def point_warnings(
+    counts: PointCounts, cloud: PointCloud, whose: str = "feature"
+) -> tuple[str, ...]:
+    """What is weak about the points of a feature."""
     found = []
     if not cloud.covariance_mm2.any():
         found.append(NO_SIGMA)
     if counts.n_outliers > MANY_OUTLIERS * counts.n_feature:
         share = 100.0 * counts.n_outliers / counts.n_feature
-        found.append(f"{share:.1f} % of the feature's points are outliers: see the pictures")
+        found.append(f"{share:.1f} % of the {whose}'s points are outliers: see the pictures")
     return tuple(found)
 
 

@@ -114,7 +114,7 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
             remedy="write numbers with points: 1.5,2.5,3.5",
         )
     named = _named(heading)
-    values = _values("\n".join(body), tuple(named.values()), path)
+    values = _values("\n".join(body), tuple(named.values()), path, start + 1)
     columns = {name: values[:, k] for k, name in enumerate(named)}
     read = set(named.values())
     passed_over = tuple(word for k, word in enumerate(heading) if k not in read)
@@ -132,19 +132,31 @@ def _named(heading: list[str]) -> dict[str, int]:
     return named if set(POINT) <= set(named) else {name: k for k, name in enumerate(POINT)}
 
 
-def _values(body: str, columns: tuple[int, ...], path: Path) -> FloatArray:
-    """(N, C) numbers of some columns."""
+def _values(body: str, columns: tuple[int, ...], path: Path, first: int) -> FloatArray:
+    """(N, C) numbers of some columns of lines that are numbered from ``first``."""
     if EMPTY_FIELD.search(body):
         body = EMPTY_FIELD.sub(r"\1nan", body)
-    text = io.StringIO(body.replace(",", " ").replace(";", " "))
+    body = body.replace(",", " ").replace(";", " ")
     try:
-        return np.loadtxt(text, usecols=columns, ndmin=2)
+        return np.loadtxt(io.StringIO(body), usecols=columns, ndmin=2)
     except (ValueError, IndexError) as error:
         raise FileFormatError(
-            f"the points are not understood ({error})",
+            f"the points are not understood{_first_wrong(body, columns, first)}",
             where=path_text(path),
             remedy="give one point a line: x y z in mm, with a point as decimal sign",
         ) from error
+
+
+def _first_wrong(body: str, columns: tuple[int, ...], first: int) -> str:
+    """Which line it is that holds no numbers in some columns."""
+    for k, line in enumerate(body.split("\n")):
+        words = line.split()
+        try:
+            for column in columns if words else ():
+                float(words[column])
+        except (ValueError, IndexError):
+            return f": line {first + k} is '{line.strip()[:60]}'"
+    return ""
 
 
 def _notes(lines: list[str]) -> tuple[str, ...]:

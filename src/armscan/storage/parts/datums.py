@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from armscan.inspection.cad.part import PartModel
 from armscan.inspection.cad.reference_points import ReferencePoints, paired_markers
 from armscan.records.cloud import CloudFrame
 from armscan.storage.parts.tables import require_face
-from armscan.storage.points import read_marker_list
+from armscan.storage.points import ASSUMED_SIGMA_MM, read_marker_list
 from armscan.storage.tables import COORDINATES, CsvTable, read_csv
 
 MEASURED = tuple(f"measured_{name}" for name in COORDINATES)
@@ -274,4 +275,11 @@ def read_reference_markers(
             where=found.markers.source,
             remedy="leave the nominal list's column id out: markers are matched by distances then",
         )
-    return paired_markers(nominal.markers, found.markers, by_number=nominal.has_ids)
+    pairs = paired_markers(nominal.markers, found.markers, by_number=nominal.has_ids)
+    if isinstance(pairs, FitFailure) or not found.is_sigma_assumed:
+        return pairs
+    note = (
+        "the list of measured markers tells no covariances: a standard deviation of "
+        f"{ASSUMED_SIGMA_MM:g} mm an axis is assumed"
+    )
+    return replace(pairs, notes=(*pairs.notes, note))

@@ -26,7 +26,13 @@ from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import part_of
 from armscan.inspection.cad.point_errors import scatter_of_means
 from armscan.records.cloud import FUSED
-from armscan.report.inspection.cad import cad_warnings, verdict_table
+from armscan.report.inspection.cad import (
+    _histogram,
+    cad_quantities,
+    cad_warnings,
+    face_charts,
+    verdict_table,
+)
 from armscan.storage.parts.tables import face_table_bytes
 from rigs.inspection_clouds import cloud_of
 from rigs.parts import box_corners
@@ -261,6 +267,31 @@ def test_of_a_face_not_seen_nothing_is_told() -> None:
     lines = [line for line in face_table_bytes(found).decode().splitlines() if line[:1] != "#"]
     rows = list(csv.DictReader(lines))
     assert {row["u_mean_mm"] for row in rows if row["n"] == "0"} == {""}
+
+
+def test_a_face_of_few_points_is_nowhere_called_seen_and_no_alignment_has_no_rms() -> None:
+    """Five points lie on a side: fewer than a spot needs."""
+    side = [[0.0, 5.0 + k, 10.0] for k in range(5)]
+    found = compared(np.concatenate([top_points(3000), side]), sigma=0.01, tolerance_mm=0.05)
+    assert sum(one.statistics.n > 0 for one in found.faces) == 2
+    told = {item.key: item for item in cad_quantities(found, BOX.part)}
+    assert told["faces.n_seen"].value == 1
+    assert told["verdict_faces"].value["not seen"] == 5
+    assert not told["alignment.rms_mm"].label
+
+
+def test_pictures_of_faces_that_were_not_judged_come_last() -> None:
+    side = [[0.0, 5.0 + k, 10.0] for k in range(5)]
+    found = compared(np.concatenate([top_points(3000), side]), sigma=0.01, tolerance_mm=0.05)
+    captions = [one.caption for one in face_charts(found)]
+    assert ["not seen" in text for text in captions] == [False, True]
+
+
+def test_two_strays_do_not_make_one_bar_of_a_face() -> None:
+    d = np.random.default_rng(4).normal(0.0, 0.005, 167)
+    d[:2] = -1.9
+    told = _histogram(d, [0.05], "top", share=0.98, size=(4.2, 2.6), caption="")
+    assert "2 lie outside the picture" in told.caption
 
 
 def test_failing_faces_stand_first_and_are_marked() -> None:

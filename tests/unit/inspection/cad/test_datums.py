@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +27,8 @@ from armscan.inspection.cad.reference_points import (
     paired_markers,
 )
 from armscan.records.points import MarkerSet
-from armscan.storage.parts.datums import datum_features
+from armscan.storage.parts.datums import datum_features, read_reference_markers
+from armscan.storage.points import markers_csv
 from rigs.inspection_clouds import cloud_of
 from rigs.parts import box_corners, extruded, turned
 
@@ -429,6 +431,22 @@ def test_markers_are_paired_with_or_without_numbers(by_number: bool) -> None:
     assert found.method == "markers"
     assert np.abs(found.cad_from_part.apply(seen) - NOMINAL[order]).max() < 0.03
     assert "1 of 7 measured markers" in found.warnings[0]
+
+
+def test_a_list_of_markers_without_covariances_says_what_is_assumed(tmp_path: Path) -> None:
+    nominal, measured = tmp_path / "nominal.csv", tmp_path / "measured.csv"
+    places = TRUE.inverse().apply(NOMINAL)
+    for path, rows_mm in ((nominal, NOMINAL), (measured, places)):
+        rows = "".join("{},{},{}\n".format(*row) for row in rows_mm.tolist())
+        path.write_text("x_mm,y_mm,z_mm\n" + rows)
+    points = read_reference_markers(nominal, measured, "Base")
+    assert isinstance(points, ReferencePoints)
+    assert "0.02 mm an axis is assumed" in points.notes[0]
+    known = markers(places, list(range(1, len(places) + 1)), "Base")
+    measured.write_bytes(markers_csv(known))
+    points = read_reference_markers(nominal, measured, "Base")
+    assert isinstance(points, ReferencePoints)
+    assert not points.notes
 
 
 def test_markers_at_equal_distances_are_not_guessed() -> None:

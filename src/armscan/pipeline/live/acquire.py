@@ -28,7 +28,7 @@ MOST_WAITING = 512
 MOST_TO_KEEP = 256
 """Elements that are matched and wait to be recorded; then matching waits, and nothing is lost."""
 BEHIND_SHARE = 0.25
-"""Of them: with more, recording needs the processor, and nothing is measured live."""
+"""Of them: with more, recording needs the processor, and what is measured live is seldom."""
 SEEN_EVERY_NS = 20_000_000
 """So often a device that has nothing says so."""
 BEHIND = "this computer cannot keep up with the recording; the devices' own buffers must hold"

@@ -7,8 +7,6 @@ the command line, and help reads the default from that class.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import MISSING, fields
 from importlib import import_module
@@ -94,17 +92,3 @@ def test_the_depth_margin_that_texts_name_is_the_default() -> None:
     page = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
     words = " ".join(page.read_text().split())
     assert f"up to X times its width at either end ({text} unless said)" in words
-
-
-@pytest.mark.parametrize("words", ["reconstruct", "calibrate laser", "simulate", "inspect cad"])
-def test_help_loads_no_compiled_loops(words: str) -> None:
-    """With nothing compiled yet, a page of help would take minutes."""
-    program = (
-        "import sys; from armscan.cli import main; main(sys.argv[1:]); "
-        "sys.exit('numba' in sys.modules)"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", program, *words.split(), "-h"], capture_output=True, check=False
-    )
-    assert run.returncode == 0
-    assert b"[default: " in run.stdout

@@ -7,14 +7,12 @@ and left to that class, and help reads it from there when it is printed.
 
 from __future__ import annotations
 
-import ast
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from enum import StrEnum
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -33,8 +31,7 @@ T = TypeVar("T")
 class DefaultOf(str):
     """A default that help shows, as ``package.module:Class.field`` of a dataclass.
 
-    Help formats it; only then is it looked up: in the module's text, since importing it would load
-    the compiled loops for a page of help, and by import where the text holds no plain value.
+    Help formats it; only then is the module imported and the field's default read.
     """
 
     __slots__ = ()
@@ -42,24 +39,8 @@ class DefaultOf(str):
     def __format__(self, spec: str) -> str:
         module, _, place = self.partition(":")
         name, _, wanted = place.partition(".")
-        value = _written_default(module, name, wanted)
-        if value is None:
-            known = fields(getattr(import_module(module), name))
-            value = {field.name: field.default for field in known}[wanted]
-        return str(value)
-
-
-def _written_default(module: str, name: str, wanted: str) -> object:
-    """The plain value that a class's field has in the text of its module; None if there is none."""
-    found = find_spec(module)
-    if found is None or found.origin is None:
-        return None
-    for one in ast.parse(Path(found.origin).read_text(encoding="utf-8")).body:
-        if isinstance(one, ast.ClassDef) and one.name == name:
-            for field in one.body:
-                if isinstance(field, ast.AnnAssign) and ast.unparse(field.target) == wanted:
-                    return field.value.value if isinstance(field.value, ast.Constant) else None
-    return None
+        known = fields(getattr(import_module(module), name))
+        return str({field.name: field.default for field in known}[wanted])
 
 
 class Side(StrEnum):

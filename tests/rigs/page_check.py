@@ -100,6 +100,14 @@ def browser(folder: Path) -> Iterator[Any]:
         driver.quit()
 
 
+SETTLED = """
+const done = arguments[0];
+const frames = () => requestAnimationFrame(() => requestAnimationFrame(done));
+Promise.all([...document.images].map(one => one.decode().catch(() => 0))).then(frames);
+"""
+"""Pictures are decoded and laid out: on a busy machine text was read where it did not stay."""
+
+
 def page_faults(driver: Any, page: Path, pictures: Path | None = None) -> list[str]:
     """What is wrong with a page, in words; empty for a sound one.
 
@@ -121,11 +129,13 @@ def page_faults(driver: Any, page: Path, pictures: Path | None = None) -> list[s
         driver.get(page.as_uri())
         # folded parts are read too
         driver.execute_script("document.querySelectorAll('details').forEach(d => d.open = true)")
+        driver.execute_async_script(SETTLED)
         found += [f"{width} px: {text}" for text in driver.execute_script(FAULTS, True)]
         if pictures is not None:
             _save(driver, pictures / f"{page.stem}-{width}.png", width)
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
     _set_width(driver, PAPER_PX)
+    driver.execute_async_script(SETTLED)
     found += [f"paper: {text}" for text in driver.execute_script(FAULTS, False)]
     if pictures is not None:
         printed = driver.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})

@@ -10,11 +10,12 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
-from armscan.models.calibration import CameraCalibration, Provenance
+from armscan.models.calibration import Provenance
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import StereoCalibration
 from armscan.storage.documents import stereo_document
 from rigs.ring_scenes import Mark, render, tilted
+from rigs.true_scanner import certain_camera
 
 WIDTH, HEIGHT, FOCAL_PX = 480, 400, 1000.0
 DISTANCE_MM, BASELINE_MM, RADIUS_MM = 150.0, 60.0, 3.0
@@ -57,17 +58,7 @@ def draw_marked_plate(path: Path) -> None:
         command=(),
         inputs=(),
     )
-    calibration = CameraCalibration(
-        camera=camera,
-        covariance=np.zeros((9, 9)),
-        has_covariance=True,
-        rms_px=0.1,
-        sigma_point_px=0.05,
-        n_views=9,
-        n_points=99,
-        covered_px=np.array([0, 0, WIDTH, HEIGHT]),
-        provenance=origin,
-    )
+    calibration = certain_camera(camera, origin)
     stereo = StereoCalibration(
         left=calibration,
         right=calibration,

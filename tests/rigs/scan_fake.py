@@ -14,7 +14,6 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import (
     ArmNoise,
-    CameraCalibration,
     HandEyeCalibration,
     ScannerCalibration,
     SensorCalibration,
@@ -25,6 +24,7 @@ from armscan.models.light_sheet import LightSheet
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from rigs.sheet_rig import PROVENANCE, THESIS_PLANE
+from rigs.true_scanner import certain_camera
 
 CAMERA = CameraModel(
     fx_px=600.0,
@@ -52,17 +52,7 @@ def scanner(latency_ns: int = 0) -> ScannerCalibration:
         scale_mm=20.0,
         bow_mm=np.zeros(5),
     )
-    camera = CameraCalibration(
-        camera=CAMERA,
-        covariance=np.zeros((9, 9)),
-        has_covariance=True,
-        rms_px=0.1,
-        sigma_point_px=0.05,
-        n_views=9,
-        n_points=99,
-        covered_px=np.array([0, 0, 319.0, 239.0]),
-        provenance=PROVENANCE,
-    )
+    camera = certain_camera(CAMERA, PROVENANCE)
     sheets = (
         SheetCalibration(
             name="A",

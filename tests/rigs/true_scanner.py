@@ -14,6 +14,7 @@ from armscan.models.calibration import (
     ArmNoise,
     CameraCalibration,
     HandEyeCalibration,
+    Provenance,
     ScannerCalibration,
     SensorCalibration,
     SheetCalibration,
@@ -77,8 +78,9 @@ def true_scanner(twin: Twin) -> ScannerCalibration:
     return ScannerCalibration(sensor=sensor, hand_eye=hand_eye, provenance=PROVENANCE)
 
 
-def _of_one_camera(camera: CameraModel, sheets: dict[str, LightSheet]) -> SensorCalibration:
-    document = CameraCalibration(
+def certain_camera(camera: CameraModel, provenance: Provenance | None = None) -> CameraCalibration:
+    """A camera that is known for certain over its whole image."""
+    return CameraCalibration(
         camera=camera,
         covariance=np.zeros((9, 9)),
         has_covariance=True,
@@ -87,8 +89,12 @@ def _of_one_camera(camera: CameraModel, sheets: dict[str, LightSheet]) -> Sensor
         n_views=9,
         n_points=99,
         covered_px=np.array([0.0, 0.0, camera.width_px - 1.0, camera.height_px - 1.0]),
-        provenance=PROVENANCE,
+        provenance=provenance or PROVENANCE,
     )
+
+
+def _of_one_camera(camera: CameraModel, sheets: dict[str, LightSheet]) -> SensorCalibration:
+    document = certain_camera(camera)
     calibrated = tuple(
         SheetCalibration(
             name=name, sheet=sheet, rms_mm=0.01, n_boards=6, n_points=600,

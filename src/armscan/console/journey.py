@@ -26,7 +26,7 @@ from armscan.pipeline.live.session import LiveOptions
 from armscan.pipeline.measure import MeasureOptions
 from armscan.storage.arm import ARM_FILE
 from armscan.storage.codec import MismatchError, RecordCodec, parse_toml, toml_bytes
-from armscan.storage.files import files_in, is_file, path_text, read_bytes, write_files
+from armscan.storage.files import files_in, is_file, make_folder, path_text, read_bytes, write_files
 from armscan.storage.recording_session import EXPOSURES_FILE, exposure_rows
 from armscan.storage.tables import read_csv
 from armscan.vision.stripe.image import StripeOptions
@@ -545,12 +545,7 @@ def open_journey(folder: Path, settings: SessionSettings | None = None) -> Journ
             journey.change(**{**told, **known, **of_rig})
         return journey
     _check_own(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"the folder cannot be made ({error.strerror})", where=path_text(folder)
-        ) from error
+    make_folder(folder, with_parents=True)
     journey = Journey(folder, settings or SessionSettings())
     journey.change()
     return journey

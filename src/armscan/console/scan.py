@@ -18,7 +18,6 @@ import numpy as np
 from armscan.console.journey import SeeingSettings, SessionSettings, StepName
 from armscan.console.quality import Incidence, passes_apart_mm
 from armscan.devices.matching import MatchedInstant, TimedSample, arm_track
-from armscan.errors import OutputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.arm import axis_frames
@@ -35,7 +34,7 @@ from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.recording import NO_TRIGGER, ArmTrack, ExposureRow, Session
 from armscan.storage.arm import ARM_FILE, arm_columns
-from armscan.storage.files import path_text, write_files
+from armscan.storage.files import make_folder, write_files
 from armscan.storage.recording import encoded_png, read_recording
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
@@ -100,7 +99,7 @@ class GrowingRecording:
         """
         content = encoded_png(exposure, self.session.cameras[row.camera])
         path = self.folder / row.source
-        make_folder(path.parent)
+        make_folder(path.parent, with_parents=True)
         write_files({path: content}, is_overwriting=True)
         self.rows.append(row)
 
@@ -142,22 +141,6 @@ def samples_of(arm: ArmTrack) -> Iterator[ArmReading]:
     for k, t_ns in enumerate(arm.t_ns.tolist()):
         trigger = NO_TRIGGER if arm.trigger_ids is None else int(arm.trigger_ids[k])
         yield t_ns, arm.pose(k) if arm.is_known[k] else None, trigger
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder with those above it.
-
-    Raises
-    ------
-    OutputError
-        If the disk refuses.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"the folder cannot be made ({error.strerror})", where=path_text(folder)
-        ) from error
 
 
 class Bench(Protocol):
@@ -379,7 +362,7 @@ class LiveScan:
         try:
             self._wait_for_clocks()
             make_room()
-            make_folder(self.path.parent)
+            make_folder(self.path.parent, with_parents=True)
             self.recorder.begin()
         except BaseException:
             self.session.stop()

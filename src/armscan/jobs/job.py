@@ -29,7 +29,7 @@ from armscan.report.quantity import Summary, sentences, summary_json
 from armscan.storage.codec import parse_json
 from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.documents import new_provenance
-from armscan.storage.files import Content, check_outputs, read_bytes, write_files
+from armscan.storage.files import Content, check_outputs, make_folder, read_bytes, write_files
 
 T = TypeVar("T")
 
@@ -279,14 +279,7 @@ class Batch:
         return found
 
     def _open(self) -> None:
-        try:
-            self.folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise OutputError(
-                f"the folder cannot be made ({error.strerror})",
-                where=str(self.folder),
-                remedy="name another one",
-            ) from error
+        make_folder(self.folder)
         place = self.folder / LEDGER
         if place.exists():
             self._ledger = parse_json(read_bytes(place), str(place)).get("results", {})

@@ -219,6 +219,24 @@ Content: TypeAlias = bytes | Iterable[bytes]
 """Of a file: all of it, or pieces that follow each other."""
 
 
+def make_folder(folder: Path, *, with_parents: bool = False) -> None:
+    """Make a folder where there is none; those above it, too, only where that is asked for.
+
+    Raises
+    ------
+    OutputError
+        If the disk refuses.
+    """
+    try:
+        folder.mkdir(parents=with_parents, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"the folder cannot be made ({error.strerror})",
+            where=path_text(folder),
+            remedy="choose another place",
+        ) from error
+
+
 def write_files(contents: Mapping[Path, Content], *, is_overwriting: bool = False) -> None:
     """Write files that belong together, each of them complete.
 

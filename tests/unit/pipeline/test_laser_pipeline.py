@@ -8,7 +8,7 @@ import pytest
 
 from armscan.calibration.sheets.result import LaserFit
 from armscan.errors import EstimationError, InputError
-from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
+from armscan.models.calibration import SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_pairs
@@ -19,6 +19,7 @@ from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.target import Chessboard
 from rigs.sheet_rig import PROVENANCE
+from rigs.true_scanner import certain_camera
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = CameraModel(
@@ -30,17 +31,7 @@ CAMERA = CameraModel(
     width_px=WIDTH,
     height_px=HEIGHT,
 )
-CALIBRATION = CameraCalibration(
-    camera=CAMERA,
-    covariance=np.zeros((9, 9)),
-    has_covariance=True,
-    rms_px=0.1,
-    sigma_point_px=0.05,
-    n_views=9,
-    n_points=99,
-    covered_px=np.array([0.0, 0.0, WIDTH - 1.0, HEIGHT - 1.0]),
-    provenance=PROVENANCE,
-)
+CALIBRATION = certain_camera(CAMERA, PROVENANCE)
 LINE_SIGMA_PX = 2.0
 DEPTH_MM = 200.0
 

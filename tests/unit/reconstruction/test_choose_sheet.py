@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 
 from armscan.errors import EstimationError, OptionError
-from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
+from armscan.models.calibration import SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.labels import LabelledProfile, SingleLabeller
 from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.profile import Profile, StripeFlag
 from rigs.sheet_rig import PROVENANCE, make_profile
+from rigs.true_scanner import certain_camera
 
 CAMERA = CameraModel(
     fx_px=1000.0,
@@ -35,18 +36,7 @@ def leaning(sign: float) -> LightSheet:
 
 
 def two_sheets() -> SensorCalibration:
-    box = np.array([0.0, 0.0, 1000.0, 800.0])
-    camera = CameraCalibration(
-        camera=CAMERA,
-        covariance=np.zeros((9, 9)),
-        has_covariance=True,
-        rms_px=0.1,
-        sigma_point_px=0.05,
-        n_views=9,
-        n_points=99,
-        covered_px=box,
-        provenance=PROVENANCE,
-    )
+    camera = certain_camera(CAMERA, PROVENANCE)
     sheets = tuple(
         SheetCalibration(
             name=name,

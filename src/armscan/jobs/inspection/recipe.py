@@ -26,7 +26,7 @@ from armscan.report.page import Page, page_of
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import CLOUD_SUFFIXES, read_cloud
 from armscan.storage.documents import fingerprint
-from armscan.storage.files import Content, is_folder, path_text, write_files
+from armscan.storage.files import Content, is_folder, make_folder, path_text, write_files
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.parts.recipes import (
     PartResult,
@@ -194,7 +194,7 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
     recipe_hash = " ".join((hashes[0], *hashes[2:]))
     run = _Run(own, job.output, file, (recipe_hash, hashes[1] if len(hashes) > 1 else ""))
     rows: list[PartRow] = []
-    _make_folder(job.output)
+    make_folder(job.output)
     write_files({job.output / TABLE: part_table_bytes(rows)}, is_overwriting=True)
     try:
         for k, (name, path) in enumerate(paths.items()):
@@ -282,14 +282,3 @@ def _check_folder(folder: Path, *, is_overwriting: bool) -> None:
             where=where,
             remedy="name a new folder or one of earlier results, or give --force",
         )
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"the folder cannot be made ({error.strerror})",
-            where=path_text(folder),
-            remedy="choose another place",
-        ) from error

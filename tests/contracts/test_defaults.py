@@ -7,6 +7,8 @@ the command line, and help reads the default from that class.
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import MISSING, fields
 from importlib import import_module
@@ -92,3 +94,20 @@ def test_the_depth_margin_that_texts_name_is_the_default() -> None:
     page = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
     words = " ".join(page.read_text().split())
     assert f"up to X times its width at either end ({text} unless said)" in words
+
+
+def test_help_loads_no_compiled_loops() -> None:
+    """With nothing compiled yet, a page of help would take a minute of compilation."""
+    paths = [" ".join(path) for path in COMMANDS]
+    program = (
+        "import sys\n"
+        "from armscan.cli import main\n"
+        "for words in sys.argv[1:]:\n"
+        "    main([*words.split(), '-h'])\n"
+        "sys.exit(len({'numba', 'numpy', 'cv2', 'scipy'} & set(sys.modules)))"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program, *paths], capture_output=True, check=False, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.count("Show this message and exit") == len(paths)

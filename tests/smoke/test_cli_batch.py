@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -165,3 +167,53 @@ def test_what_is_wrong_for_all_is_said_once(
     assert run()[0] == 2
     ledger = json.loads((week.parent / "clouds" / "batch.json").read_text())
     assert list(ledger["results"]) == ["a"] and "data" not in ledger["results"]["a"]
+
+
+def test_a_second_batch_into_one_folder_is_refused_while_the_first_runs(
+    week: Path, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another process has the folder; killed, it leaves it free."""
+    clouds = week.parent / "clouds"
+    clouds.mkdir()
+    program = (
+        "import sys; from pathlib import Path; from armscan.storage.files import sole_writer\n"
+        "with sole_writer(Path(sys.argv[1])):\n"
+        "    print('held', flush=True); sys.stdin.read()"
+    )
+    first = subprocess.Popen(
+        [sys.executable, "-c", program, str(clouds)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    with first:
+        assert first.stdout is not None and first.stdout.readline() == b"held\n"
+        scanner_file = str(week.parent / "scanner.json")
+        words = ["reconstruct", str(week), "--scanner", scanner_file, "-o", str(clouds)]
+        assert main(words) == 2
+        assert "another run writes into this folder" in capsys.readouterr().err
+        assert list(clouds.iterdir()) == []
+        first.kill()
+    assert "data" in run()[1]["scans"]["a"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"{}",
+        b'{"results": []}',
+        b'{"results": {"a": 3}}',
+        b'{"results": {"a": {"mark": "x", "data": [1]}}}',
+        b'{"results": {}, "jobs": 3}',
+    ],
+)
+def test_a_file_of_another_program_with_the_ledger_s_name_is_left(
+    content: bytes, week: Path, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clouds = week.parent / "clouds"
+    clouds.mkdir()
+    (clouds / "batch.json").write_bytes(content)
+    scanner_file = str(week.parent / "scanner.json")
+    words = ["reconstruct", str(week), "--scanner", scanner_file, "-o", str(clouds)]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "this is not the list of a batch's results" in said and "batch.json" in said
+    assert [path.name for path in clouds.iterdir()] == ["batch.json"]
+    assert (clouds / "batch.json").read_bytes() == content

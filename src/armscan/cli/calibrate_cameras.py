@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from armscan.cli.delivery import run
 from armscan.cli.options import (
     ArmFile,
     AsJson,
@@ -26,7 +27,6 @@ from armscan.cli.options import (
     Target,
     given,
     refuse_given,
-    run,
 )
 
 NOT_AGAIN = "images scan target method bits_used bits_align cache"

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from armscan.cli.delivery import run
 from armscan.cli.options import (
     ArmFile,
     AsJson,
@@ -28,7 +29,6 @@ from armscan.cli.options import (
     StripeMethodOption,
     given,
     refuse_given,
-    run,
 )
 
 NOT_AGAIN = (

@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``--title-block`` and ``--pdf``, which every command that inspects a cloud has."""
+"""How a command runs its job, and what it hands out: progress, the report, its page as PDF.
+
+``--title-block`` and ``--pdf`` are options of every command that inspects a cloud.
+"""
 
 from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +20,8 @@ import typer
 
 if TYPE_CHECKING:
     from armscan.jobs.job import Job
+    from armscan.pipeline.progress import Progress, ProgressEvent
+    from armscan.report.quantity import Summary
 
 TitleBlockOption = Annotated[
     list[str] | None,
@@ -100,3 +107,72 @@ def with_delivery(job: Job) -> Job:
         )
     block = read_title_block(asked.title_block, "--title-block")
     return replace(job, title_block=block, pdf=asked.pdf)
+
+
+def run(
+    work: Callable[[Job], Summary],
+    *,
+    as_json: bool,
+    output: Path | None = None,
+    force: bool = False,
+    force_bad: bool = False,
+    cache: bool = False,
+) -> Summary:
+    """Run a job under a progress bar, and show what came out."""
+    from armscan.jobs.job import Job
+
+    with progress_bar() as progress:
+        job = Job(
+            output=output, is_overwriting=force, is_forced=force_bad, is_caching=cache,
+            command=("armscan", *sys.argv[1:]), progress=progress,
+        )  # fmt: skip
+        job = with_delivery(job)
+        try:
+            summary = work(job)
+        except KeyboardInterrupt:
+            if job.cache is not None and job.cache.folder.is_dir():
+                typer.echo("what was found in images is kept: the same command uses it", err=True)
+            raise
+    show(summary, as_json=as_json)
+    return summary
+
+
+def show(summary: Summary, *, as_json: bool) -> None:
+    """Print a report: tables for people, or the same as JSON and nothing else."""
+    from armscan.report.quantity import summary_json, summary_text
+
+    typer.echo(summary_json(summary) if as_json else summary_text(summary))
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """Show progress events on standard error while the block runs; nothing if it is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as ProgressBars
+
+    from armscan.pipeline.progress import silent
+
+    if not (console := Console(stderr=True)).is_terminal:
+        yield silent
+        return
+    bars = ProgressBars(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[item]}"),
+        console=console,
+        transient=True,
+    )
+    tasks: dict[str, int] = {}
+
+    def advance(event: ProgressEvent) -> None:
+        if event.stage not in tasks:
+            tasks[event.stage] = bars.add_task(event.stage, total=event.total, item="")
+        task = bars.tasks[tasks[event.stage]]
+        item = f"{task.speed:.0f}/s {event.item}" if task.speed else event.item
+        bars.update(task.id, completed=event.done, total=event.total, item=item)
+
+    with bars:
+        yield advance

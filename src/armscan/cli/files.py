@@ -10,7 +10,8 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.options import AsJson, Force, refuse_vain, show
+from armscan.cli.delivery import show
+from armscan.cli.options import AsJson, Force, refuse_vain
 
 INFO_EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
 CONVERT_EXAMPLE = (

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from armscan.cli.delivery import run
 from armscan.cli.options import (
     AsJson,
     DefaultOf,
@@ -18,7 +19,6 @@ from armscan.cli.options import (
     SideOption,
     given,
     numbers,
-    run,
 )
 
 PLANE_EXAMPLE = (

@@ -9,17 +9,9 @@ from typing import Annotated
 
 import typer
 
+from armscan.cli.delivery import run
 from armscan.cli.inspect import EXIT_NOT_PASSED, CloudArgument
-from armscan.cli.options import (
-    AsJson,
-    DefaultOf,
-    Force,
-    PageOption,
-    RegionOption,
-    given,
-    numbers,
-    run,
-)
+from armscan.cli.options import AsJson, DefaultOf, Force, PageOption, RegionOption, given, numbers
 
 CAD_EXAMPLE = (
     "\b\nExample:\n"

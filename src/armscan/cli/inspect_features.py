@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from armscan.cli.delivery import run
 from armscan.cli.inspect import CloudArgument
 from armscan.cli.options import (
     AsJson,
@@ -17,7 +18,6 @@ from armscan.cli.options import (
     RegionOption,
     given,
     numbers,
-    run,
 )
 
 LINE_EXAMPLE = "\b\nExample:\n  armscan inspect line edge.ply --region=0,40,-1,1,9,11 -o edge.html"

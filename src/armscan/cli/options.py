@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands have, and how a command runs its job and shows what came out.
+"""Options that several commands have.
 
 A default stands once, in the class that the option sets: an option that is not given is None here
 and left to that class, and help reads it from there when it is printed.
@@ -7,23 +7,15 @@ and left to that class, and help reads it from there when it is printed.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import fields
+import ast
+from collections.abc import Mapping
 from enum import StrEnum
-from importlib import import_module
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 import typer
-
-from armscan.cli.delivery import with_delivery
-
-if TYPE_CHECKING:
-    from armscan.jobs.job import Job
-    from armscan.pipeline.progress import Progress, ProgressEvent
-    from armscan.report.quantity import Summary
 
 T = TypeVar("T")
 
@@ -31,16 +23,29 @@ T = TypeVar("T")
 class DefaultOf(str):
     """A default that help shows, as ``package.module:Class.field`` of a dataclass.
 
-    Help formats it; only then is the module imported and the field's default read.
+    Help formats it; only then is it read, from the text of the module: to import it would load the
+    compiled loops for a page of help.
     """
 
     __slots__ = ()
 
     def __format__(self, spec: str) -> str:
         module, _, place = self.partition(":")
-        name, _, wanted = place.partition(".")
-        known = fields(getattr(import_module(module), name))
-        return str({field.name: field.default for field in known}[wanted])
+        owner, _, field = place.partition(".")
+        source = cast(ModuleSpec, find_spec(module)).origin
+        text = Path(cast(str, source)).read_text(encoding="utf-8")
+        body = [
+            line
+            for node in ast.parse(text).body
+            if isinstance(node, ast.ClassDef) and node.name == owner
+            for line in node.body
+        ]
+        values = {
+            line.target.id: line.value
+            for line in body
+            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)
+        }
+        return str(ast.literal_eval(cast(ast.expr, values[field])))
 
 
 class Side(StrEnum):
@@ -228,72 +233,3 @@ def numbers(text: str, option: str) -> tuple[float, ...]:
         raise OptionError(
             f"'{text}' is not a list of numbers", where=option, remedy="put commas between them"
         ) from error
-
-
-def run(
-    work: Callable[[Job], Summary],
-    *,
-    as_json: bool,
-    output: Path | None = None,
-    force: bool = False,
-    force_bad: bool = False,
-    cache: bool = False,
-) -> Summary:
-    """Run a job under a progress bar, and show what came out."""
-    from armscan.jobs.job import Job
-
-    with progress_bar() as progress:
-        job = Job(
-            output=output, is_overwriting=force, is_forced=force_bad, is_caching=cache,
-            command=("armscan", *sys.argv[1:]), progress=progress,
-        )  # fmt: skip
-        job = with_delivery(job)
-        try:
-            summary = work(job)
-        except KeyboardInterrupt:
-            if job.cache is not None and job.cache.folder.is_dir():
-                typer.echo("what was found in images is kept: the same command uses it", err=True)
-            raise
-    show(summary, as_json=as_json)
-    return summary
-
-
-def show(summary: Summary, *, as_json: bool) -> None:
-    """Print a report: tables for people, or the same as JSON and nothing else."""
-    from armscan.report.quantity import summary_json, summary_text
-
-    typer.echo(summary_json(summary) if as_json else summary_text(summary))
-
-
-@contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """Show progress events on standard error while the block runs; nothing if it is no terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as ProgressBars
-
-    from armscan.pipeline.progress import silent
-
-    if not (console := Console(stderr=True)).is_terminal:
-        yield silent
-        return
-    bars = ProgressBars(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[item]}"),
-        console=console,
-        transient=True,
-    )
-    tasks: dict[str, int] = {}
-
-    def advance(event: ProgressEvent) -> None:
-        if event.stage not in tasks:
-            tasks[event.stage] = bars.add_task(event.stage, total=event.total, item="")
-        task = bars.tasks[tasks[event.stage]]
-        item = f"{task.speed:.0f}/s {event.item}" if task.speed else event.item
-        bars.update(task.id, completed=event.done, total=event.total, item=item)
-
-    with bars:
-        yield advance

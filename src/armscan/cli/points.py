@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from armscan.cli.delivery import run
 from armscan.cli.options import (
     AsJson,
     BitsAlign,
@@ -19,7 +20,6 @@ from armscan.cli.options import (
     Side,
     given,
     refuse_vain,
-    run,
 )
 
 PROBE_EXAMPLE = (

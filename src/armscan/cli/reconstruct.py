@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from armscan.cli.delivery import run
 from armscan.cli.options import (
     ArmFile,
     AsJson,
@@ -23,7 +24,6 @@ from armscan.cli.options import (
     given,
     refuse_given,
     refuse_vain,
-    run,
 )
 
 EXIT_INPUT = 2

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
+from armscan.cli.delivery import run
 from armscan.cli.inspect import CloudArgument
-from armscan.cli.options import AsJson, Force, RegionOption, given, numbers, run
+from armscan.cli.options import AsJson, Force, RegionOption, given, numbers
 
 CLEAN_EXAMPLE = (
     "\b\nExample:\n  armscan clean part.ply -o cleaned.ply --max-incidence 60 --isolated 0.5 "

@@ -9,8 +9,9 @@ from typing import Annotated, cast
 
 import typer
 
+from armscan.cli.delivery import progress_bar, show
 from armscan.cli.inspect_cad import UnitOption
-from armscan.cli.options import AsJson, DefaultOf, given, progress_bar, show
+from armscan.cli.options import AsJson, DefaultOf, given
 
 DEMO_EXAMPLE = "\b\nExample:\n  armscan demo single -o demo"
 SIMULATE_EXAMPLE = (

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from armscan.errors import ArmscanError, EstimationError, OptionError, OutputError
+from armscan.errors import ArmscanError, EstimationError, FileFormatError, OptionError, OutputError
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.title_block import TitleBlock, calibration_state
 from armscan.models.calibration import Provenance
@@ -29,7 +29,14 @@ from armscan.report.quantity import Summary, sentences, summary_json
 from armscan.storage.codec import parse_json
 from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.documents import new_provenance
-from armscan.storage.files import Content, check_outputs, make_folder, read_bytes, write_files
+from armscan.storage.files import (
+    Content,
+    check_outputs,
+    make_folder,
+    read_bytes,
+    sole_writer,
+    write_files,
+)
 
 T = TypeVar("T")
 
@@ -248,11 +255,19 @@ class Batch:
         Raises
         ------
         OutputError
-            If the folder or a file in it cannot be written: no other result could be.
+            If the folder or a file in it cannot be written: no other result could be; or if
+            another run is at work there.
+        FileFormatError
+            If its ``batch.json`` is something else.
         OptionError
             If the work of all was asked for wrongly, or the cluster was lost.
         """
-        self._open()
+        make_folder(self.folder)
+        with sole_writer(self.folder):
+            self._open()
+            return self._made(items)
+
+    def _made(self, items: Sequence[BatchItem]) -> dict[str, LedgerEntry]:
         found: dict[str, LedgerEntry] = {}
         waiting = [one for one in items if not self._is_done(one)]
         for item in items:
@@ -279,10 +294,19 @@ class Batch:
         return found
 
     def _open(self) -> None:
-        make_folder(self.folder)
         place = self.folder / LEDGER
-        if place.exists():
-            self._ledger = parse_json(read_bytes(place), str(place)).get("results", {})
+        if not place.exists():
+            return
+        document = parse_json(read_bytes(place), str(place))
+        results = document.get("results")
+        is_whole = isinstance(results, dict) and all(map(_is_entry, results.values()))
+        if not isinstance(results, dict) or not is_whole or len(document) > 1:
+            raise FileFormatError(
+                "this is not the list of a batch's results",
+                where=str(place),
+                remedy="name another folder; if the list was damaged, remove it",
+            )
+        self._ledger = results
 
     def _place(self, name: str) -> Path:
         return self.folder / f"{name}{self._suffix}"
@@ -336,6 +360,14 @@ class Batch:
         self._ledger[name] = entry
         content = json.dumps({"results": self._ledger}, indent=1)
         write_files({self.folder / LEDGER: content.encode()}, is_overwriting=True)
+
+
+def _is_entry(entry: object) -> bool:
+    """Whether it can be a `LedgerEntry`."""
+    if not isinstance(entry, dict) or not isinstance(entry.get("mark"), str):
+        return False
+    is_timed = isinstance(entry.get("seconds", 0.0), int | float)
+    return is_timed and isinstance(entry.get("data", {}), dict)
 
 
 def solved(result: T | FitFailure, where: object = "") -> T:

@@ -237,6 +237,45 @@ def make_folder(folder: Path, *, with_parents: bool = False) -> None:
         ) from error
 
 
+@contextmanager
+def sole_writer(folder: Path) -> Iterator[None]:
+    """Hold a folder while the block runs; what a killed run held is free again.
+
+    Where folders cannot be locked (some file systems of networks), nothing is held.
+
+    Raises
+    ------
+    OutputError
+        If another run holds it.
+    """
+    if fcntl is None:
+        yield
+        return
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise OutputError(
+            f"the folder cannot be read ({error.strerror})",
+            where=path_text(folder),
+            remedy="check its rights, or choose another folder",
+        ) from error
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise OutputError(
+            "another run writes into this folder",
+            where=path_text(folder),
+            remedy="wait for its end, or name another folder",
+        ) from error
+    except OSError:  # no locks there
+        pass
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
 def write_files(contents: Mapping[Path, Content], *, is_overwriting: bool = False) -> None:
     """Write files that belong together, each of them complete.
 

@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.options import AsJson, DefaultOf, Force, given, show
+from armscan.cli.delivery import show
+from armscan.cli.options import AsJson, DefaultOf, Force, given
 
 RIG = "armscan.pipeline.live.rig:RigDescription."
 RECORD_EXAMPLE = (

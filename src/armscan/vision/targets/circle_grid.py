@@ -21,6 +21,7 @@ from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.circle_edges import MeasuredCircles, measure_circles
 from armscan.vision.targets.circle_lattice import (
+    BLOCK_FRACTIONS,
     Blobs,
     NumberedGrid,
     find_blobs,
@@ -138,6 +139,9 @@ def _distorted(ideal_px: FloatArray, camera: CameraModel) -> tuple[FloatArray, F
 
 MIN_CIRCLES_FRACTION = 0.8
 """Least fraction of a grid's circles that must be found; each border row must be among them."""
+_LOOKS = ((BLOCK_FRACTIONS[1:2], 1.0), (BLOCK_FRACTIONS, MIN_CIRCLES_FRACTION))
+"""Blocks of the threshold, and the fraction of circles that must be found and show good edges: one
+size shows all of them in most photographs, where the others could add nothing."""
 WHOLE_FRACTION = 0.95
 """Least filled fraction of a lattice that may be a whole grid."""
 
@@ -159,29 +163,31 @@ def detect_circle_grid(exposure: Exposure, target: CircleGrid) -> TargetView | F
     """
     best_seen = (0, (0, 0))
     for grey in grey_channels(exposure):
-        for candidate in _candidates(grey, exposure, target):
-            best_seen = max(best_seen, (candidate.n_seen, candidate.size_seen))
-            if candidate.grid is None:
-                continue
-            index = candidate.grid.blob_index
-            circles = measure_circles(
-                grey,
-                candidate.blobs.centres_px[index],
-                candidate.blobs.shapes_px2[index],
-                MIN_CONTRAST * exposure.full_scale,
-            )
-            if circles.is_good.mean() >= MIN_CIRCLES_FRACTION:
-                return correct_centres(_view(exposure, target, candidate.grid, circles))
+        grey8 = to_grey8(grey, exposure.full_scale)
+        for blocks, fraction in _LOOKS:
+            least = fraction * len(target.points_board_mm)
+            for candidate in _candidates(find_blobs(grey8, block_fractions=blocks), target):
+                best_seen = max(best_seen, (candidate.n_seen, candidate.size_seen))
+                if candidate.grid is None or len(candidate.grid.blob_index) < least:
+                    continue
+                index = candidate.grid.blob_index
+                circles = measure_circles(
+                    grey,
+                    candidate.blobs.centres_px[index],
+                    candidate.blobs.shapes_px2[index],
+                    MIN_CONTRAST * exposure.full_scale,
+                )
+                if circles.is_good.mean() >= fraction:
+                    return correct_centres(_view(exposure, target, candidate.grid, circles))
     return _failure(exposure, target, *best_seen)
 
 
-def _candidates(grey: RawGrey, exposure: Exposure, target: CircleGrid) -> list[_Candidate]:
+def _candidates(blobs: Blobs, target: CircleGrid) -> list[_Candidate]:
     """Lattices among the dark and among the light blobs, the target's own and the largest first.
 
     The thresholds also outline the ground between circles: such a lattice fits as well, but its
     rims show no edge, so that measuring it tells.
     """
-    blobs = find_blobs(to_grey8(grey, exposure.full_scale))
     found = []
     for is_light in (False, True):
         alike = blobs.select(blobs.is_light == is_light)

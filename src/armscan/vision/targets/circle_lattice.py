@@ -57,6 +57,7 @@ def find_blobs(
     largest_px: float = MAX_CIRCLE_PX,
     min_contrast: float = MIN_CONTRAST,
     same_log_area: float = SAME_LOG_AREA,
+    block_fractions: tuple[float, ...] = BLOCK_FRACTIONS,
 ) -> Blobs:
     """Return every contour that is an ellipse within the range of sizes, once.
 
@@ -64,11 +65,11 @@ def find_blobs(
 
     ``grey8``: The image. ``smallest_px``, ``largest_px``: Range of the diameters. ``min_contrast``:
     Least contrast, as a fraction of full scale. ``same_log_area``: Where circles nest, less than
-    `SAME_LOG_AREA`, so that their rims stay apart.
+    `SAME_LOG_AREA`, so that their rims stay apart. ``block_fractions``: Of `BLOCK_FRACTIONS`.
     """
     rows: list[tuple[float, ...]] = []
     margin = max(255.0 * min_contrast / 2.0, _NOISE_SIGMAS * _noise(grey8))
-    for fraction in BLOCK_FRACTIONS:
+    for fraction in block_fractions:
         block = max(11, round(fraction * max(grey8.shape)) | 1)
         mean = cv2.boxFilter(grey8, -1, (block, block), borderType=cv2.BORDER_REPLICATE)
         for is_light in (True, False):

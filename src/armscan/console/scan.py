@@ -30,7 +30,6 @@ from armscan.pipeline.live.session import (
     LiveSnapshot,
     ShownCloud,
 )
-from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.recording import NO_TRIGGER, ArmTrack, ExposureRow, Session
 from armscan.storage.arm import ARM_FILE, arm_columns
@@ -229,7 +228,7 @@ class ScanRecorder(LiveRecorder):
     Attributes
     ----------
     pose_of
-        The tool's pose by the exposure's source, as `exposure_of` names it.
+        The tool's pose by the instant's number.
     latest_joints_rad
         (J,) angles of the arm, where it gives them.
     n_left_out
@@ -241,10 +240,12 @@ class ScanRecorder(LiveRecorder):
     ) -> None:
         super().__init__(path, rig, is_simulated=is_simulated)
         self.path, self._keeps_times = path, keeps_times
-        self.pose_of: dict[str, Pose[Base, Tool] | None] = {}
+        self.pose_of: dict[int, Pose[Base, Tool] | None] = {}
         self.latest_joints_rad: FloatArray | None = None
         self.n_left_out = 0
-        self._first_of: dict[str, int] = {}
+        self._indices: dict[int, range] = {}
+        """Exposures that are listed, by the number of their instant."""
+        self._gone = range(0)
         self._lock = threading.Lock()
 
     def add_samples(self, samples: tuple[TimedSample, ...]) -> None:
@@ -264,21 +265,23 @@ class ScanRecorder(LiveRecorder):
                 times = [frame.t_device_ns for frame in instant.frames if frame is not None]
                 instant = replace(instant, t_ns=times[0])
             super().add_instant(instant)
-            for camera, frame in enumerate(instant.frames):
-                if frame is not None:
-                    source = f"camera {camera} frame {frame.number}"
-                    self.pose_of[source] = instant.pose
-                    self._first_of[source] = first
+            self.pose_of[instant.number] = instant.pose
+            self._indices[instant.number] = range(first, self.n_exposures)
+            # it was taken back while it waited to be recorded
+            if instant.number in self._gone:
+                self._leave_out(range(instant.number, instant.number + 1))
 
-    def leave_out(self, source: str) -> None:
-        """Take what was recorded since an exposure, and what came with it, out of the list."""
+    def leave_out(self, numbers: range) -> None:
+        """Take instants out of the list, also those of them that are still to be recorded."""
         with self._lock:
-            since = self._first_of.get(source, self.n_exposures)
-            gone = [one for one, index in self._first_of.items() if index >= since]
-            for one in gone:
-                self._first_of.pop(one)
-            self.n_left_out += len(gone)
-            self.take_back(since)
+            self._gone = numbers or self._gone
+            self._leave_out(numbers)
+
+    def _leave_out(self, numbers: range) -> None:
+        gone = [self._indices.pop(one) for one in numbers if one in self._indices]
+        if gone:
+            self.n_left_out += sum(map(len, gone))
+            self.take_back(gone[0].start, gone[-1].stop)
 
     def finish(self) -> None:
         """Write the file's end; one without an exposure is removed.
@@ -332,8 +335,6 @@ class LiveScan:
         )
         self.events: deque[LiveEvent] = deque(maxlen=50)
         self._scanner = scanner
-        self._source_of: dict[int, str] = {}
-        self._starts: list[int] = []
         self._incidence = Incidence()
         self._drift: tuple[int, float | None] = -1, None
         self.session = LiveSession(
@@ -341,7 +342,6 @@ class LiveScan:
             scanner,
             options=(seeing or SeeingSettings.of(self.rig.description)).options,
             recorder=self.recorder,
-            keep_cloud=self._remember,
         )
         self.session.add_listener(self._hear)
 
@@ -394,18 +394,11 @@ class LiveScan:
 
     def undo_pass(self) -> None:
         """Take the last pass out of the cloud and out of the recording's list."""
-        if self._starts:
-            start = self._starts.pop()
-            self.session.undo_pass()
-            # also what came with it and was not placed
-            self.recorder.leave_out(self._source_of[start])
+        self.recorder.leave_out(self.session.undo_pass())
 
     def clear(self) -> None:
-        """Take all passes out."""
-        self.session.clear()
-        self._starts.clear()
-        if self._source_of:
-            self.recorder.leave_out(self._source_of[min(self._source_of)])
+        """Take all that was recorded out."""
+        self.recorder.leave_out(self.session.clear())
 
     def stop(self) -> None:
         """End the scan; the recording is whole.
@@ -437,7 +430,7 @@ class LiveScan:
         version = self.snapshot.cloud_version
         if self._drift[0] != version:
             cloud = self.session.cloud()
-            last = cloud.exposure >= (self._starts[-1] if self._starts else 0)
+            last = cloud.exposure >= self.session.last_pass_start
             self._drift = version, passes_apart_mm(cloud.points_mm[~last], cloud.points_mm[last])
         return self._drift[1]
 
@@ -446,7 +439,7 @@ class LiveScan:
         hand_eye = None if self._scanner is None else self._scanner.hand_eye
         seen_from: dict[int, FloatArray] = {}
         for number in np.unique(cloud.exposure).tolist():
-            pose = self.recorder.pose_of.get(self._source_of.get(number, ""))
+            pose = self.recorder.pose_of.get(number)
             if pose is not None and hand_eye is not None:
                 seen_from[number] = (pose @ hand_eye.tool_from_sensor).translation_mm
         return self._incidence.angles_deg(cloud, seen_from)
@@ -458,13 +451,6 @@ class LiveScan:
         if joints is None or model is None or not np.isfinite(joints).all():
             return np.array(ends)
         return np.array([*axis_frames(model, joints).origins_mm[0], ends[1]])
-
-    def _remember(self, number: int, cloud: PointCloud) -> None:
-        """Which exposure an instant is, and with which instant a pass begins."""
-        n_passes = self.session.snapshot().n_passes
-        if n_passes != len(self._starts):
-            self._starts = [*self._starts[: n_passes - 1], number]
-        self._source_of[number] = cloud.exposure_sources[0]
 
     def _hear(self, event: LiveEvent) -> None:
         # a simulated hand waits for its images to be rendered, and any hand may pause

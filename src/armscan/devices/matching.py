@@ -86,6 +86,8 @@ class MatchedInstant:
         ``base_from_tool``; None where it is not known.
     status
         Why not.
+    number
+        How many instants the matcher handed out before it.
     """
 
     frames: tuple[Frame | None, ...]
@@ -94,6 +96,7 @@ class MatchedInstant:
     trigger_id: int | None
     pose: Pose[Base, Tool] | None
     status: PoseStatus
+    number: int = 0
 
 
 @dataclass(slots=True)
@@ -169,6 +172,7 @@ class InstantMatcher:
         self._apart_ns: dict[tuple[int, int], int] = {}
         self._events: deque[tuple[int, tuple[str, ...]]] = deque(maxlen=USUAL_STEPS)
         self._frame_step_ns = 0.0
+        self._n_taken = 0
         self._last_ns: list[int | None] = [None] * n_cameras
 
     def add_samples(self, samples: tuple[ArmSample, ...]) -> tuple[TimedSample, ...]:
@@ -238,8 +242,10 @@ class InstantMatcher:
                     trigger_id=first.trigger_id,
                     pose=pose,
                     status=status,
+                    number=self._n_taken,
                 )
             )
+            self._n_taken += 1
         return tuple(done)
 
     def _add_sample(self, sample: ArmSample) -> TimedSample:

@@ -300,6 +300,50 @@ def test_windows_and_exposures_are_those_of_the_scan_while_it_runs(tmp_path: Pat
     bench.close()
 
 
+def test_what_is_recorded_while_a_pass_is_taken_back_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = DrawnBench(30, rate_hz=20.0)
+    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01.mcap", scanner())
+    undo, before = live.session.undo_pass, []
+
+    def undone() -> range:
+        numbers = undo()
+        before.append(live.recorder.n_exposures)
+        waited(lambda: live.recorder.n_exposures >= before[0] + 4)
+        return numbers
+
+    monkeypatch.setattr(live.session, "undo_pass", undone)
+    live.start()
+    waited(lambda: live.snapshot.n_passes == 1 and live.n_recorded >= 5)
+    live.undo_pass()
+    waited(lambda: bench.is_over)
+    live.stop()
+    indices = [row.index for row in read_recording(tmp_path / "scan-01.mcap").rows]
+    assert indices == list(range(indices[0], 30)) and live.n_recorded == len(indices)
+    # one may have been on its way to the recorder
+    assert before[0] <= indices[0] <= before[0] + 1
+
+
+def test_an_instant_that_is_recorded_after_it_was_taken_back_is_not_listed(tmp_path: Path) -> None:
+    bench = FailingBench()
+    recorder = ScanRecorder(tmp_path / "s.mcap", bench.rig, is_simulated=True)
+    recorder.begin()
+    image = np.full((240, 320), 7, dtype=np.uint8)
+    for k in range(5):
+        if k == 2:
+            recorder.leave_out(range(1, 4))
+            recorder.leave_out(range(4, 4))  # nothing more
+        # a camera that was begun anew counts from zero
+        frames = (Frame(image, k % 2, 10**9 * k, 10**9 * k, k),)
+        recorder.add_instant(
+            MatchedInstant(frames, 10**9 * (k + 1), ("A",), k, None, PoseStatus.NO_TIME, number=k)
+        )
+    recorder.finish()
+    assert [row.index for row in read_recording(tmp_path / "s.mcap").rows] == [0, 4]
+    bench.close()
+
+
 def test_both_cameras_of_an_instant_are_taken_back_together(tmp_path: Path) -> None:
     bench = FailingBench(n_cameras=2)
     recorder = ScanRecorder(tmp_path / "s.mcap", bench.rig, is_simulated=True)
@@ -309,13 +353,13 @@ def test_both_cameras_of_an_instant_are_taken_back_together(tmp_path: Path) -> N
         # the cameras count their frames by themselves
         frames = tuple(Frame(image, n, 10**9 * k, 10**9 * k, k) for n in (k, k + 2))
         recorder.add_instant(
-            MatchedInstant(frames, 10**9 * (k + 1), ("A",), k, None, PoseStatus.NO_TIME)
+            MatchedInstant(frames, 10**9 * (k + 1), ("A",), k, None, PoseStatus.NO_TIME, number=k)
         )
         if k == 2:
-            recorder.leave_out("camera 1 frame 3")
+            recorder.leave_out(range(1, 3))
             assert (recorder.n_exposures, recorder.n_left_out) == (6, 4)
-    recorder.leave_out("camera 0 frame 3")
-    recorder.leave_out("camera 0 frame 3")  # is out already
+    recorder.leave_out(range(3, 4))
+    recorder.leave_out(range(1, 4))  # are out already
     assert recorder.n_left_out == 6
     recorder.finish()
     rows = read_recording(tmp_path / "s.mcap").rows

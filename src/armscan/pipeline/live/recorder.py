@@ -103,9 +103,13 @@ class LiveRecorder:
         """Exposures that came; the next one has this index."""
         return self._index
 
-    def take_back(self, since: int) -> None:
-        """Have no reader list the exposures so far from an index on; the file keeps them."""
-        self._writer.add_event(time.monotonic_ns(), TAKEN_BACK, {"since": since})
+    def take_back(self, since: int, until: int) -> None:
+        """Have no reader list exposures that came, by index, ``until`` not among them.
+
+        The file keeps them.
+        """
+        facts = {"since": since, "until": until}
+        self._writer.add_event(time.monotonic_ns(), TAKEN_BACK, facts)
 
     def close(self) -> WriterStatus:
         """Write all that waits, and the file's end.

@@ -205,9 +205,10 @@ class ShownCloud:
 
 @dataclass(slots=True, eq=False)
 class _Pass:
-    """Points of one pass, thinned as they come."""
+    """Points of one pass, thinned as they come; ``start`` is the number of its first instant."""
 
     first: Pose[Base, Tool]
+    start: int
     voxels: set[int] = field(default_factory=set)
     pieces: list[ShownCloud] = field(default_factory=list)
 
@@ -362,23 +363,44 @@ class LiveSession:
         self._acquisition.recorder = None
         self._change("paused")
 
-    def undo_pass(self) -> None:
-        """Take the last pass out of the live cloud; the recorder has and keeps all of it."""
+    @property
+    def last_pass_start(self) -> int:
+        """Number of the instant with which the last pass begins; 0 if there is no pass."""
+        with self._lock:
+            return self._passes[-1].start if self._passes else 0
+
+    def undo_pass(self) -> range:
+        """Take the last pass out of the live cloud; the recorder has and keeps all of it.
+
+        Returns
+        -------
+        numbers
+            Of the instants that came since the pass began, also those that were not placed; empty
+            if there was no pass.
+        """
         self._acquisition.wait_until_kept()
         with self._lock:
-            if self._passes:
-                self._passes.pop()
-            self._next_pass = self._taken_back = self._n_instants
+            end = self._n_instants
+            start = self._passes.pop().start if self._passes else end
+            self._next_pass = self._taken_back = end
             self._version += 1
         self._tell(LiveEvent("pass", "the last pass was taken back"))
+        return range(start, end)
 
-    def clear(self) -> None:
-        """Empty the live cloud; the recorder has and keeps all of it."""
+    def clear(self) -> range:
+        """Empty the live cloud; the recorder has and keeps all of it.
+
+        Returns
+        -------
+        numbers
+            Of all instants that came.
+        """
         self._acquisition.wait_until_kept()
         with self._lock:
             self._passes.clear()
-            self._next_pass = self._taken_back = self._n_instants
+            end = self._next_pass = self._taken_back = self._n_instants
             self._version += 1
+        return range(end)
 
     def stop(self) -> None:
         """Lasers off; what arrived is recorded and measured to its end."""
@@ -500,10 +522,10 @@ class LiveSession:
             self._frames |= {k: (one, instant.lasers) for k, one in frames if one is not None}
             self._arrivals.append(time.monotonic_ns())
             self._latest = instant.pose
+            number = instant.number
+            self._n_instants = number + 1
             if self._state != "scanning" or self._labeller is None:
                 return
-            number = self._n_instants
-            self._n_instants += 1
             status = self._fault(instant) or self._moved(instant, number)
             if status is not None:
                 self._counts[status] += 1
@@ -618,7 +640,9 @@ class LiveSession:
                 return
             is_next = self._next_pass is not None and number >= self._next_pass
             if is_next or not self._passes or self._has_turned(pose):
-                self._passes.append(_Pass(pose))
+                # a pass begins with what was asked for, though its first images were not placed
+                start = self._next_pass if is_next and self._next_pass is not None else number
+                self._passes.append(_Pass(pose, start))
                 self._next_pass = None if is_next else self._next_pass
             for camera, (found, cloud) in enumerate(zip(one.profiles, clouds, strict=True)):
                 seen = found.labelled.status == PointStatus.MEASURED
@@ -629,8 +653,8 @@ class LiveSession:
             self._range_mm = float(np.median(depth)) if len(depth) else None
             self._counts[LiveStatus.PLACED] += 1
             self._version += 1
-            start = instant.t_ns or max(one.t_host_ns for one in instant.frames if one)
-            self._latencies.append((time.monotonic_ns() - start) / 1e6)
+            taken_ns = instant.t_ns or max(one.t_host_ns for one in instant.frames if one)
+            self._latencies.append((time.monotonic_ns() - taken_ns) / 1e6)
         self._told = ""
         if self._keep_cloud is not None:
             try:

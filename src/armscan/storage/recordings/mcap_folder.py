@@ -182,8 +182,10 @@ class RecordedTables:
 
     def _take_back(self, event: dict[str, Any]) -> None:
         if event["kind"] == TAKEN_BACK:
-            since = int(event["facts"]["since"])
-            kept = [k for k, row in enumerate(self.exposures) if int(row["index"]) < since]
+            # files of before had no end: all that came so far
+            facts = {"until": 2**63, **event["facts"]}
+            gone = range(int(facts["since"]), int(facts["until"]))
+            kept = [k for k, row in enumerate(self.exposures) if int(row["index"]) not in gone]
             self.exposures = [self.exposures[k] for k in kept]
             self.times = [self.times[k] for k in kept]
 

@@ -55,10 +55,11 @@ from armscan.storage.recordings.mcap_folder import (
 
 CHUNK_BYTES = 4 << 20
 """Of images in one chunk: reading one exposure unpacks no more than this and one image."""
-CHUNK_SECONDS = 0.5
+CHUNK_SECONDS = 0.4
 """After so long a chunk is closed and handed to the system; a killed process loses no more."""
-PACKING_SECONDS = 0.3
-"""A chunk is written as it is when no processor had time to pack it for so long."""
+PACKED_WITHIN_SECONDS = 0.5
+"""A chunk is written as it is when its first message came so long ago and it is not packed: with
+what writing takes, a killed process loses nothing that is older than a second."""
 NICENESS = 10
 """Of the packing thread: a scan is measured with nine tenths of a core that both want."""
 DOCUMENTS_SECONDS, MOST_REPEATED_BYTES = 5.0, 1 << 16
@@ -123,6 +124,7 @@ class _Message:
     n_exposures: int = 0
     number: int | None = None
     """Of an exposure: what its image and its facts have in common."""
+    since: float = field(default_factory=time.monotonic)
 
     @property
     def n_bytes(self) -> int:
@@ -140,6 +142,8 @@ class _Chunk:
     times: list[int] = field(default_factory=list)
     index: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     n_exposures: int = 0
+    since: float = math.inf
+    """When the first of its messages came."""
 
     def add(self, message: _Message, sequence: int, declared: Sequence[bytes]) -> None:
         if message.channel not in self.index:
@@ -155,14 +159,18 @@ class _Chunk:
         self.n_bytes += 9 + length
         self.times.append(time_ns)
         self.n_exposures += message.n_exposures
+        self.since = min(self.since, message.since)
+
+    @property
+    def is_late(self) -> bool:
+        return time.monotonic() > self.since + PACKED_WITHIN_SECONDS
 
 
 @dataclass(frozen=True, slots=True)
 class _Closed:
-    """A chunk that waits to be written: since when, and how it is packed; None to write it raw."""
+    """A chunk that waits to be written, and how it is packed; None to write it raw."""
 
     chunk: _Chunk
-    since: float
     packed: Future[list[bytes]] | None
 
 
@@ -470,14 +478,15 @@ class RecordingWriter:
 
     def _next_look(self, begun: float) -> float:
         """When something is to be done though no message came."""
-        waits = [one.since + PACKING_SECONDS for one in self._closed]
+        waits = [one.chunk.since + PACKED_WITHIN_SECONDS for one in self._closed]
         return min([begun + CHUNK_SECONDS, *waits[:1]])
 
     def _add(self, chunks: dict[str, _Chunk], message: _Message) -> None:
         if message.kind == "tables" and time.monotonic() > self._documented + DOCUMENTS_SECONDS:
             self._documented = time.monotonic()
             for document in self._documents:
-                self._add(chunks, replace(document, t_ns=message.t_ns))
+                again = replace(document, t_ns=message.t_ns, since=message.since)
+                self._add(chunks, again)
         sequence = self._sequence[message.channel] if message.number is None else message.number
         self._sequence[message.channel] += 1
         chunks[message.kind].add(message, sequence, self._declared[message.channel])
@@ -521,10 +530,10 @@ class RecordingWriter:
         chunk, chunks[kind] = chunks[kind], _Chunk()
         if not chunk.n_bytes:
             return
-        is_packing = self._is_packing()
+        is_packing = self._is_packing(chunk)
         packed = self._packing.submit(_packed, chunk) if is_packing else None
         with self._ready:
-            self._closed.append(_Closed(chunk, time.monotonic(), packed))
+            self._closed.append(_Closed(chunk, packed))
             self._queued_bytes += chunk.n_bytes
 
     def _write_closed(self, *, is_last: bool) -> None:
@@ -532,7 +541,7 @@ class RecordingWriter:
         while self._closed:
             one, packed = self._closed[0], self._closed[0].packed
             if packed is not None and not packed.done() and not self._must_pack:
-                is_late = is_last or time.monotonic() > one.since + PACKING_SECONDS
+                is_late = is_last or one.chunk.is_late
                 if not is_late and 2 * self._queued_bytes < self._options.queue_bytes:
                     return
                 packed.cancel()
@@ -587,10 +596,11 @@ class RecordingWriter:
         chosen = self._options.compression
         return chosen == "zstd" or (self._options.is_stripe_band and chosen != "raw")
 
-    def _is_packing(self) -> bool:
+    def _is_packing(self, chunk: _Chunk) -> bool:
         if self._must_pack or self._options.compression == "raw":
             return self._must_pack
-        return (os.cpu_count() or 1) > 1 and 2 * self._queued_bytes < self._options.queue_bytes
+        is_behind = chunk.is_late or 2 * self._queued_bytes >= self._options.queue_bytes
+        return (os.cpu_count() or 1) > 1 and not is_behind
 
     def _write(self, pieces: Sequence[bytes]) -> None:
         """Write pieces that belong together; the file's size counts them when all are written."""

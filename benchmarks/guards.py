@@ -185,17 +185,35 @@ def _judged_camera(made: Instrument, fit: CameraFit) -> Said:
 # --- light sheets
 
 
+def bent(board: BoardStripes, sigmas: float) -> BoardStripes:
+    """The board with a stripe that its own form curves, by so many of the stripe's sigmas."""
+    profile = board.profile
+    away = profile.points_px - profile.points_px.mean(axis=0)
+    along = away @ np.linalg.svd(away, full_matrices=False)[2][0]
+    curve = 1.5 * (along / np.abs(along).max()) ** 2 - 0.5
+    shift = (sigmas * profile.sigma_px * curve)[:, None] * profile.normals_px
+    return replace(board, profile=replace(profile, points_px=profile.points_px + shift))
+
+
 def faulty_boards(
     boards: list[BoardStripes], k: int, fault: str, lasers: Sequence[str], field_mm: float
 ) -> list[BoardStripes]:
     """Boards with a fault in board k."""
     one = boards[k]
-    if fault == "board moved by 1 % of the field":
-        pose = one.sensor_from_board.value
-        shift = np.array([0.0, 0.0, 0.01 * field_mm])
+    if fault in ("board moved by 1 % of the field", "board off by 15 of its sigmas"):
+        pose, known = one.sensor_from_board.value, one.sensor_from_board.covariance[3:, 3:]
+        normal = pose.rotation[:, 2]
+        shift = 15.0 * float(np.sqrt(normal @ known @ normal)) * normal
+        if "field" in fault:
+            shift = np.array([0.0, 0.0, 0.01 * field_mm])
         away = Pose(pose.rotation, pose.translation_mm + shift)
         moved = replace(one.sensor_from_board, value=away)
         return [*boards[:k], replace(one, sensor_from_board=moved), *boards[k + 1 :]]
+    if fault == "boards bent by 10 stripe sigmas":
+        rng = np.random.default_rng(len(boards))
+        bend = dict.fromkeys(board.place for board in boards)
+        size = {place: 10.0 * float(rng.standard_normal()) for place in bend}
+        return [bent(board, size[board.place]) for board in boards]
     if fault == "stripe of another board":
         other = next(b for b in boards if b.lasers == one.lasers and b.place != one.place)
         profile = replace(other.profile, source=one.profile.source)
@@ -209,8 +227,8 @@ def faulty_boards(
 
 
 SHEET_FAULTS = (
-    "board moved by 1 % of the field", "stripe of another board", "wrong laser's label",
-    "one board",
+    "board moved by 1 % of the field", "board off by 15 of its sigmas", "stripe of another board",
+    "wrong laser's label", "boards bent by 10 stripe sigmas", "one board",
 )  # fmt: skip
 
 
@@ -236,7 +254,9 @@ def sheet_case(seed: int) -> Case | None:
         reasons = sheet_reasons(fit)
         left_out = tuple(f"{one.source}: {one.reason}" for one in fit.skipped)
         of_sheets = tuple(text for sheet in fit.sheets for text in sheet.warnings)
-        warnings = (*fit.warnings, *of_sheets, *left_out)
+        decisions = [sheet.diagnostics.bow_decision for sheet in fit.sheets]
+        kept = tuple(text for text in decisions if text.startswith("a bow does better"))
+        warnings = (*fit.warnings, *of_sheets, *left_out, *kept)
         if reasons:
             return Said("; ".join(reasons), warnings)
         return Said("", warnings, _is_wrong(fit))
@@ -244,9 +264,9 @@ def sheet_case(seed: int) -> Case | None:
     def _is_wrong(fit: LaserFit) -> bool:
         return judge_sheets(made, fit, information, seen, lines, 1, 0.0).result != "right"
 
-    return Case(
-        calibrate, dict.fromkeys(SHEET_FAULTS[:3], (boards[k].profile.source, boards[k].place))
-    )
+    of_board = (boards[k].profile.source, f"board {boards[k].place}")
+    names = dict.fromkeys(SHEET_FAULTS[:4], of_board)
+    return Case(calibrate, {**names, SHEET_FAULTS[4]: ("times larger", "times as much")})
 
 
 # --- hand-eyes
@@ -297,6 +317,15 @@ def faulty_scan(
         plate = replace(plate, plane=Plane(plate.plane.point_mm, plate.plane.axes @ turn.T))
     elif fault == "sensor's points 2 % too large":
         stripes = [replace(s, points_mm=1.02 * s.points_mm) for s in stripes]
+    elif fault == "one exposure of another surface":
+        rng = np.random.default_rng(k)
+        lost = {s.source for s in stripes if s.posture == names[k]}
+        stripes = [
+            replace(s, points_mm=s.points_mm + rng.normal(0.0, 5.0, s.points_mm.shape))
+            if s.source in lost
+            else s
+            for s in stripes
+        ]
     elif fault == "four postures":
         stripes = [s for s in stripes if s.posture in names[:4]]
     elif fault == "arm that does not turn":
@@ -307,6 +336,7 @@ def faulty_scan(
 
 HAND_EYE_FAULTS = (
     "one pose off by 10 arm", "plate bumped half way by 10 arm", "two poses exchanged",
+    "one exposure of another surface",
     "poses off by one", "left-handed poses", "poses in metres", "poses inverted",
     "plate probed 10 arm off", "plate tilted by 1 deg", "sensor's points 2 % too large",
     "four postures", "arm that does not turn",
@@ -330,7 +360,7 @@ def hand_eye_case(seed: int) -> Case:
         is_wrong = is_beyond(quadratic(error, stated.covariance), 6)
         return Said("", fit.warnings, is_wrong)
 
-    of_posture = dict.fromkeys(HAND_EYE_FAULTS[:3], scan[0][k].posture)
+    of_posture = dict.fromkeys(HAND_EYE_FAULTS[:4], (scan[0][k].posture, scan[0][k].source))
     words = {
         "poses off by one": "of the one", "left-handed poses": "left-handed",
         "poses in metres": "metres", "poses inverted": "tool_from_base",

@@ -75,6 +75,10 @@ def camera_information(made: Instrument, seen: Sequence[SeenPoints], n_shared: i
     return total + _boards(made, seen, n_shared, n_shared + 2 * m)
 
 
+N_TERMS = 8
+"""Of a light: plane and bow."""
+
+
 def bound(information: FloatArray, n: int) -> FloatArray:
     """(n, n) smallest covariance of the first n unknowns."""
     scale = 1.0 / np.sqrt(np.diag(information))
@@ -89,16 +93,13 @@ def sheet_information(
     seen: Sequence[SeenPoints],
     lines: Sequence[SeenLine],
     n_shared: int,
-    *,
-    is_bowed: Sequence[bool],
 ) -> FloatArray:
     """Information on cameras, target points and the shape of each light.
 
-    ``cameras`` is that of `camera_information`; the lights' parameters (`light_terms`) follow.
+    ``cameras`` is that of `camera_information`; `N_TERMS` parameters of each light (`light_terms`)
+    follow.
     """
-    counts = [8 if bowed else 3 for bowed in is_bowed]
-    first = len(cameras) + np.concatenate([[0], np.cumsum(counts)])
-    size = int(first[-1])
+    size = len(cameras) + N_TERMS * len(made.lights)
     total = np.zeros((size, size))
     total[: len(cameras), : len(cameras)] = cameras
     places = {id(view.place): view.place for view in seen}
@@ -107,7 +108,8 @@ def sheet_information(
         rows = [_view_rows(made, view, n_shared, size) for view in views]
         for line in lines:
             if id(line.place) == key:
-                of = slice(int(first[line.light]), int(first[line.light + 1]))
+                first = len(cameras) + N_TERMS * line.light
+                of = slice(first, first + N_TERMS)
                 rows.append(_line_rows(made, line, n_shared, size, of))
         total += _eliminated(rows)
     return total

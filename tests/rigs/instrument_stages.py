@@ -18,15 +18,18 @@ from armscan.calibration.sheets.board_points import HeadCameras, place_board
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, SheetFit
 from armscan.calibration.sheets.result import reasons_to_refuse as sheet_reasons
+from armscan.calibration.sheets.solve import BOW_SHARES, LIKELY_BOW
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
+from armscan.models.light_sheet import BOW_TERMS
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.cameras import camera_calibration
 from armscan.vision.targets.target import TargetView
 from rigs.instrument_bounds import (
+    N_TERMS,
     SeenLine,
     SeenPoints,
     bound,
@@ -60,7 +63,7 @@ class Outcome:
 
     ``result`` is right, silently wrong, rightly refused, wrongly refused or not reached; ``chi2``
     the joint normalised error over ``freedom`` parameters; ``over_bound`` the stated standard
-    deviations over the Cramer-Rao bound.
+    deviations over the Cramer-Rao bound, ``over_likely`` over that of planes that may be bowed.
     """
 
     stage: str
@@ -70,6 +73,7 @@ class Outcome:
     freedom: int = 0
     groups: dict[str, float] = field(default_factory=dict)
     over_bound: float = float("nan")
+    over_likely: float = float("nan")
     warnings: tuple[str, ...] = ()
     seconds: float = 0.0
 
@@ -383,20 +387,23 @@ def judge_sheets(
     bowed = [False] * len(made.lights)
     for sheet, name in zip(fit.sheets, names, strict=True):
         bowed[name] = sheet.sheet.is_bowed
-    whole = sheet_information(made, information, seen, lines, n_shared, is_bowed=bowed)
-    size, kept = len(information), [k for k in range(len(made.lights)) if k in names]
-    first = size + np.concatenate([[0], np.cumsum([8 if one else 3 for one in bowed])])
-    used = np.concatenate([np.arange(size)] + [np.arange(first[k], first[k + 1]) for k in kept])
-    best = bound(whole[np.ix_(used, used)][::-1, ::-1], len(used) - size)[::-1, ::-1]
-    widths = [8 if bowed[k] else 3 for k in kept]
-    at = dict(zip(kept, np.cumsum([0, *widths[:-1]]).tolist(), strict=True))
+    whole = sheet_information(made, information, seen, lines, n_shared)
+    first = len(information)
+    best = _light_bounds(whole, first, {k: N_TERMS if bowed[k] else 3 for k in names})
+    likely = _likely_bows(made, fit, names)
+    for k, precision in likely.items():
+        bow = first + N_TERMS * k + np.arange(3, N_TERMS)
+        whole[bow, bow] += precision
+    widths = {k: N_TERMS if bowed[k] or k in likely else 3 for k in names}
+    best_likely = _light_bounds(whole, first, widths)
     squares, freedom, is_wrong = 0.0, 0, False
     ratios: list[float] = []
+    over_likely: list[float] = []
     groups: dict[str, float] = {}
     for sheet, k in zip(fit.sheets, names, strict=True):
         points = points_of_light(made, lines, k)
         # A plane that was kept states what it may be bowed by; the bound is that of a plane.
-        n, width = 8 if sheet.covariance[3, 3] > 0.0 else 3, 8 if bowed[k] else 3
+        n = 8 if sheet.covariance[3, 3] > 0.0 else 3
         error, rest = sheet_error(sheet, points, n)
         one = judged(
             "sheet", error, sheet.covariance[:n, :n], {"plane": (0, 1, 2), "bow": (3, 4, 5, 6, 7)}
@@ -408,11 +415,12 @@ def judge_sheets(
         is_plane = not (light.cone or light.skew or sheet.sheet.is_bowed)
         # A true plane, kept as one, has no error in what a bow might be.
         squares, freedom = squares + one.chi2, freedom + (3 if is_plane else n)
-        own = best[at[k] : at[k] + width, at[k] : at[k] + width]
-        terms = light_terms(made, made.lights[k], points, width)
         _, _, by = sheet.sheet.height_with_jacobian(points)
         stated = np.einsum("ni,ij,nj->n", by[:, :n], sheet.covariance[:n, :n], by[:, :n]).mean()
-        ratios.append(np.sqrt(stated / np.einsum("ni,ij,nj->n", terms, own, terms).mean()))
+        for found, bounds in ((ratios, best), (over_likely, best_likely)):
+            terms = light_terms(made, made.lights[k], points, len(bounds[k]))
+            least = np.einsum("ni,ij,nj->n", terms, bounds[k], terms).mean()
+            found.append(float(np.sqrt(stated / least)))
         groups["shape left over sigma"] = max(
             groups.get("shape left over sigma", 0.0), rest / float(np.sqrt(stated))
         )
@@ -427,9 +435,40 @@ def judge_sheets(
         freedom,
         groups,
         float(np.median(ratios)),
+        float(np.median(over_likely)),
         warnings,
         seconds,
     )
+
+
+def _light_bounds(whole: FloatArray, first: int, widths: dict[int, int]) -> dict[int, FloatArray]:
+    """(W, W) bound of the first W terms of each light, whose terms start at ``first``."""
+    own = {k: first + N_TERMS * k + np.arange(n) for k, n in sorted(widths.items())}
+    used = np.concatenate([np.arange(first), *own.values()])
+    # `bound` is of the first unknowns.
+    best = bound(whole[np.ix_(used, used)][::-1, ::-1], len(used) - first)[::-1, ::-1]
+    ends = np.cumsum([len(rows) for rows in own.values()])
+    return {
+        k: best[end - len(rows) : end, end - len(rows) : end]
+        for (k, rows), end in zip(own.items(), ends, strict=True)
+    }
+
+
+def _likely_bows(made: Instrument, fit: LaserFit, names: Sequence[int]) -> dict[int, FloatArray]:
+    """(5,) precision of the bow's terms of each light kept as a plane that states a bow."""
+    half = 0.5 * made.field_mm
+    degrees = np.array([sum(term) for term in BOW_TERMS])
+    return {
+        k: (
+            LIKELY_BOW
+            * BOW_SHARES
+            * sheet.sheet.scale_mm
+            * (half / sheet.sheet.scale_mm) ** degrees
+        )
+        ** -2.0
+        for sheet, k in zip(fit.sheets, names, strict=True)
+        if not sheet.sheet.is_bowed and sheet.covariance[3, 3] > 0.0
+    }
 
 
 def points_of_light(made: Instrument, lines: Sequence[SeenLine], k: int) -> FloatArray:

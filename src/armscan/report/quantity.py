@@ -225,7 +225,7 @@ def significant(value: float, unit: str = "", digits: int = 3) -> str:
 
 
 def sentence(text: str) -> str:
-    """Text with a capital at its start and a full stop at its end.
+    """Text with a capital at its start and a full stop, or its question mark, at its end.
 
     A first word with a dot, digit or the like inside is a name, of a file or a coefficient, and
     stays as it is.
@@ -234,7 +234,7 @@ def sentence(text: str) -> str:
         return ""
     first = text.split(maxsplit=1)[0].rstrip(".,:;").replace("-", "").replace("'", "")
     start = text[:1].upper() if first.isalpha() else text[:1]
-    return f"{start}{text[1:].rstrip('.')}."
+    return f"{start}{text[1:].rstrip('.')}{'' if text.endswith('?') else '.'}"
 
 
 def sentences(texts: Iterable[str]) -> tuple[str, ...]:

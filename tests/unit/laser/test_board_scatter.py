@@ -18,6 +18,7 @@ from armscan.calibration.sheets.solve import (
     stack_observations,
 )
 from armscan.calibration.sheets.voting import observe_boards
+from armscan.geometry.poses import Pose
 from armscan.models.light_sheet import LightSheet
 from rigs.sheet_rig import SheetRig, placed, thesis_rig
 
@@ -142,3 +143,41 @@ def test_a_stripe_of_which_nothing_is_left_has_no_say() -> None:
     found = board_scatter(few, flat, errors, noise)
     assert np.isfinite(found.log_likelihood)
     assert found == board_scatter(without, flat, errors, noise)
+
+
+def moved(board: BoardStripes, sigmas: float) -> BoardStripes:
+    """The same board in a place that is wrong by so many of its own sigmas, along its normal."""
+    pose = board.sensor_from_board
+    normal = pose.value.rotation[:, 2]
+    away_mm = sigmas * np.sqrt(normal @ pose.covariance[3:, 3:] @ normal) * normal
+    place = Pose(pose.value.rotation, pose.value.translation_mm + away_mm)
+    return replace(board, sensor_from_board=replace(pose, value=place))
+
+
+@pytest.mark.parametrize("sigmas", [10.0, 30.0])
+def test_a_board_in_the_wrong_place_hardly_moves_the_sheet_and_does_not_discredit_the_others(
+    sigmas: float,
+) -> None:
+    """As if it had been left out: half a sigma of the sheet, as well known, and it is named.
+
+    Charged to all boards alike it moves the sheet by 3 to 4 (12) of the sigmas that are right
+    without it, and these become twice (six times) as large.
+    """
+    rig = rig_of_many()
+    for seed in SEEDS[:3]:
+        boards = list(rig.boards(rig.camera, np.random.default_rng(seed)))
+        calibration = rig.calibration(rig.camera)
+        boards[1] = moved(boards[1], sigmas)
+        fit = calibrate_sheets(boards, calibration)
+        left_out = calibrate_sheets(boards[:1] + boards[2:], calibration)
+        assert isinstance(fit, LaserFit) and isinstance(left_out, LaserFit)
+        one, other = fit.sheets[0], left_out.sheets[0]
+        assert one.calibration.n_boards == other.calibration.n_boards + 1
+        assert not any("times as much as their targets" in warning for warning in fit.warnings)
+        told = [w for w in fit.warnings if "lies elsewhere than its target says" in w]
+        assert len(told) == 1 and boards[1].profile.source in told[0]
+        apart_mm = (other.sheet.origin_mm - one.sheet.origin_mm) @ one.sheet.axes[2]
+        turned = one.sheet.axes[:2] @ other.sheet.axes[2]
+        assert abs(apart_mm) < 0.5 * other.offset_sigma_mm
+        assert np.degrees(np.abs(turned)).max() < 0.5 * other.tilt_sigma_deg
+        assert one.tilt_sigma_deg == pytest.approx(other.tilt_sigma_deg, rel=0.3)

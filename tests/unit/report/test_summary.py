@@ -59,6 +59,7 @@ def test_sentences() -> None:
     assert sentence("all is well") == "All is well."
     assert sentence("Done.") == "Done."
     assert sentence("") == ""
+    assert sentence("is it the same board?") == "Is it the same board?"
     assert sentence("well-known") == "Well-known."
 
 

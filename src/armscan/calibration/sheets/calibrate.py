@@ -16,7 +16,11 @@ from armscan.calibration.sheets.board_points import (
     HeadCameras,
     find_bow,
 )
-from armscan.calibration.sheets.checks import check_points, estimate_shapes_mm
+from armscan.calibration.sheets.checks import (
+    check_points,
+    estimate_shapes_mm,
+    find_outlier_view,
+)
 from armscan.calibration.sheets.coplanarity import (
     CommonPlane,
     fit_common_plane,
@@ -29,7 +33,6 @@ from armscan.calibration.sheets.model import (
     SheetModel,
     choose_model,
     compare_planes,
-    find_outlier_view,
     scatter_by_stripe,
     sheet_geometry,
     start_sheet,
@@ -72,6 +75,9 @@ from armscan.models.two_views import StereoCalibration
 OUTLIER_ROUNDS = 4
 NOTED_FACTOR = 1.5
 """Scatter of boards over its claim from which on it is told."""
+STRAY_FACTOR = 2.5
+"""Scatter of a board over that of the others from which on it is named: it then has less than a
+sixth of their weight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,8 +244,9 @@ class _Case:
 
     @property
     def _errors(self) -> CommonErrors:
-        """Of boards that scatter as those of the worst sheet do."""
-        return self.errors.with_boards(max(model.board_factor for model in self.models))
+        """Of boards each of which errs as the sheet says that it makes err most."""
+        factors = np.max([model.board_factors for model in self.models], axis=0)
+        return self.errors.with_boards(factors)
 
     def solved(self) -> LaserFit | FitFailure | _Refused:
         """Solve all sheets together and put the result into words and numbers.
@@ -318,11 +325,27 @@ class _Case:
                     "targets' points say: they may be bent, or the camera's lens is not as "
                     "calibrated"
                 )
+            strays = self._strays(model)
+            if strays:
+                warnings.append(
+                    f"sheet {name}: {', '.join(strays)}: the board lies elsewhere than its target "
+                    "says, far beyond the others' scatter, and counts for little: was it found "
+                    "rightly, and is it flat? leave it out if not"
+                )
         if not self.cameras.has_covariance:
             warnings.append(
                 "the camera came without covariance: the sheets' sigmas leave its errors out"
             )
         return tuple(warnings)
+
+    def _strays(self, model: SheetModel) -> list[str]:
+        """Images, the first of each placement, of boards that scatter more than the others."""
+        boards = board_numbers(self.images)
+        return [
+            self.images[boards.index(board)].data.profile.source
+            for board, factor in enumerate(model.board_factors)
+            if factor > STRAY_FACTOR * model.board_factor
+        ]
 
     def _sheet_fit(
         self,

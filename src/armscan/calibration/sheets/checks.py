@@ -13,21 +13,30 @@ What a sheet's model leaves of its shape shows in the same place of the sheet on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from armscan.calibration.sheets.board_points import HeadCameras, intersect_sheet_of
-from armscan.calibration.sheets.result import BoardDistances, BoardPointCheck, SheetPointCheck
+from armscan.calibration.sheets.model import StripeNoise, lack_of_fit, stripe_noise
+from armscan.calibration.sheets.result import (
+    LACK_OF_FIT_P,
+    BoardDistances,
+    BoardPointCheck,
+    SheetPointCheck,
+)
 from armscan.calibration.sheets.solve import (
     N_SHEET,
+    CommonErrors,
     NormalSolution,
     SheetObservations,
     SheetSolution,
+    solve_sheets,
 )
 from armscan.calibration.sheets.stripes_on_board import BoardImage
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet
 
 FEWEST_OTHERS = 2
@@ -200,6 +209,48 @@ class _Claim:
         total = noise + (by_camera**2).sum(axis=1) + (by_board**2).sum(axis=1)
         total = total + ((by_sheet @ covariance - lever) * by_sheet).sum(axis=1)
         return np.asarray(np.maximum(total, 0.0))
+
+
+FEWEST_BOARDS = 4
+"""For an outlier among them: with fewer, two are left of which each explains the other."""
+
+
+def find_outlier_view(
+    observations: SheetObservations, sheet: LightSheet, errors: CommonErrors
+) -> int | None:
+    """Number of an image without whose board a plane explains all others, or None.
+
+    ``observations`` are points of one sheet that a plane does not explain; fits start at ``sheet``.
+    """
+    alone = observations.as_one_sheet()
+    boards = np.unique(alone.board)
+    if len(boards) < FEWEST_BOARDS:
+        return None
+    noise = stripe_noise(alone, alone.residuals_px([sheet])[1])
+    whole = solve_sheets(alone, [sheet], errors, [False], sigma_factor=noise.sigma_factor)
+    if isinstance(whole, FitFailure):
+        return None
+    p_values = [_probability_without(int(board), alone, whole, noise) for board in boards]
+    best = int(np.argmax(p_values))
+    if p_values[best] < LACK_OF_FIT_P:
+        return None
+    return int(alone.image[alone.board == boards[best]][0])
+
+
+def _probability_without(
+    board: int, observations: SheetObservations, whole: SheetSolution, noise: StripeNoise
+) -> float:
+    """Of the lack of fit of all other boards, by one step from the plane of all."""
+    normal = whole.system.solve(whole.weight, 0, without_board=board)
+    if normal is None:
+        return 0.0
+    rest = observations.board != board
+    remaining = (whole.system.residual_px + whole.system.times(normal.step))[rest]
+    common = normal.step[normal.n_sheet :]
+    chi2 = float((whole.weight[rest] * remaining**2).sum() + common @ common)
+    share = replace(noise, degrees_of_freedom=noise.degrees_of_freedom * float(rest.mean()))
+    n_stripes = len(np.unique(observations.stripe[rest]))
+    return lack_of_fit(chi2, n_stripes, whole.n_parameters, share).p_value
 
 
 CELLS = 12

@@ -50,10 +50,11 @@ LEAST_POINTS = 8
 """With fewer points left of it a stripe has no shape."""
 FACTORS = np.geomspace(1.0, 100.0, 81)
 """Scatter of the boards that is tried, in steps of 6 %."""
+STRAY_SHARE = 0.1
+"""Boards that stray: rare enough to leave boards alone that scatter alike (their scatter rises by
+a few hundredths), common enough that one of few may."""
 FORMS_PX = np.append(0.0, np.geomspace(0.01, 10.0, 37))
 """Form of the boards that is tried, in steps of 21 %."""
-FEWEST_BOARDS = 4
-"""For an outlier among them: with fewer, two are left of which each explains the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,13 +176,15 @@ class BoardScatter:
     """Likeliest scatter of the boards under a model of the sheet.
 
     ``factor``, at least 1, is the standard deviations of the boards' poses over what is claimed for
-    them, by the offsets and slopes of the stripes. ``log_likelihood`` is that of the stripes'
-    shapes, curvature included, up to a constant that all models share: of poses that scatter, and
-    of what each board's own form, or the lens where it stands, adds to every shape term. A pose
-    does not curve a stripe, and a bend is not a pose that is known a hundred times worse.
+    them, by the offsets and slopes of the stripes; ``of_boards`` (M,) those of each board by the
+    mean of its weight, larger for boards that stray. ``log_likelihood`` is that of the stripes' shapes, curvature included, up
+    to a constant that all models share: of poses that scatter, and of what each board's own form,
+    or the lens where it stands, adds to every shape term. A pose does not curve a stripe, and a
+    bend is not a pose that is known a hundred times worse.
     """
 
     factor: float
+    of_boards: tuple[float, ...]
     log_likelihood: float
 
 
@@ -193,6 +196,9 @@ def board_scatter(
 ) -> BoardScatter:
     """Estimate by restricted likelihood how much the boards of one sheet scatter.
 
+    Boards scatter alike, but for one in ten (`STRAY_SHARE`), which strays by an unknown factor
+    more: seen in part, bent or found wrongly, it would make all others look badly known.
+
     ``solution`` is a model fitted to the sheet's points with the cameras free, ``errors`` the
     claimed covariance of boards and cameras, ``noise`` that of the points along the stripes.
     """
@@ -202,25 +208,46 @@ def board_scatter(
     moved = solution.common[len(solution.common) - errors.n_camera :]
     residual = residual + by_camera @ (errors.camera_root @ moved)
     stripes = [of for of in observations.each_stripe() if of.sum() >= LEAST_POINTS]
-    n = BOARD_SHAPES * len(stripes)
+    n, n_boards = BOARD_SHAPES * len(stripes), len(errors.pose_roots)
     lost = np.sqrt(n / max(n - solution.n_parameters, 1.0))
-    log_likelihood = np.zeros((len(FORMS_PX), len(FACTORS)))
-    of_poses = np.zeros(len(FACTORS))
+    of_shapes = np.zeros((n_boards, len(FORMS_PX), len(FACTORS)))
+    of_poses = np.zeros((n_boards, 1, len(FACTORS)))
     for of in stripes:
         stripe = observations.select(of)
+        board = int(stripe.board[0])
         design = _course(stripe, BOARD_SHAPES - 1)
         weighted = design / (stripe.sigma_px * noise.sigma_factor)[:, None] ** 2
         covariance = np.asarray(np.linalg.inv(weighted.T @ design), dtype=np.float64)
         gain = covariance @ weighted.T
-        root = errors.pose_roots[int(stripe.board[0])]
+        root = errors.pose_roots[board]
         terms, follow = gain @ (lost * residual[of]), gain @ by_pose[of] @ root
-        log_likelihood += _log_likelihood(terms, covariance, follow, FORMS_PX)
+        of_shapes[board] += _log_likelihood(terms, covariance, follow, FORMS_PX)
         by_a_pose = slice(0, POSE_SHAPES)
-        of_poses += _log_likelihood(
+        of_poses[board] += _log_likelihood(
             terms[by_a_pose], covariance[by_a_pose, by_a_pose], follow[by_a_pose], np.zeros(1)
-        )[0]
-    factor = float(FACTORS[int(np.argmax(of_poses))])
-    return BoardScatter(factor, float(log_likelihood.max()))
+        )
+    common = int(np.argmax(_with_strays(of_poses).sum(axis=(0, 1))))
+    shapes = _with_strays(of_shapes).sum(axis=0)
+    own = _own_factors(of_poses[:, 0], common)
+    return BoardScatter(float(FACTORS[common]), own, float(shapes.max()))
+
+
+def _with_strays(log_likelihood: FloatArray) -> FloatArray:
+    """(M, R, F) of each board, for every common factor, if it scatters so or strays."""
+    backwards = np.logaddexp.accumulate(log_likelihood[..., ::-1], axis=-1)[..., ::-1]
+    strays = backwards - np.log(np.arange(len(FACTORS), 0, -1))
+    alike = log_likelihood + np.log1p(-STRAY_SHARE)
+    return np.asarray(np.logaddexp(alike, strays + np.log(STRAY_SHARE)))
+
+
+def _own_factors(log_likelihood: FloatArray, common: int) -> tuple[float, ...]:
+    """(M,) by the mean weight of each board, of its likelihood (M, F) and the common factor."""
+    factors, tail = FACTORS[common:], log_likelihood[:, common:]
+    prior = np.full(len(factors), STRAY_SHARE / len(factors))
+    prior[0] += 1.0 - STRAY_SHARE
+    share = prior * np.exp(tail - tail.max(axis=1, keepdims=True))
+    weight = (share / factors**2).sum(axis=1) / share.sum(axis=1)
+    return tuple(float(one) for one in 1.0 / np.sqrt(weight))
 
 
 def _log_likelihood(
@@ -234,44 +261,6 @@ def _log_likelihood(
     return np.asarray(-0.5 * (log_determinant + solved[..., 0] @ terms))
 
 
-def find_outlier_view(
-    observations: SheetObservations, sheet: LightSheet, errors: CommonErrors
-) -> int | None:
-    """Number of an image without whose board a plane explains all others, or None.
-
-    ``observations`` are points of one sheet that a plane does not explain; fits start at ``sheet``.
-    """
-    alone = observations.as_one_sheet()
-    boards = np.unique(alone.board)
-    if len(boards) < FEWEST_BOARDS:
-        return None
-    noise = stripe_noise(alone, alone.residuals_px([sheet])[1])
-    whole = solve_sheets(alone, [sheet], errors, [False], sigma_factor=noise.sigma_factor)
-    if isinstance(whole, FitFailure):
-        return None
-    p_values = [_probability_without(int(board), alone, whole, noise) for board in boards]
-    best = int(np.argmax(p_values))
-    if p_values[best] < LACK_OF_FIT_P:
-        return None
-    return int(alone.image[alone.board == boards[best]][0])
-
-
-def _probability_without(
-    board: int, observations: SheetObservations, whole: SheetSolution, noise: StripeNoise
-) -> float:
-    """Of the lack of fit of all other boards, by one step from the plane of all."""
-    normal = whole.system.solve(whole.weight, 0, without_board=board)
-    if normal is None:
-        return 0.0
-    rest = observations.board != board
-    remaining = (whole.system.residual_px + whole.system.times(normal.step))[rest]
-    common = normal.step[normal.n_sheet :]
-    chi2 = float((whole.weight[rest] * remaining**2).sum() + common @ common)
-    share = replace(noise, degrees_of_freedom=noise.degrees_of_freedom * float(rest.mean()))
-    n_stripes = len(np.unique(observations.stripe[rest]))
-    return lack_of_fit(chi2, n_stripes, whole.n_parameters, share).p_value
-
-
 MIN_BOARDS_FOR_BOW = 4
 """Fewest boards from which a bow is told from the boards' own errors: three boards' two heights
 each leave three numbers beside a plane, and a bow has five."""
@@ -281,6 +270,9 @@ NO_SPARE = 2
 """Boards of which two straight stripes fix a plane but for one height."""
 MOST_OF_TWO = 5.0
 """Largest scatter that is charged to them; more is a board in the wrong place, and told as such."""
+SCATTER_ROUNDS = 12
+SCATTER_SETTLED = 0.06
+"""A step of the factors that are tried."""
 MAX_RAISES = 10
 FAN_ROUNDS = 5
 FAN_SETTLED = 1e-3
@@ -301,7 +293,7 @@ class SheetModel:
 
     ``decision`` tells why there is a bow, or none. In the joint fit the stripes' sigmas are
     multiplied by ``sigma_factor`` (their noise, its correlation, and what the model leaves
-    unexplained), those of the boards' poses by ``board_factor``.
+    unexplained), those of each board's pose by its own of ``board_factors`` (M,).
     """
 
     sheet: LightSheet
@@ -311,7 +303,12 @@ class SheetModel:
     final_test: FTest
     decision: str
     sigma_factor: float
-    board_factor: float = 1.0
+    board_factors: tuple[float, ...]
+
+    @property
+    def board_factor(self) -> float:
+        """What is common to all boards: of the one that strays least."""
+        return min(self.board_factors)
 
 
 def sheet_geometry(
@@ -388,7 +385,10 @@ def choose_model(
     if isinstance(flat, FitFailure):
         return flat
     plane_test = data.lack_of_fit(flat, noise)
-    model = SheetModel(flat.sheets[0], False, noise, plane_test, plane_test, "", noise.sigma_factor)
+    as_claimed = (1.0,) * len(errors.pose_roots)
+    model = SheetModel(
+        flat.sheets[0], False, noise, plane_test, plane_test, "", noise.sigma_factor, as_claimed
+    )
     n_boards = len(np.unique(observations.board))
     test = f"lack of fit F {plane_test.f_ratio:.2f}, p {plane_test.p_value:.2g}"
     if plane_test.p_value >= LACK_OF_FIT_P:
@@ -405,7 +405,8 @@ def choose_model(
         return data.charged_to_stripes(model)
     # One height is left over, and no test of it has power: its likeliest cause is taken.
     scatter = data.board_scatter(flat, noise)
-    return data.charged_to_boards(model, min(scatter.factor, MOST_OF_TWO))
+    factor = min(scatter.factor, MOST_OF_TWO)
+    return data.charged_to_boards(model, (factor,) * len(as_claimed))
 
 
 def _bow_or_boards(
@@ -417,7 +418,7 @@ def _bow_or_boards(
     boards = data.board_scatter(flat, noise)
 
     def plane(decision: str) -> SheetModel | FitFailure:
-        return data.charged_to_boards(replace(plane_model, decision=decision), boards.factor)
+        return data.charged_to_boards(replace(plane_model, decision=decision), boards.of_boards)
 
     if not is_bow_allowed:
         return plane(f"a plane was asked for, and does not explain the stripes ({test})")
@@ -442,12 +443,12 @@ def _bow_or_boards(
         f"bow fitted: the plane does not explain the stripes ({test}), the bow does better "
         f"({likelihood})"
     )
-    model = SheetModel(
-        bowed.sheets[0], True, noise, plane_test, final, decision, noise.sigma_factor
+    model = replace(
+        plane_model, sheet=bowed.sheets[0], is_bowed=True, final_test=final, decision=decision
     )
     if final.p_value >= LACK_OF_FIT_P:
         return model
-    charged = data.charged_to_boards(model, boards_bowed.factor)
+    charged = data.charged_to_boards(model, boards_bowed.of_boards)
     if isinstance(charged, FitFailure):
         return plane(f"a bow does better than a plane ({likelihood}), but {charged.reason}")
     return charged
@@ -516,25 +517,43 @@ class _OneSheet:
         )
         return np.asarray(np.clip(fan, -MAX_FAN, MAX_FAN))
 
-    def charged_to_boards(self, model: SheetModel, board_factor: float) -> SheetModel | FitFailure:
-        """Charge to the boards what they scatter, and to the stripes what is then left."""
-        wider = _OneSheet(self.points, self.errors.with_boards(board_factor))
-        solution = wider.solve(model.sheet, model.noise.sigma_factor, is_bowed=model.is_bowed)
-        if isinstance(solution, FitFailure):
-            return solution
-        if not solution.has_converged:
-            return FitFailure(
-                f"with boards that err {board_factor:.1f} times as much as their targets say the "
-                "sheet's shape did not settle",
-                "take more boards, farther apart, and check their poses",
+    def charged_to_boards(
+        self, model: SheetModel, factors: tuple[float, ...]
+    ) -> SheetModel | FitFailure:
+        """Charge to the boards what they scatter, and to the stripes what is then left.
+
+        In rounds: the less boards that stray pull at the sheet, the clearer it shows which do. What
+        is common to all boards does not rise in them: with the poses freer to follow, the boards'
+        form would show as scatter, and that is charged to the stripes.
+        """
+        for _ in range(SCATTER_ROUNDS):
+            wider = _OneSheet(self.points, self.errors.with_boards(factors))
+            solution = wider.solve(model.sheet, model.noise.sigma_factor, is_bowed=model.is_bowed)
+            if isinstance(solution, FitFailure):
+                return solution
+            if not solution.has_converged:
+                return FitFailure(
+                    f"with boards that err {min(factors):.1f} times as much as their targets say "
+                    "the sheet's shape did not settle",
+                    "take more boards, farther apart, and check their poses",
+                )
+            final = wider.lack_of_fit(solution, model.noise)
+            model = replace(model, final_test=final, sigma_factor=model.noise.sigma_factor)
+            charged = wider.charged_to_stripes(
+                replace(model, sheet=solution.sheets[0], board_factors=factors)
             )
-        model = replace(
-            model,
-            sheet=solution.sheets[0],
-            final_test=wider.lack_of_fit(solution, model.noise),
-            board_factor=board_factor,
-        )
-        return wider.charged_to_stripes(model)
+            if isinstance(charged, FitFailure) or len(np.unique(self.points.board)) <= NO_SPARE:
+                return charged
+            model = charged
+            solution = wider.solve(model.sheet, model.sigma_factor, is_bowed=model.is_bowed)
+            if isinstance(solution, FitFailure):
+                return solution
+            found = np.array(self.board_scatter(solution, model.noise).of_boards)
+            found *= min(1.0, min(factors) / found.min())
+            if np.allclose(np.log(found), np.log(factors), rtol=0.0, atol=SCATTER_SETTLED):
+                break
+            factors = tuple(found.tolist())
+        return model
 
     def charged_to_stripes(self, model: SheetModel) -> SheetModel | FitFailure:
         """Raise the stripes' sigmas until the model fits, if it did not.

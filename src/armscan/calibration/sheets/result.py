@@ -441,6 +441,7 @@ def reasons_to_refuse(fit: LaserFit) -> tuple[str, ...]:
             others = " if the sheet rests on the other boards" if math.isfinite(alone) else ""
             found.append(
                 f"sheet {sheet.name}: points on a board lie {rms_mm:.3g} mm (rms) off it{others}, "
-                f"{100.0 * miss:.1f} % of the depth: {100.0 * LARGEST_MISS:.0f} % is the limit"
+                f"{100.0 * miss:.1f} % of the depth: {100.0 * LARGEST_MISS:.0f} % is the limit (is "
+                "the camera's calibration that of these photographs, its focus and zoom unmoved?)"
             )
     return tuple(found)

@@ -178,9 +178,10 @@ class CommonErrors:
         covariances = [image.placed.covariance for image in firsts]
         return CommonErrors(covariances, images[0].camera_covariance)
 
-    def with_boards(self, factor: float) -> CommonErrors:
-        """The same with the boards' standard deviations multiplied."""
-        return replace(self, pose_covariances=[factor**2 * one for one in self.pose_covariances])
+    def with_boards(self, factors: FloatArray | Sequence[float]) -> CommonErrors:
+        """The same with the standard deviations of each board multiplied by its own factor."""
+        pairs = zip(factors, self.pose_covariances, strict=True)
+        return replace(self, pose_covariances=[factor**2 * one for factor, one in pairs])
 
     @property
     def n_camera(self) -> int:

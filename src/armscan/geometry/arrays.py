@@ -67,8 +67,9 @@ def frozen_floats(
     if allow_nan or allow_infinite:
         bad = np.isinf(array) if allow_nan else np.isnan(array)
     if bad.any():
+        n = int(bad.sum())
         raise InputError(
-            f"{name} holds {int(bad.sum())} values that are not finite",
+            f"{name} holds {n} value{'s that are' if n > 1 else ' that is'} not finite",
             remedy="remove or mask these entries",
         )
     return array

@@ -23,7 +23,7 @@ def test_wrong_shapes_are_named(shape: tuple[int | None, ...]) -> None:
 
 
 def test_nan_and_infinity() -> None:
-    with pytest.raises(InputError, match="1 values that are not finite"):
+    with pytest.raises(InputError, match="holds 1 value that is not finite"):
         frozen_floats([1.0, np.nan], (2,), "x")
     assert np.isnan(frozen_floats([1.0, np.nan], (2,), "x", allow_nan=True)[1])
     with pytest.raises(InputError, match="not finite"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from armscan.inspection.recipe import (
     follow_recipe,
     placed_cloud,
 )
+from armscan.report.inspection.recipe import _nearness
 from armscan.storage.parts.recipes import (
     PartResult,
     part_result_bytes,
@@ -130,6 +132,15 @@ def test_a_result_comes_back_as_it_was_written(tmp_path: Path) -> None:
     again = read_part_result(path)
     assert part_result_bytes(again) == part_result_bytes(result)
     assert math.isnan(again.row.quantities[0].value)
+
+
+def test_faces_that_were_not_judged_come_last_in_the_trend() -> None:
+    """Two strays lie ten times the tolerance off a face that the scan does not show."""
+    stray = replace(quantity("not seen", "mean"), name="a", value=0.5, nominal=0.0)
+    judged = replace(quantity("pass", "mean"), name="b", value=0.01, nominal=0.0)
+    rows = (PartRow("1", "1.ply", (stray, judged)), PartRow("2", "2.ply", (judged,)))
+    found = sorted("abc", key=lambda name: -_nearness(rows, name))
+    assert found == ["b", "a", "c"]
 
 
 def test_a_table_has_a_row_a_part_though_one_has_no_quantities() -> None:

@@ -283,7 +283,19 @@ def measured(
     """Distances of a cloud's points, or of some rows, where a pose puts them."""
     chosen = slice(None) if rows is None else rows
     towards = None if cloud.normals is None else pose.rotate(cloud.normals[chosen])
-    return surface.distance(pose.apply(cloud.points_mm[chosen]), towards=towards)
+    sight = None if towards is None else sight_of(cloud, pose, rows)
+    return surface.distance(pose.apply(cloud.points_mm[chosen]), towards=towards, sight=sight)
+
+
+def sight_of(
+    cloud: PointCloud, pose: Pose[Cad, Part], rows: IntArray | None = None
+) -> FloatArray | None:
+    """(M, 3) unit directions in Cad to where points, or rows, were seen from; None if unknown."""
+    if cloud.seen_from_mm is None or cloud.is_fused:
+        return None
+    chosen = slice(None) if rows is None else rows
+    way = pose.rotate(cloud.seen_from_mm[cloud.exposure[chosen]] - cloud.points_mm[chosen])
+    return np.asarray(way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12))
 
 
 def _foreign(surface: PartSurface, cloud: PointCloud, best: PoseCandidate) -> FitFailure | None:

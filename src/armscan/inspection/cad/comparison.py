@@ -22,7 +22,7 @@ from armscan.geometry.arrays import (
     ints,
 )
 from armscan.geometry.estimate import FitFailure
-from armscan.inspection.cad.alignment import Alignment, measured
+from armscan.inspection.cad.alignment import Alignment, measured, sight_of
 from armscan.inspection.cad.distance import PartSurface, SurfaceDistance
 from armscan.inspection.cad.point_errors import PointErrors, scatter_of_means
 from armscan.inspection.conformity import COVERAGE, judge
@@ -51,6 +51,8 @@ LEAST_SPOT_POINTS = 10
 ALONG_FACE = 0.98
 """Cosine between a deviation and the normal of its face, below which the closest point is on an
 edge: the facets of a round face are up to 10 degrees apart, and the point may be of either face."""
+MOST_BEYOND = 0.5
+"""Part of the points that may lie beyond the reach: the best fit, too, rests on most points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,16 +273,20 @@ def compare_with_part(
     Returns
     -------
     FitFailure
-        If no point lies near the model.
+        If fewer than half of the points lie near the model.
     """
     part = surface.part
     found = measured(surface, cloud, alignment.cad_from_part)
     near = np.abs(found.signed_mm) <= options.reach_mm
     rows = np.flatnonzero(near)
-    if len(rows) == 0:
+    if len(rows) < (1.0 - MOST_BEYOND) * len(cloud):
+        share = f"only {100 * len(rows) / len(cloud):.0f} % of the" if len(rows) else "no"
+        lead = "leave --align none out, " if alignment.method == "none" else ""
         return FitFailure(
-            f"no point of the cloud lies within {options.reach_mm:g} mm of the model",
-            "leave --align none out, or give a larger --reach-mm",
+            f"the cloud does not lie on the model: {share} points come within "
+            f"{options.reach_mm:g} mm of it",
+            f"{lead}give the model of this part, cut table and fixtures away with --region, or "
+            "give a larger --reach-mm",
         )
     placed = alignment.cad_from_part.apply(cloud.points_mm)
     normals, d = found.normals, found.signed_mm
@@ -394,13 +400,10 @@ def _seen_from_behind(
 
     They are of the face beyond the edge: a stripe along a rim, half of which falls beside it.
     """
-    if cloud.seen_from_mm is None or cloud.is_fused or not surface.is_closed:
+    sight = sight_of(cloud, alignment.cad_from_part)
+    if sight is None or not surface.is_closed:
         return np.zeros(len(cloud), dtype=np.bool_)
-    pose = alignment.cad_from_part
-    towards = pose.rotate(cloud.seen_from_mm[cloud.exposure] - cloud.points_mm)
-    length = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
-    normals = surface.part.normals[found.triangle]
-    cosine = np.einsum("ni,ni->n", towards, normals) / length
+    cosine = np.einsum("ni,ni->n", sight, surface.part.normals[found.triangle])
     return np.asarray(cosine < FROM_BEHIND)
 
 

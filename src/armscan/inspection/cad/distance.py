@@ -97,6 +97,7 @@ class PartSurface:
         *,
         reach_mm: float = math.inf,
         towards: FloatArray | None = None,
+        sight: FloatArray | None = None,
     ) -> SurfaceDistance:
         """Distances of points.
 
@@ -111,6 +112,10 @@ class PartSurface:
             surface that looks its way: the two sides of a thin wall are told apart, also where
             the wall is displaced by more than half of its thickness. Where none within reach
             does, the closest surface counts.
+        sight
+            (N, 3) directions to where the points were seen from, or None. With them the closest
+            surface counts also where it could be seen from there, whatever ``towards`` says:
+            normals of a lone stripe on a wall may point to any side.
         """
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         order = neighbour_order(points)
@@ -121,6 +126,8 @@ class PartSurface:
             looks_away = (rows >= 0) & (
                 np.einsum("ij,ij->i", self._normals[rows], towards) < OPPOSITE
             )
+            if sight is not None:
+                looks_away &= np.einsum("ij,ij->i", self._normals[rows], sight) < 0.0
             again = order[looks_away[order]]
             second = self._closest(points, again, np.ascontiguousarray(towards), reach_mm)
             replaced = looks_away & (second[0] >= 0)

@@ -253,13 +253,14 @@ def _described(
     centre, _ = middle_and_radius(pose.apply(cloud.points_mm))
     distance = np.linalg.norm(fit.residuals, axis=1)
     sigma = _sigmas(points, fit, size, is_known=is_known)
+    noun = "markers" if points.is_marker else "points"
     rule = (
-        "from the covariances of the points' places"
+        f"from the covariances of the {noun}' places"
         if is_known
-        else ("from how far the points disagree: no sigma of them is told")
+        else f"from how far the {noun} disagree: no sigma of them is told"
     )
     if points.is_marker:
-        rule += "; what a calibration adds is common to all markers and not in it"
+        rule += "; an error of the calibration moves all markers alike and is not in it"
     return Alignment(
         method="markers" if points.is_marker else "points",
         cad_from_part=pose,

@@ -18,6 +18,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.inspection.cad.alignment import Alignment, DatumUse, held_text
 from armscan.inspection.cad.comparison import (
     DEFINITIONS,
+    LEAST_SPOT_POINTS,
     RULE,
     CadComparison,
     FaceComparison,
@@ -247,10 +248,15 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
             f"{100.0 * beyond:.0f} % of the points lie farther than {found.options.reach_mm:g} mm "
             "from the model and count nowhere; see whether they are of the part"
         )
-    unseen = [one.name for one in found.faces if one.decision == "not seen"]
-    if unseen:
-        named = ", ".join(unseen[:6]) + (" and others" if len(unseen) > 6 else "")
-        texts.append(f"not seen by the scan, so not judged: {named}")
+    unseen = [one for one in found.faces if one.decision == "not seen"]
+    for what, names in (
+        ("without any point, so not judged", [one.name for one in unseen if not one.statistics.n]),
+        (f"with fewer than {LEAST_SPOT_POINTS} points in every spot, so not judged",
+         [f"{one.name} ({one.statistics.n:,} in all)" for one in unseen if one.statistics.n]),
+    ):  # fmt: skip
+        if names:
+            named = ", ".join(names[:6]) + (" and others" if len(names) > 6 else "")
+            texts.append(f"{what}: {named}")
     once = [one.name for one in found.faces if one.is_seen_once]
     if found.is_fused:
         texts.append(

@@ -213,9 +213,9 @@ def _of(row: PartRow, name: str, kinds: Sequence[str]) -> list[PartQuantity]:
 
 
 def _nearness(rows: Sequence[PartRow], name: str) -> float:
-    """How near a face comes to its limits on any part; -1 where no part shows it."""
+    """How near a face comes to its limits on any part; 0 where not judged, -1 where not shown."""
     ratios = [
-        abs(one.deviation) / one.tolerance
+        0.0 if one.decision == "not seen" else abs(one.deviation) / one.tolerance
         for row in rows
         for one in _of(row, name, ("mean", "spot"))
         if math.isfinite(one.value)

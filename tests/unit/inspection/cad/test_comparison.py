@@ -358,3 +358,26 @@ def test_a_stripe_along_a_rim_is_not_of_the_face_that_nobody_saw() -> None:
         found = compare_with_part(surface, cloud, align_none(cloud), CadOptions(), False)
         assert isinstance(found, CadComparison)
         assert found.faces[side].statistics.n == counted
+
+
+def test_a_cloud_that_lies_elsewhere_is_refused_and_table_about_a_part_is_not() -> None:
+    """40 and 60 % of the points are on the part, the rest 30 mm beside it."""
+    beside = top_points(1000) + np.array([90.0, 0.0, 0.0])
+    for share, is_refused in ((0.4, True), (0.6, False)):
+        n = int(1000 * share)
+        cloud = cloud_of(np.concatenate([top_points(n), beside[n:]]), sigma_mm=0.01)
+        found = compare_with_part(BOX, cloud, align_none(cloud), CadOptions(), errors_known=True)
+        assert isinstance(found, FitFailure) == is_refused
+        if isinstance(found, FitFailure):
+            assert "only 40 % of the points come within 2 mm" in found.reason
+            assert "--align none" in found.remedy
+
+
+def test_faces_without_points_and_with_too_few_are_told_apart() -> None:
+    side = [[0.0, 5.0 + k, 10.0] for k in range(5)]
+    found = compared(np.concatenate([top_points(3000), side]), sigma=0.01, tolerance_mm=0.05)
+    few = next(one.name for one in found.faces if one.statistics.n == 5)
+    texts = [text for text in cad_warnings(found, errors_known=True) if "not judged" in text]
+    assert len(texts) == 2
+    assert few not in texts[0]
+    assert f"{few} (5 in all)" in texts[1]

@@ -91,6 +91,22 @@ def test_a_displaced_thin_wall_keeps_its_sides() -> None:
     assert np.allclose(with_normals[100:], 0.8)
     near = surface.distance(points, towards=normals, reach_mm=0.5).signed_mm
     assert np.allclose(near[:100], -0.2)
+    # whoever saw them stood on their side, so that the wrong one was out of sight
+    seen = surface.distance(points, towards=normals, sight=normals).signed_mm
+    assert np.allclose(seen, with_normals)
+
+
+def test_a_wrong_normal_takes_no_point_off_a_face_that_was_in_sight() -> None:
+    """One stripe runs along the foot of a wall, and its normals point into the wall."""
+    surface = PartSurface(part_of(box_corners([0, 0, 0.0], [50, 30, 20.0]), source="block"))
+    points = np.column_stack([np.full(50, 50.01), np.linspace(5, 25, 50), np.full(50, 2.0)])
+    normals = np.tile([-0.96, -0.18, -0.21], (50, 1))
+    sight = np.tile([0.21, -0.07, 0.98], (50, 1))
+    misled = surface.distance(points, towards=normals).signed_mm
+    assert np.abs(misled).min() > 1.9
+    found = surface.distance(points, towards=normals, sight=sight)
+    assert np.allclose(found.signed_mm, 0.01)
+    assert np.allclose(found.closest_mm[:, 0], 50.0)
 
 
 def test_nothing_beyond_the_reach() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A user without a home and without rights on the installation can still measure."""
+"""How kernels are loaded and kept; a user without a home and without rights can still measure."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import os
 import stat
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from armscan.cli.run import VARIABLE, give_kernels_a_folder
+from armscan.kernels.arrays import load_kernels
 
 
 @pytest.fixture
@@ -98,7 +100,8 @@ def test_two_processes_do_not_compile_the_same_kernel(tmp_path: Path) -> None:
     """Both start with an empty cache; what one compiles, the other waits for and takes."""
     program = (
         "from armscan.kernels import grids\n"
-        "from armscan.kernels.arrays import COMPILED\n"
+        "from armscan.kernels.arrays import COMPILED, load_kernels\n"
+        "load_kernels()\n"
         "print(*COMPILED)"
     )
     environment = {**os.environ, VARIABLE: str(tmp_path)}
@@ -119,3 +122,48 @@ def test_two_processes_do_not_compile_the_same_kernel(tmp_path: Path) -> None:
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
     )
     assert again.stdout.split() == []
+
+
+SOURCE = """
+from __future__ import annotations
+from armscan.kernels.arrays import Floats, compiled
+
+@compiled()
+def total(values: Floats) -> float:
+    return values.sum()
+
+@compiled()
+def mean(values: Floats) -> float:
+    return total(values) / values.size
+
+@compiled()
+def unused(values: Floats) -> float:
+    return values[0]
+"""
+
+
+def test_a_kernel_is_loaded_when_it_is_first_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By Python, or by a kernel that is compiled; of other numbers it is refused at once."""
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
+    source = tmp_path / "kernels_of_a_test.py"
+    source.write_text(SOURCE)
+    spec = importlib.util.spec_from_file_location("kernels_of_a_test", source)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    kernels = (module.total, module.mean, module.unused)
+    assert [len(one.overloads) for one in kernels] == [0, 0, 0]
+    with pytest.raises(TypeError, match="total takes no"):
+        module.total(np.zeros(3, np.float32))
+    given = np.array([1.0, 2.0, 6.0])
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(module.mean, [given] * 8)) == [3.0] * 8
+    given.setflags(write=False)
+    assert module.mean(given) == 3.0
+    assert [len(one.overloads) for one in kernels] == [1, 1, 0]
+    with pytest.raises(TypeError):
+        module.mean(np.zeros((2, 2)))
+    load_kernels()
+    assert len(module.unused.overloads) == 1

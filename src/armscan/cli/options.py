@@ -32,20 +32,32 @@ class DefaultOf(str):
     def __format__(self, spec: str) -> str:
         module, _, place = self.partition(":")
         owner, _, field = place.partition(".")
-        source = cast(ModuleSpec, find_spec(module)).origin
-        text = Path(cast(str, source)).read_text(encoding="utf-8")
-        body = [
-            line
-            for node in ast.parse(text).body
-            if isinstance(node, ast.ClassDef) and node.name == owner
-            for line in node.body
-        ]
-        values = {
-            line.target.id: line.value
-            for line in body
-            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)
-        }
-        return str(ast.literal_eval(cast(ast.expr, values[field])))
+        return str(_written(module, field, owner))
+
+
+def _written(module: str, name: str, owner: str = "") -> object:
+    """The plain value that a name has in the text of a module, or a field in that of a class."""
+    source = cast(ModuleSpec, find_spec(module)).origin
+    body = ast.parse(Path(cast(str, source)).read_text(encoding="utf-8")).body
+    classes = [one for one in body if isinstance(one, ast.ClassDef) and one.name == owner]
+    values = {
+        ast.unparse(target): line.value
+        for line in (classes[0].body if owner else body)
+        if isinstance(line, ast.Assign | ast.AnnAssign)
+        for target in (line.targets if isinstance(line, ast.Assign) else [line.target])
+    }
+    value = values.get(name)
+    if isinstance(value, ast.Name):
+        return _written(module, value.id)
+    if value is not None:
+        return ast.literal_eval(value)
+    imports = {
+        alias.name: str(line.module)
+        for line in body
+        if isinstance(line, ast.ImportFrom)
+        for alias in line.names
+    }
+    return _written(imports[name], name)
 
 
 class Side(StrEnum):

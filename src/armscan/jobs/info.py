@@ -672,12 +672,13 @@ def _compiler_fact(problems: list[str]) -> str:
 
 
 def _compile_kernels(problems: list[str]) -> str:
-    from armscan.kernels.arrays import COMPILED
+    from armscan.kernels.arrays import COMPILED, load_kernels
 
     names = [item.name for item in pkgutil.iter_modules(kernels.__path__)]
     for name in names:
         try:
             importlib.import_module(f"{kernels.__name__}.{name}")
+            load_kernels()
         except Exception as error:
             problems.append(f"kernel module {name} does not compile ({error})")
     seconds = sum(COMPILED.values())

@@ -12,6 +12,8 @@ from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numba import njit, types
+from numba.core.caching import NullCache
+from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
 try:
@@ -101,33 +103,77 @@ def compiled(
     def compile_kernel(kernel: F) -> F:
         named = dict(kernel.__annotations__)
         signature = _TYPES[named.pop("return")](*(_TYPES[name] for name in named.values()))
-
-        def built(*, cache: bool) -> F:
-            found: Any = njit(
-                cache=cache,
-                nogil=True,
-                fastmath=freedoms,
-                error_model=error_model,
-                forceinline=is_inlined,
-            )(kernel)
-            if found is kernel:
-                # compilation is switched off, as for a debugger
-                return kernel
-            start = time.perf_counter()
-            with _alone(found):
-                found.compile(signature)
-            if found.stats.cache_misses or not cache:
-                COMPILED[f"{kernel.__module__}.{kernel.__name__}"] = time.perf_counter() - start
-            found.disable_compile()
-            return cast(F, found)
-
-        try:
-            return built(cache=True)
-        except Exception:
-            # what a killed process or a full disk left of an earlier compilation
-            return built(cache=_forgotten(njit(cache=True)(kernel)))
+        found: Any = njit(
+            cache=True,
+            nogil=True,
+            fastmath=freedoms,
+            error_model=error_model,
+            forceinline=is_inlined,
+        )(kernel)
+        # the same if compilation is switched off, as for a debugger
+        return kernel if found is kernel else cast(F, _on_first_use(found, signature))
 
     return compile_kernel
+
+
+_WAITING: dict[str, Callable[[], Any]] = {}
+"""What loads each kernel that was imported and is not loaded yet."""
+
+
+def load_kernels() -> None:
+    """Load, or compile, all kernels imported so far, for work that must not wait for them later."""
+    for load in list(_WAITING.values()):
+        load()
+
+
+def _on_first_use(kernel: Any, signature: Any) -> Any:
+    """The kernel, which is loaded when Python or a kernel that is compiled first asks for it.
+
+    A command then waits for the kernels that it uses. From the start only the signature is known;
+    numba asks by these two methods, and would else compile for the types of the first arguments.
+    """
+    name = f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
+    template_of = kernel.get_call_template
+
+    def load() -> Any:
+        # numba's lock first: who holds it may come to wait for the file's
+        with global_compiler_lock:
+            if not kernel.overloads:
+                start = time.perf_counter()
+                with _alone(kernel):
+                    _compile(kernel, signature)
+                if kernel.stats.cache_misses:
+                    COMPILED[name] = time.perf_counter() - start
+                kernel.disable_compile()
+            _WAITING.pop(name, None)
+            return kernel.overloads[signature.args].entry_point
+
+    def first_call(*values: Any) -> Any:
+        entry = load()
+        for value, wanted in zip(values, signature.args, strict=True):
+            if kernel.typingctx.can_convert(kernel.typeof_pyval(value), wanted) is None:
+                raise TypeError(f"{name} takes no {kernel.typeof_pyval(value)} as {wanted}")
+        return entry
+
+    def call_template(types_: Any, named: Any) -> Any:
+        load()
+        return template_of(types_, named)
+
+    kernel._compile_for_args, kernel.get_call_template = first_call, call_template
+    _WAITING[name] = load
+    return kernel
+
+
+def _compile(kernel: Any, signature: Any) -> None:
+    try:
+        kernel.compile(signature)
+    except Exception:
+        # what a killed process or a full disk left of an earlier compilation
+        try:
+            kernel._cache.flush()
+        except OSError:
+            kernel._cache = NullCache()
+        kernel.compile(signature)
 
 
 @contextmanager
@@ -149,15 +195,6 @@ def _alone(kernel: Any) -> Iterator[None]:
     finally:
         if handle is not None:
             os.close(handle)
-
-
-def _forgotten(kernel: Any) -> bool:
-    """Empty the cache of one kernel; False if its folder may not be written."""
-    try:
-        kernel._cache.flush()
-    except OSError:
-        return False
-    return True
 
 
 def kernel_folder() -> str:

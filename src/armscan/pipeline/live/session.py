@@ -20,6 +20,7 @@ from armscan.devices.protocols import CameraSettings, Frame
 from armscan.errors import ArmscanError, DeviceError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray, ImageArray, IntArray
 from armscan.geometry.poses import Base, Pose, Tool
+from armscan.kernels.arrays import load_kernels
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.instants import Instant, InstantImages
 from armscan.pipeline.live.acquire import (
@@ -322,6 +323,8 @@ class LiveSession:
         """
         if self._state != "closed":
             raise DeviceError("a session is opened once", remedy="make a new one")
+        # no exposure waits for a loop to be loaded or compiled
+        load_kernels()
         try:
             for control, camera in zip(self._controls, self._rig.cameras, strict=True):
                 with told_as_fault_of(camera.name):

@@ -30,7 +30,7 @@ from armscan.vision.targets.circle_lattice import (
     number_grid,
 )
 from armscan.vision.targets.ellipse import Ellipses, fit_ellipses
-from armscan.vision.targets.saddle import MIN_CONTRAST, RawGrey, grey_channels, to_grey8
+from armscan.vision.targets.saddle import MIN_CONTRAST, grey_channels, to_grey8
 from armscan.vision.targets.target import CircleEdges, CircleGrid, OtherCountSeen, TargetView
 
 ROUNDS = 3

@@ -40,7 +40,7 @@ from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.reconstruction.sync import PoseStatus
 from armscan.records.exposure import SensorWindow
 from armscan.storage.recording import read_recording
-from armscan.storage.recordings import write_mcap
+from armscan.storage.recordings import mcap_file
 from rigs.console_rig import DrawnBench, FailingBench, drawn_scan, waited
 from rigs.scan_fake import scanner
 
@@ -94,7 +94,7 @@ def test_a_pass_taken_back_is_in_neither_cloud_nor_recording(tmp_path: Path) -> 
 
 def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> list[int]:
     """A disk with room for so many bytes; what is in the list is room that came later."""
-    left, write = [room], write_mcap._write_some
+    left, write = [room], mcap_file._write_some
 
     def some(handle, pieces):
         if left[0] <= 0:
@@ -102,7 +102,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> list[int]:
         left[0] -= sum(map(len, pieces))
         return write(handle, pieces)
 
-    monkeypatch.setattr(write_mcap, "_write_some", some)
+    monkeypatch.setattr(mcap_file, "_write_some", some)
     return left
 
 

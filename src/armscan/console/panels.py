@@ -527,6 +527,9 @@ def _live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) -
         if drift is None
         else f"the last pass lies {drift:.3f} mm from the earlier ones (median)",
     ]
+    for k, lines_seen in enumerate(shown.brightness):
+        camera = f"camera {k + 1}" if len(shown.brightness) > 1 else "exposure"
+        lines += [f"{camera}: {'; '.join(one.words for one in lines_seen)}"] if lines_seen else []
     still = shown.counts.get(LiveStatus.STILL, 0)
     lines += [f"{still} dropped while the hand was still"] if still else []
     lost = [

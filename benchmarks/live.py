@@ -2,15 +2,18 @@
 """A live scan of rendered images: recorded, measured and shown; what is lost, late and used.
 
 Command: ``python benchmarks/live.py [--cameras 1|2] [--rate 80] [--seconds 60] [--record-only]
-[--compression auto|raw|zstd] [--folder /dev/shm]``, and with ``--budget --rate 4`` the processor
-time of each part an exposure: recorded as it is, recorded packed, recorded and measured.
+[--compression auto|raw|zstd] [--folder /dev/shm] [--by-time] [--reconstruct]``, and with
+``--budget --rate 4`` the processor time of each part an exposure: recorded as it is, recorded
+packed, recorded and measured.
 
 A process of its own holds rendered images of a plate in memory (2658x800; the thesis's head of one
 line, or of eleven lines before two cameras). At each trigger it copies one a camera into a ring of
 shared memory, as a camera's driver does, and sends a sample of the arm by the documented stream.
 This process drives `LiveSession` on them, records to a file in a temporary folder, and asks for the
 cloud twenty times a second, as a page does. From exposure to screen: until the cloud that holds the
-instant was handed out. Simulated; the arm and all clocks are one computer's.
+instant was handed out. Simulated; the arm and all clocks are one computer's. With ``--by-time``
+exposures are placed by clocks that have to be learned, not by triggers' ids; ``--reconstruct`` also
+reads the recording again and places all of it.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
@@ -43,10 +47,12 @@ from armscan.pipeline.live.recorder import LiveRecorder
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.live.session import LiveSession
 from armscan.pipeline.measure import reconstruct
+from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.pipeline.simulate import TwinName
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.records.recording import CameraSetup
+from armscan.storage.recording import read_recording
 from armscan.storage.recordings.write_mcap import WriterOptions
 from rigs.true_scanner import true_scanner
 
@@ -216,6 +222,14 @@ def warm_up(scanner: ScannerCalibration, place: str) -> None:
     reconstruct(pair[:1], scanner.sensor, rights=pair[1:])
 
 
+def placed_again(path: Path, scanner: ScannerCalibration) -> str:
+    """What becomes of each exposure of the recording when it is read again."""
+    source = read_recording(path)
+    found = measure_scan(source, scanner, ScanOptions(has_normals=False))
+    counts = Counter(one.status.value for one in found.exposures)
+    return f"read again: {dict(counts)} of {len(source.rows)} listed; {source.warnings}"
+
+
 def words(label: str, values: Sequence[float], unit: str) -> str:
     if not values:
         return f"{label}: none"
@@ -240,6 +254,7 @@ def run(given: argparse.Namespace, folder: Path, place: str, shape: tuple[int, .
     cameras: list[Any] = [RingCamera(k, slots, ends[k][0]) for k in range(n_cameras)]
     arm = open_device("arm", f"tcp:127.0.0.1:{ends[0][0].recv()}")
     description = RigDescription(("ring",) * n_cameras, rate_hz=given.rate, is_common_trigger=True)
+    description = replace(description, is_common_trigger=not given.by_time)
     rig = Rig(cameras, arm, None, description)
     path = folder / "scan.mcap"
     recorder = CountingRecorder(
@@ -253,6 +268,9 @@ def run(given: argparse.Namespace, folder: Path, place: str, shape: tuple[int, .
         lambda one: print(one.kind, one.text) if one.kind in ("fault", "warning") else None
     )
     load, cpu, start = os.getloadavg()[0], time.process_time(), time.monotonic()
+    session.open()
+    while given.by_time and not session.is_timed:
+        time.sleep(0.01)
     session.start()
     time.sleep(seconds)
     session.stop()
@@ -281,6 +299,8 @@ def run(given: argparse.Namespace, folder: Path, place: str, shape: tuple[int, .
         f"(pixels {n_sent * np.prod(shape[1:]) / 1e6 / taken_s:.0f} MB/s); "
         f"the recorder waited {end.n_waits} times; whole after {taken_s:.1f} s"
     )
+    if given.reconstruct and scanner is not None:
+        print(placed_again(path, scanner))
     del slots
     path.unlink()
     for camera in cameras:
@@ -296,6 +316,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--record-only", action="store_true")
     parser.add_argument("--compression", default="auto", choices=("auto", "raw", "zstd"))
+    parser.add_argument("--by-time", action="store_true", help="placed by clocks, not by ids")
+    parser.add_argument("--reconstruct", action="store_true", help="place the recording again")
     parser.add_argument("--budget", action="store_true", help="what each part takes, one by one")
     parser.add_argument("--folder", default=None, help="where the recording is made and removed")
     given = parser.parse_args()

@@ -22,8 +22,7 @@ from armscan.cli import (
 )
 from armscan.cli import reconstruct as reconstruct_command
 from armscan.cli.delivery import delivered
-from armscan.cli.live.console import CONSOLE_EXAMPLE, console
-from armscan.cli.live.record import RECORD_EXAMPLE, record
+from armscan.cli.live.rig import CONSOLE_EXAMPLE, RECORD_EXAMPLE, console, record
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}

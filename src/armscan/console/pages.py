@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from html import escape
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -26,13 +26,16 @@ from armscan.console.journey import (
     Journey,
     SeeingSettings,
     StepName,
-    StepResult,
     StepState,
     held_session,
     open_journey,
     sessions_in,
 )
 from armscan.console.panels import (
+    GOOD,
+    TINTS,
+    WORDS,
+    WRONG,
     Controls,
     PointsPanel,
     ScanPanel,
@@ -40,6 +43,7 @@ from armscan.console.panels import (
     TipPanel,
     padded,
     put,
+    result_card,
 )
 from armscan.console.placements import Placement, drawing
 from armscan.console.quality import ModelWatch
@@ -51,24 +55,12 @@ from armscan.console.work import Worker, recover_scans, run_step, seen_in_take
 from armscan.errors import ArmscanError, OutputError
 from armscan.pipeline.progress import ProgressEvent
 from armscan.records.exposure import Exposure
-from armscan.report.drawing import ACCENT, ALERT, INK, LINE, MUTED
+from armscan.report.drawing import ACCENT, ALERT, INK, MUTED
 from armscan.storage.arm import PROBE_FILE
 from armscan.storage.clouds import read_cloud
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.files import read_bytes
 from armscan.storage.formats.ply import parse_ply
-
-GOOD, WRONG = "#3f7d2b", "#b3261e"
-TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": WRONG, "old": "#b07d12"}
-WORDS = {
-    "waiting": "waits",
-    "open": "to do",
-    "ready": "can be calculated",
-    "good": "good",
-    "doubtful": "with remarks",
-    "not good": "not good",
-    "old": "out of date",
-}
 
 
 class ConsolePage:
@@ -281,7 +273,7 @@ class ConsolePage:
 
     def _rest(self) -> None:
         self._is_viewing = self.bench is not None and self.bench.has_operator
-        self.scanning.show_image(None)
+        self.scanning.show_images(())
         if self.bench is not None:
             self.bench.rest()
 
@@ -293,7 +285,7 @@ class ConsolePage:
             if BY_NAME[step].filling == "touches":
                 bench.touch(place, k)
                 return
-            self.scanning.show_image(bench.take(step, place, k))
+            self.scanning.show_images(bench.take(step, place, k))
 
     def take_one(self) -> None:
         """Record the placement or touch that is drawn, and say what is seen in it."""
@@ -319,7 +311,7 @@ class ConsolePage:
         """Remove what this step has taken."""
         self._seen = None
         with self._lock:
-            self.scanning.show_image(None)
+            self.scanning.show_images(())
             self.journey.start_over(self.step, self._scan_of(self.step))
 
     def start_or_pause(self) -> None:
@@ -409,13 +401,13 @@ class ConsolePage:
             )
         return self.bench
 
-    def _look(self) -> Exposure | None:
-        """What a camera sees while something is put before it to be taken."""
+    def _look(self) -> tuple[Exposure, ...]:
+        """What the cameras see while something is put before them to be taken."""
         step = BY_NAME[self.step]
         if self.bench is None or not self._is_viewing or step.filling != "placements":
-            return None
+            return ()
         if self.worker.is_busy or not self._take.visible or not self._lock.acquire(blocking=False):
-            return None
+            return ()
         try:
             return self.bench.look(self.step, self.journey.n_taken(self.step))
         finally:
@@ -548,6 +540,8 @@ class ConsolePage:
     def _instruction(self, state: StepState) -> str:
         step = BY_NAME[self.step]
         body = paragraph(step.to_do)
+        if self.step is StepName.CAMERA and self.journey.settings.n_cameras > 1:
+            body += paragraph("Both cameras must see all of it: look at both images.")
         if state.status == "waiting":
             return body + paragraph(f"{state.why}.", ALERT)
         if step.filling not in ("placements", "touches"):
@@ -618,30 +612,6 @@ class ConsolePage:
             )
         path = self.journey.cloud_file(self.scan)
         return shown_points(read_cloud(path)) if path.is_file() else None
-
-
-def result_card(state: StepState, link: str) -> str:
-    """HTML of what a step's job said."""
-    result = cast(StepResult, state.result)
-    tint = TINTS[state.status if state.status in TINTS else result.verdict]
-    title = WORDS[state.status] if state.status in TINTS else WORDS[result.verdict]
-    rows = "".join(
-        f'<tr><td style="color:{MUTED};padding:2px 8px 2px 0;vertical-align:top">'
-        f'{escape(label.strip())}</td><td style="padding:2px 0;white-space:pre-line">'
-        f"{escape(text)}</td></tr>"
-        for label, text in result.values
-    )
-    reasons = "".join(paragraph(text, INK, 13) for text in result.reasons)
-    old = paragraph(f"{state.why}: calculate again.", ALERT, 13) if state.status == "old" else ""
-    return (
-        f'<div style="border:1px solid {LINE};border-left:5px solid {tint};border-radius:4px;'
-        f'padding:8px 10px;margin:6px 0;color:{INK};font-size:13px">'
-        f'<div style="font-size:15px;font-weight:700;color:{tint}">{title.capitalize()}</div>'
-        f"{old}{reasons}{paragraph('' if old else result.next_step, INK, 13)}"
-        f'<details open><summary style="cursor:pointer;color:{MUTED}">Figures</summary>'
-        f'<table style="font-size:12px;border-collapse:collapse">{rows}</table></details>'
-        f"{link}</div>"
-    )
 
 
 def run_console(

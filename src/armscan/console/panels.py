@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts of the console's column that know no session: buttons with their keys, the points that are
-shown, how lines are seen, and a scan while it runs.
+shown, how lines are seen, a scan while it runs, and the card of a step's result.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from html import escape
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
 import viser
 
-from armscan.console.journey import SeeingSettings
+from armscan.console.journey import SeeingSettings, StepResult, StepState
 from armscan.console.quality import ModelWatch
 from armscan.console.scan import LiveScan
 from armscan.console.scene import (
@@ -36,7 +38,7 @@ from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.live.exposure import ExposureMode, ExposureSettings, LaserTarget
 from armscan.pipeline.live.session import LiveSnapshot, LiveStatus
 from armscan.records.exposure import Exposure
-from armscan.report.drawing import ALERT, INK, MUTED
+from armscan.report.drawing import ALERT, INK, LINE, MUTED
 from armscan.report.quantity import sentence
 from armscan.storage.arm import ProbeTip, probe_tip_toml, read_probe_tip
 from armscan.storage.files import write_files
@@ -50,6 +52,17 @@ MODES: dict[str, ExposureMode] = {
     "as set": "fixed",
     "automatic": "automatic",
     "automatic, glints": "reflective",
+}
+GOOD, WRONG = "#3f7d2b", "#b3261e"
+TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": WRONG, "old": "#b07d12"}
+WORDS = {
+    "waiting": "waits",
+    "open": "to do",
+    "ready": "can be calculated",
+    "good": "good",
+    "doubtful": "with remarks",
+    "not good": "not good",
+    "old": "out of date",
 }
 START_BUTTON, UNDO_BUTTON = "0", "1"
 """Buttons of the arm: start or pause, and take the last pass back."""
@@ -329,7 +342,7 @@ class ScanPanel:
     finish
         What ends a scan.
     look
-        Gives what a camera sees now while no scan runs; None to leave what is shown.
+        Gives what the cameras see now while no scan runs; none to leave what is shown.
     """
 
     def __init__(
@@ -337,7 +350,7 @@ class ScanPanel:
         controls: Controls,
         points: PointsPanel,
         finish: Callable[[], object],
-        look: Callable[[], Exposure | None],
+        look: Callable[[], Sequence[Exposure]],
     ) -> None:
         self.live: LiveScan | None = None
         self._look, self._model = look, cast(ModelWatch | None, None)
@@ -403,7 +416,7 @@ class ScanPanel:
         try:
             live.stop()
         finally:
-            self.show_image(None)
+            self.show_images(())
             self._points.view.show_head(None, None)
         return live.n_recorded
 
@@ -433,12 +446,13 @@ class ScanPanel:
         ):
             handle.visible = is_motion and self.live is not None
 
-    def show_image(self, exposure: Exposure | None) -> None:
-        """Show what a camera sees; None to show no image."""
-        if exposure is not None:
-            self._pictures[0].image = taken_image(exposure)
-        self._window.visible = self._pictures[0].visible = exposure is not None
-        self._pictures[1].visible = False
+    def show_images(self, exposures: Sequence[Exposure]) -> None:
+        """Show what the cameras see, one image each; none to show nothing."""
+        for handle, exposure in zip_longest(self._pictures, exposures[: len(self._pictures)]):
+            if exposure is not None:
+                handle.image = taken_image(exposure)
+            handle.visible = exposure is not None
+        self._window.visible = bool(exposures)
 
     def _label(self, *, is_again: bool = False) -> None:
         if self.live is None:
@@ -452,8 +466,8 @@ class ScanPanel:
             try:
                 if (live := self.live) is not None:
                     self._show(live)
-                elif (seen := self._look()) is not None:
-                    self.show_image(seen)
+                elif seen := self._look():
+                    self.show_images(seen)
             except Exception as error:  # the page goes on showing what it can
                 self._tell(told(error))
 
@@ -527,6 +541,9 @@ def _live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) -
         if drift is None
         else f"the last pass lies {drift:.3f} mm from the earlier ones (median)",
     ]
+    for k, lines_seen in enumerate(shown.brightness):
+        camera = f"camera {k + 1}" if len(shown.brightness) > 1 else "exposure"
+        lines += [f"{camera}: {'; '.join(one.words for one in lines_seen)}"] if lines_seen else []
     still = shown.counts.get(LiveStatus.STILL, 0)
     lines += [f"{still} dropped while the hand was still"] if still else []
     lost = [
@@ -548,6 +565,30 @@ def _live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) -
     return "".join(
         [paragraph(text, ALERT, 14) for text in alerts]
         + [paragraph(line, INK, 13) for line in lines]
+    )
+
+
+def result_card(state: StepState, link: str) -> str:
+    """HTML of what a step's job said."""
+    result = cast(StepResult, state.result)
+    tint = TINTS[state.status if state.status in TINTS else result.verdict]
+    title = WORDS[state.status] if state.status in TINTS else WORDS[result.verdict]
+    rows = "".join(
+        f'<tr><td style="color:{MUTED};padding:2px 8px 2px 0;vertical-align:top">'
+        f'{escape(label.strip())}</td><td style="padding:2px 0;white-space:pre-line">'
+        f"{escape(text)}</td></tr>"
+        for label, text in result.values
+    )
+    reasons = "".join(paragraph(text, INK, 13) for text in result.reasons)
+    old = paragraph(f"{state.why}: calculate again.", ALERT, 13) if state.status == "old" else ""
+    return (
+        f'<div style="border:1px solid {LINE};border-left:5px solid {tint};border-radius:4px;'
+        f'padding:8px 10px;margin:6px 0;color:{INK};font-size:13px">'
+        f'<div style="font-size:15px;font-weight:700;color:{tint}">{title.capitalize()}</div>'
+        f"{old}{reasons}{paragraph('' if old else result.next_step, INK, 13)}"
+        f'<details open><summary style="cursor:pointer;color:{MUTED}">Figures</summary>'
+        f'<table style="font-size:12px;border-collapse:collapse">{rows}</table></details>'
+        f"{link}</div>"
     )
 
 

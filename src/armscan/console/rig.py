@@ -213,7 +213,7 @@ class TwinBench:
         self._n_cameras = len(self.twin.scan("camera").session.cameras)
         self._sources: dict[str, ScanSource] = {}
         self._hand: _Hand | None = None
-        self._shot: tuple[TwinScene, int, Exposure] | None = None
+        self._shots: dict[tuple[TwinScene, int], Exposure] = {}
         self._seen: tuple[StepName, int] | None = None
         self.scan_source(self.scene)
 
@@ -252,7 +252,7 @@ class TwinBench:
             groups.setdefault(row.t_ns if row.view is None else row.view, []).append(k)
         return list(groups.values())
 
-    def take(self, step: StepName, folder: Path, k: int) -> Exposure | None:
+    def take(self, step: StepName, folder: Path, k: int) -> tuple[Exposure, ...]:
         """As of `Bench`."""
         scene = TAKEN_SCENES[step]
         source, views = self.scan_source(scene), self._views(scene)
@@ -261,10 +261,8 @@ class TwinBench:
                 "the simulated operator has shown all placements", remedy="calculate now"
             )
         grown = GrowingRecording.of(folder, _session(source))
-        shown = None
-        for row in views[k]:
-            shot = self._rendered(scene, row)
-            shown = shot if shown is None or shot.lasers else shown
+        shots = [self._rendered(scene, row) for row in views[k]]
+        for row, shot in zip(views[k], shots, strict=True):
             grown.add(source.rows[row], shot)
         if source.arm is not None:
             last = source.rows[views[k][-1]].t_ns
@@ -272,31 +270,31 @@ class TwinBench:
                 if t_ns <= last:
                     grown.add_sample(t_ns, pose, trigger)
         grown.flush()
-        return shown
+        return _one_a_camera(shots)
 
-    def look(self, step: StepName, k: int) -> Exposure | None:
+    def look(self, step: StepName, k: int) -> tuple[Exposure, ...]:
         """As of `Bench`: what the simulated operator holds for the next take."""
         if step not in TAKEN_SCENES or self._seen == (step, k):
-            return None
+            return ()
         self._seen = step, k
         scene = TAKEN_SCENES[step]
         rows, source = self._views(scene), self.scan_source(scene)
         if k >= len(rows):
-            return None
-        lit = [row for row in rows[k] if source.rows[row].lasers]
-        return self._rendered(scene, (lit or rows[k])[0])
+            return ()
+        lit = [row for row in rows[k] if source.rows[row].lasers] or rows[k]
+        first = {source.rows[row].camera: row for row in reversed(lit)}
+        return tuple(self._rendered(scene, first[camera]) for camera in sorted(first))
 
     def rest(self) -> None:
         """As of `Bench`."""
 
     def _rendered(self, scene: TwinScene, row: int) -> Exposure:
-        """An image of a scene; the latest is kept, for it is looked at before it is taken."""
-        kept = self._shot
-        if kept is not None and kept[:2] == (scene, row):
-            return kept[2]
-        shot = self.scan_source(scene).exposure(row)
-        self._shot = scene, row, shot
-        return shot
+        """An image of a scene; the latest are kept: they are looked at, and then taken."""
+        if (scene, row) not in self._shots:
+            if len(self._shots) >= KEPT_SHOTS:
+                self._shots.pop(next(iter(self._shots)))
+            self._shots[scene, row] = self.scan_source(scene).exposure(row)
+        return self._shots[scene, row]
 
     def touch(self, folder: Path, k: int) -> None:
         """As of `Bench`."""
@@ -438,7 +436,7 @@ class DeviceBench:
             needs_latency=not self.rig.description.is_common_trigger,
         )
 
-    def take(self, step: StepName, folder: Path, k: int) -> Exposure | None:
+    def take(self, step: StepName, folder: Path, k: int) -> tuple[Exposure, ...]:
         """As of `Bench`: one image in the light of the room, one of each laser, or both."""
         sources = self._sources
         states: list[tuple[str, ...]] = [()]
@@ -451,7 +449,7 @@ class DeviceBench:
         setups = [camera.setup for camera in self.rig.cameras]
         session = Session("calibration", tuple(setups), is_simulated=self.is_simulated)
         grown = GrowingRecording.of(folder, session)
-        shown = None
+        shots = []
         view = f"{k + 1:02d}"
         for state, instant in zip(states, self._instants(states, step), strict=True):
             t_ns = _later(grown, instant)
@@ -462,11 +460,11 @@ class DeviceBench:
                 row = ExposureRow(index, t_ns, camera, f"images/{index:04d}.png", state, None, view)
                 shot = exposure_of(frame, setups[camera], replace(instant, lasers=state), camera)
                 grown.add(row, shot)
-                shown = shot if shown is None or state else shown
+                shots.append(shot)
             if step is StepName.HAND_EYE:
                 grown.add_sample(t_ns, instant.pose, None)
         grown.flush()
-        return shown
+        return _one_a_camera(shots)
 
     def touch(self, folder: Path, k: int) -> None:
         """As of `Bench`; the tip is that of ``probe.toml`` in the session's folder."""
@@ -488,15 +486,21 @@ class DeviceBench:
         _write_touches(folder, [*before, (t_ns, found[-1].pose, -1)], tip,
                        is_simulated=self.is_simulated)  # fmt: skip
 
-    def look(self, step: StepName, k: int) -> Exposure | None:
-        """As of `Bench`: the latest image of the first camera."""
+    def look(self, step: StepName, k: int) -> tuple[Exposure, ...]:
+        """As of `Bench`: the latest images."""
         latest = self._watch(step)
         self._light(() if step is StepName.CAMERA else self._sources)
         instants = tuple(latest.instants)
-        frames = [one.frames[0] for one in instants if one.frames[0] is not None]
-        if not frames:
-            return None
-        return exposure_of(frames[-1], self.rig.cameras[0].setup, instants[-1])
+        found = {
+            camera: (frame, one)
+            for one in instants
+            for camera, frame in enumerate(one.frames)
+            if frame is not None
+        }
+        return tuple(
+            exposure_of(frame, self.rig.cameras[camera].setup, one, camera)
+            for camera, (frame, one) in sorted(found.items())
+        )
 
     @property
     def seeing(self) -> SeeingSettings:
@@ -619,6 +623,17 @@ def take_back(step: StepName, folder: Path) -> None:
         _write_touches(folder, left, read_probe_tip(folder / PROBE_FILE), is_simulated=is_simulated)
     else:
         (folder / ARM_FILE).unlink()
+
+
+KEPT_SHOTS = 2
+"""One of each camera that a head may have."""
+
+
+def _one_a_camera(shots: Sequence[Exposure]) -> tuple[Exposure, ...]:
+    """Of each camera the last image with a laser, or the last one."""
+    lit = [shot for shot in shots if shot.lasers] or shots
+    last = {shot.camera: shot for shot in lit}
+    return tuple(last[camera] for camera in sorted(last))
 
 
 def _later(grown: GrowingRecording, instant: MatchedInstant) -> int:

@@ -174,8 +174,8 @@ class Bench(Protocol):
     def n_placements(self) -> dict[StepName, int]:
         """Placements or touches of a step, where the rig knows them better than the list."""
 
-    def take(self, step: StepName, folder: Path, k: int) -> Exposure | None:
-        """Record placement ``k`` of a step into a folder; returns an image to show.
+    def take(self, step: StepName, folder: Path, k: int) -> tuple[Exposure, ...]:
+        """Record placement ``k`` of a step into a folder; returns an image of each camera to show.
 
         Raises
         ------
@@ -186,8 +186,8 @@ class Bench(Protocol):
     def touch(self, folder: Path, k: int) -> None:
         """Record touch ``k``; raises as `take`."""
 
-    def look(self, step: StepName, k: int) -> Exposure | None:
-        """What a camera sees now, before placement ``k`` is taken; None if there is nothing new.
+    def look(self, step: StepName, k: int) -> tuple[Exposure, ...]:
+        """What each camera sees now, before placement ``k`` is taken; none if nothing is new.
 
         The lasers that the step is about are on meanwhile, until `rest`.
 

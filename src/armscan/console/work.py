@@ -297,7 +297,8 @@ def recover_scans(folder: Path, progress: Progress = silent) -> tuple[str, ...]:
             continue
         whole.replace(path)
         n = next(one.value for one in found.quantities if one.key == "exposures")
-        said.append(f"{path.stem} was cut short: its {n} exposures were saved.")
+        saved = "its one exposure was" if n == 1 else f"its {n} exposures were"
+        said.append(f"{path.stem} was cut short: {saved} saved.")
     return tuple(said)
 
 

@@ -74,10 +74,15 @@ def check_camera(
     with closing(open_camera()) as camera:
         rule = _Rules(camera.name)
         _check_settings(camera, rule)
+
+        def begun() -> list[Frame]:
+            camera.start(trigger)
+            frames = _frames(camera, n_frames, timeout_s, rule)
+            _check_frames(frames, camera, rule)
+            return frames
+
         _check_silence(camera, rule)
-        camera.start(trigger)
-        first = _frames(camera, n_frames, timeout_s, rule)
-        _check_frames(first, camera, rule)
+        first = begun()
         copies = [np.array(frame.image) for frame in first]
         later = _frames(camera, n_frames, timeout_s, rule)
         _check_frames([*first, *later], camera, rule)
@@ -87,17 +92,7 @@ def check_camera(
             ),
             "the image of a frame changed after it was delivered: copy it out of the buffer",
         )
-        camera.stop()
-        _check_stopped(camera, rule)
-        since_ns = time.monotonic_ns()
-        camera.start(trigger)
-        anew = _frames(camera, n_frames, timeout_s, rule)
-        _check_frames(anew, camera, rule)
-        _check_new(anew, since_ns, rule)
-        if is_exclusive:
-            _check_taken(open_camera, rule)
-        camera.close()
-        _check_closed(camera, rule)
+        _check_end(camera, begun, open_camera if is_exclusive else None, rule)
     with closing(open_camera()) as camera:
         camera.start(trigger)
         _frames(camera, 1, timeout_s, rule)
@@ -117,21 +112,16 @@ def check_arm(
             arm.pose_form in ("quaternion", "matrix", "euler", "joints"),
             f"pose_form is '{arm.pose_form}'",
         )
+
+        def begun() -> list[ArmSample]:
+            arm.start()
+            samples = _elements(arm, n_samples, timeout_s, rule)
+            _check_samples(samples, arm, rule)
+            return samples
+
         _check_silence(arm, rule)
-        arm.start()
-        samples = _elements(arm, n_samples, timeout_s, rule)
-        _check_samples(samples, arm, rule)
-        arm.stop()
-        _check_stopped(arm, rule)
-        since_ns = time.monotonic_ns()
-        arm.start()
-        anew = _elements(arm, n_samples, timeout_s, rule)
-        _check_samples(anew, arm, rule)
-        _check_new(anew, since_ns, rule)
-        if is_exclusive:
-            _check_taken(open_arm, rule)
-        arm.close()
-        _check_closed(arm, rule)
+        begun()
+        _check_end(arm, begun, open_arm if is_exclusive else None, rule)
     with closing(open_arm()) as arm:
         arm.start()
         _elements(arm, 1, timeout_s, rule)
@@ -168,10 +158,15 @@ def check_lasers(
         if can_switch:
             _check_refusals(lasers, rule)
             lasers.set_schedule(steps)
-        lasers.start(rate_hz)
         n = 2 * len(steps) + 1
-        events = _elements(lasers, n, timeout_s, rule)
-        _check_events(events, lasers, rule)
+
+        def begun() -> list[LaserEvent]:
+            lasers.start(rate_hz)
+            events = _elements(lasers, n, timeout_s, rule)
+            _check_events(events, lasers, rule)
+            return events
+
+        events = begun()
         if can_switch:
             _check_schedule(events, steps, rate_hz, rule)
             lasers.set_next((sources[0],))
@@ -180,17 +175,7 @@ def check_lasers(
                 last.lasers == (sources[0],),
                 f"after set_next(('{sources[0]}',)) {last.lasers} were on",
             )
-        lasers.stop()
-        _check_stopped(lasers, rule)
-        since_ns = time.monotonic_ns()
-        lasers.start(rate_hz)
-        anew = _elements(lasers, 3, timeout_s, rule)
-        _check_events(anew, lasers, rule)
-        _check_new(anew, since_ns, rule)
-        if is_exclusive:
-            _check_taken(open_lasers, rule)
-        lasers.close()
-        _check_closed(lasers, rule)
+        _check_end(lasers, begun, open_lasers if is_exclusive else None, rule)
     with closing(open_lasers()) as lasers:
         rule(lasers.sources == sources, "sources differ when it is opened again")
 
@@ -250,6 +235,23 @@ def _check_stopped(device: Any, rule: _Rules) -> None:
     while device.read(_QUIET_S) and time.monotonic() < end_s:
         """Taken before."""
     _check_silence(device, rule)
+
+
+def _check_end(
+    device: Any,
+    begun: Callable[[], Sequence[Any]],
+    open_again: Callable[[], Any] | None,
+    rule: _Rules,
+) -> None:
+    """Stop, begin anew and close; where ``open_again`` is given it must fail meanwhile."""
+    device.stop()
+    _check_stopped(device, rule)
+    since_ns = time.monotonic_ns()
+    _check_new(begun(), since_ns, rule)
+    if open_again is not None:
+        _check_taken(open_again, rule)
+    device.close()
+    _check_closed(device, rule)
 
 
 def _check_new(came: Sequence[Any], since_ns: int, rule: _Rules) -> None:

@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from html import unescape
@@ -79,6 +83,47 @@ def test_a_closed_console_ends_its_scan_and_the_next_one_goes_on_there(tmp_path:
         waited(lambda: "scan-02 was cut short" in text_of(page))
         assert f"its {n} exposures were saved" in text_of(page)
         assert page.journey.scans == ("scan-01", "scan-02")
+
+
+SCANNING = """
+import sys, time
+from pathlib import Path
+from armscan.console.journey import StepName
+from unit.console.test_page import begin_scan, opened
+from rigs.console_rig import FailingBench
+
+def main():
+    with opened(Path(sys.argv[1]), FailingBench(n=4000)) as page:
+        begin_scan(page)
+        while True:
+            print(page.live.n_recorded, time.monotonic(), flush=True)
+            time.sleep(0.02)
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+def test_a_console_that_is_killed_while_it_scans_leaves_a_whole_session(tmp_path: Path) -> None:
+    folder, script = tmp_path / "s", tmp_path / "scanning.py"
+    put_scanner(folder)
+    script.write_text(SCANNING)
+    command = [sys.executable, str(script), str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(2.0)
+        process.kill()
+        killed = time.monotonic()
+        said = [line.split() for line in process.stdout.read().splitlines()]
+    due = [int(line[0]) for line in said if len(line) == 2 and float(line[1]) < killed - 1.0]
+    # the lock of the dead one keeps nobody out
+    with opened(folder, None) as page:
+        waited(lambda: "scan-01 was cut short" in text_of(page))
+        rows = read_recording(page.journey.recording(StepName.SCAN, "scan-01")).rows
+        assert [row.index for row in rows] == list(range(len(rows)))
+        assert len(rows) >= due[-1] > 0
+        assert page.journey.state(StepName.SCAN, "scan-01").status == "ready"
 
 
 def test_settings_hold_for_the_session_and_a_wrong_one_is_a_sentence(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.reconstruction.sync import PoseStatus
 from armscan.records.exposure import SensorWindow
 from armscan.storage.recording import read_recording
-from armscan.storage.recordings import write_mcap
+from armscan.storage.recordings import mcap_file
 from rigs.console_rig import DrawnBench, FailingBench, drawn_scan, waited
 from rigs.scan_fake import scanner
 
@@ -94,7 +94,7 @@ def test_a_pass_taken_back_is_in_neither_cloud_nor_recording(tmp_path: Path) -> 
 
 def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> list[int]:
     """A disk with room for so many bytes; what is in the list is room that came later."""
-    left, write = [room], write_mcap._write_some
+    left, write = [room], mcap_file._write_some
 
     def some(handle, pieces):
         if left[0] <= 0:
@@ -102,7 +102,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> list[int]:
         left[0] -= sum(map(len, pieces))
         return write(handle, pieces)
 
-    monkeypatch.setattr(write_mcap, "_write_some", some)
+    monkeypatch.setattr(mcap_file, "_write_some", some)
     return left
 
 
@@ -157,11 +157,11 @@ def test_devices_are_taken_from_one_placement_at_a_time(tmp_path: Path) -> None:
     )
     bench = DeviceBench(rig, "rig.toml")
     for k in range(2):
-        assert bench.take(StepName.HAND_EYE, tmp_path / "r", k) is not None
+        assert len(bench.take(StepName.HAND_EYE, tmp_path / "r", k)) == 1
     found = read_recording(tmp_path / "r")
     assert [row.view for row in found.rows] == ["01", "01", "02", "02"]
     assert found.arm.is_known.all() and len(found.arm.t_ns) == 4
-    assert bench.look(StepName.HAND_EYE, 2) is not None
+    assert len(bench.look(StepName.HAND_EYE, 2)) == 1
     # what was taken last is taken back, and the next take goes on from there
     take_back(StepName.HAND_EYE, tmp_path / "r")
     found = read_recording(tmp_path / "r")
@@ -281,7 +281,7 @@ def test_windows_and_exposures_are_those_of_the_scan_while_it_runs(tmp_path: Pat
     )
     bench.see(seeing)
     camera = bench.cameras[0]
-    assert bench.take(StepName.CAMERA, tmp_path / "photo", 0) is not None
+    assert len(bench.take(StepName.CAMERA, tmp_path / "photo", 0)) == 1
     # photographs show the whole sensor, in the light of the room
     assert camera.settings.size_px == (320, 240) and camera.settings.exposure_us == 9000.0
     live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01.mcap", scanner(), seeing)

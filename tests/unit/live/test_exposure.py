@@ -17,6 +17,7 @@ from armscan.pipeline.live.exposure import (
     ExposureControl,
     ExposureSettings,
     LaserTarget,
+    deciding_level,
     line_levels,
     wanted_factor,
 )
@@ -98,6 +99,19 @@ def test_the_line_becomes_as_bright_as_asked_for(start_us: float, target: float)
     assert camera.n_set == n_set
 
 
+def test_what_the_control_sees_is_told_for_each_choice_of_lasers() -> None:
+    camera = Camera({"A": 0.25, "B": 0.0}, 650.0)
+    control = ExposureControl(camera, ExposureSettings("automatic"), lambda _: None)
+    for laser in ("A", "B"):
+        assert control.adjust(camera.frame(laser), (laser,)) is None
+    lit_line, dark = control.brightness
+    assert lit_line.level == pytest.approx((0.25 * 650.0 + GROUND) / 255, abs=0.01)
+    assert (dark.level, dark.target, dark.exposure_us) == (None, 0.7, 650.0)
+    assert (lit_line.lasers, dark.lasers) == (("A",), ("B",))
+    assert lit_line.words == "A: 650 us, line at 68%, 70% wanted"
+    assert dark.words == "B: 650 us, no line is seen, 70% wanted"
+
+
 def test_glints_of_a_reflective_part_do_not_saturate() -> None:
     per_us = np.full(WIDTH, 0.1)
     per_us[::8] = np.where(np.arange(0, WIDTH, 8) % 80 == 0, 0.5, 0.1)
@@ -123,8 +137,26 @@ def test_lasers_in_turn_share_the_time_of_the_brighter_one_by_targets_of_their_o
 def test_without_a_line_the_time_grows_to_its_bound_and_no_further() -> None:
     camera = Camera(0.0, 100.0)
     assert settled(camera, ExposureSettings("automatic", most_us=2000.0)) == 2000.0
-    assert wanted_factor(np.full(9, 0.05), 0.04, 0.7, "automatic") is None
-    assert wanted_factor(np.full(9, 1.0), 0.04, 0.7, "automatic") == 0.5
+    assert deciding_level(np.full(9, 0.05), 0.04, "automatic") is None
+    assert wanted_factor(None, 0.04, 0.7) is None
+    assert wanted_factor(1.0, 0.04, 0.7) == 0.5
+
+
+def test_images_that_were_under_way_do_not_make_it_hunt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A setting shows two images later, as on cameras that read one while they take the next."""
+    monkeypatch.setattr(exposure, "EVERY_S", 0.001)
+    camera: Any = Camera(0.25, 2000.0)
+    control = ExposureControl(camera, ExposureSettings("automatic"), lambda _: None)
+    control.start()
+    times_us = [2000.0] * 2
+    for _ in range(150):
+        times_us.append(camera.settings.exposure_us)
+        control.show(Frame(lit(0.25 * times_us[-3]), 0, 0, 0), ("A",))
+        time.sleep(0.005)
+    control.stop()
+    np.testing.assert_allclose(0.25 * np.array(times_us[-30:]) + GROUND, 255 * 0.7, rtol=0.1)
+    # from much too bright: 1000, 500, and at most some steps to the target
+    assert camera.n_set <= 5
 
 
 def test_it_runs_beside_the_images_and_outlives_a_camera_that_refuses(

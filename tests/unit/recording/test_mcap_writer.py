@@ -24,7 +24,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from armscan.errors import InputError, OutputError
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
-from armscan.storage.recordings import write_mcap
+from armscan.storage.recordings import mcap_file, write_mcap
 from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions
 
@@ -160,15 +160,15 @@ def test_a_full_disk_keeps_what_is_there_and_says_how_much(
 def test_what_no_processor_has_time_to_pack_is_written_as_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    may_end, packs = threading.Event(), write_mcap._packed
+    may_end, packs = threading.Event(), mcap_file.Chunk.packed
     niceness = []
 
-    def slow(chunk: object) -> list[bytes]:
+    def slow(chunk: mcap_file.Chunk) -> list[bytes]:
         niceness.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
         may_end.wait(20.0)
-        return packs(chunk)  # type: ignore[arg-type]
+        return packs(chunk)
 
-    monkeypatch.setattr(write_mcap, "_packed", slow)
+    monkeypatch.setattr(mcap_file.Chunk, "packed", slow)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     path = tmp_path / "scan.mcap"
     with RecordingWriter(path) as writer:
@@ -180,6 +180,7 @@ def test_what_no_processor_has_time_to_pack_is_written_as_it_is(
             time.sleep(0.01)
         assert writer.status().n_written == 10
         may_end.set()
+        monkeypatch.setattr(write_mcap, "PACKED_WITHIN_SECONDS", 20.0)
         for k in range(10, 20):
             writer.add_exposure(row(k), image(k))
         while writer.status().n_written < 20 and time.monotonic() < added + 10.0:

@@ -31,6 +31,8 @@ BEHIND_SHARE = 0.25
 """Of them: with more, recording needs the processor, and what is measured live is seldom."""
 SEEN_EVERY_NS = 20_000_000
 """So often a device that has nothing says so."""
+TOLD_EVERY_S = 10.0
+"""So often the same trouble of this computer is told again."""
 BEHIND = "this computer cannot keep up with the recording; the devices' own buffers must hold"
 
 MOST_AHEAD = 16
@@ -149,6 +151,7 @@ class Acquisition:
         self._is_broken = threading.Event()
         self._threads: list[threading.Thread] = []
         self._buttons = 0
+        self._told_behind = -TOLD_EVERY_S
 
     def start(self) -> None:
         """Start the rig and the threads.
@@ -279,14 +282,13 @@ class Acquisition:
 
     def _put(self, what: str, k: int, found: Any) -> None:
         """Hand on what arrived; while there is no room the device's own buffer must hold."""
-        is_told = False
         while not self._is_broken.is_set():
             try:
                 self._arrived.put((what, k, found), timeout=READ_S)
             except queue.Full:
-                if not is_told:
+                if time.monotonic() > self._told_behind + TOLD_EVERY_S:
+                    self._told_behind = time.monotonic()
                     self._tell(LiveEvent("warning", BEHIND, RECORDER))
-                is_told = True
             else:
                 return
 

@@ -36,9 +36,14 @@ NEAR_ENOUGH = 0.1
 LEAST_CONTRAST = 0.03
 """Of full scale: what rises less above the ground is no line, and the image too dark."""
 EVERY_S = 0.25
-"""A new setting shows some images later: it is waited for."""
+"""So often a camera is set at most."""
+IMAGES_UNDER_WAY = 3
+"""Images after a new setting that may have been taken before it: cameras expose one while they
+read another out, and a third is on the line."""
 SEEN_LATELY_S = 2.0
 """Lasers that take turns share one exposure time, that of the brightest seen so lately."""
+SHOWN_S = 10.0
+"""So long a person is told how bright a line was."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +112,38 @@ class ExposureSettings:
         return min((own.get(name, self.target) for name in lasers), default=self.target)
 
 
+@dataclass(frozen=True, slots=True)
+class LineBrightness:
+    """How bright a line was when its camera was last looked at.
+
+    Parameters
+    ----------
+    lasers
+        Sources that were on; empty where it is not known.
+    level
+        Of the part of the line that decides, as a part of full scale; None where none is seen.
+    target
+        Wanted level.
+    exposure_us
+        Time of the image.
+    seen_s
+        When, by this computer's monotonic clock.
+    """
+
+    lasers: tuple[str, ...]
+    level: float | None
+    target: float
+    exposure_us: float
+    seen_s: float
+
+    @property
+    def words(self) -> str:
+        """For a person."""
+        level = "no line is seen" if self.level is None else f"line at {self.level:.0%}"
+        name = f"{'+'.join(self.lasers)}: " if self.lasers else ""
+        return f"{name}{self.exposure_us:.0f} us, {level}, {self.target:.0%} wanted"
+
+
 def line_levels(image: ImageArray, full_scale: int) -> tuple[FloatArray, float]:
     """Brightest pixels across the line, and the ground, as parts of full scale.
 
@@ -133,24 +170,33 @@ def line_levels(image: ImageArray, full_scale: int) -> tuple[FloatArray, float]:
     return found / full_scale, ground / full_scale
 
 
-def wanted_factor(
-    peaks: FloatArray, ground: float, target: float, mode: ExposureMode
-) -> float | None:
+def deciding_level(peaks: FloatArray, ground: float, mode: ExposureMode) -> float | None:
+    """Brightness of the part of the line that decides; None where no line is seen.
+
+    Parameters
+    ----------
+    peaks, ground
+        From `line_levels`.
+    mode
+        Which part decides.
+    """
+    level = float(np.quantile(peaks, GLINT_QUANTILE) if mode == "reflective" else np.median(peaks))
+    return None if level - ground < LEAST_CONTRAST else level
+
+
+def wanted_factor(level: float | None, ground: float, target: float) -> float | None:
     """By what the exposure time is to be multiplied; None where no line is seen.
 
     Light is linear in time: what rises above the ground grows with it.
 
     Parameters
     ----------
-    peaks, ground
-        From `line_levels`.
+    level, ground
+        From `deciding_level` and `line_levels`, parts of full scale.
     target
         Wanted peak, part of full scale.
-    mode
-        Which part of the line decides.
     """
-    level = float(np.quantile(peaks, GLINT_QUANTILE) if mode == "reflective" else np.median(peaks))
-    if level - ground < LEAST_CONTRAST:
+    if level is None:
         return None
     if level >= SATURATED:
         return CLIPPED_STEP
@@ -186,8 +232,9 @@ class ExposureControl:
         self._setup: CameraSetup = camera.setup
         self._shown: tuple[Frame, tuple[str, ...]] | None = None
         self._changed = threading.Condition()
+        self._n_under_way = 0
         self._is_over = False
-        self._wanted: dict[tuple[str, ...], tuple[float, float]] = {}
+        self._seen: dict[tuple[str, ...], tuple[LineBrightness, float]] = {}
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -211,8 +258,17 @@ class ExposureControl:
         """Show an image and what was on; one without laser tells nothing. Returns at once."""
         if lasers != () and frame.is_complete and self._settings.mode != "fixed":
             with self._changed:
-                self._shown = frame, lasers or ()
-                self._changed.notify()
+                self._n_under_way -= 1
+                if self._n_under_way < 0:
+                    self._shown = frame, lasers or ()
+                    self._changed.notify()
+
+    @property
+    def brightness(self) -> tuple[LineBrightness, ...]:
+        """Of the lines that were seen lately, one a choice of lasers; none where all is fixed."""
+        now_s = time.monotonic()
+        found = (one for one, _ in tuple(self._seen.values()))
+        return tuple(one for one in found if now_s - one.seen_s < SHOWN_S)
 
     def stop(self) -> None:
         """Look at no more images."""
@@ -239,9 +295,12 @@ class ExposureControl:
         full = ((1 << bits) - 1) << (
             8 * image.dtype.itemsize - bits if self._setup.align == "high" else 0
         )
-        factor = wanted_factor(*line_levels(image, full), given.target_of(lasers), given.mode)
-        self._wanted[lasers] = (now_s, now_us * (LARGEST_STEP if factor is None else factor))
-        lately = [us for seen_s, us in self._wanted.values() if now_s - seen_s < SEEN_LATELY_S]
+        peaks, ground = line_levels(image, full)
+        level, target = deciding_level(peaks, ground, given.mode), given.target_of(lasers)
+        factor = wanted_factor(level, ground, target)
+        seen = LineBrightness(lasers, level, target, now_us, now_s)
+        self._seen[lasers] = seen, now_us * (LARGEST_STEP if factor is None else factor)
+        lately = [us for one, us in self._seen.values() if now_s - one.seen_s < SEEN_LATELY_S]
         wanted_us = float(np.clip(min(lately), given.least_us, given.most_us))
         if abs(wanted_us / now_us - 1.0) < NEAR_ENOUGH:
             return None
@@ -256,6 +315,7 @@ class ExposureControl:
                     return
                 frame, lasers = self._shown
                 self._shown = None
+            took = None
             try:
                 took = self.adjust(frame, lasers)
             except DeviceError as error:
@@ -266,5 +326,7 @@ class ExposureControl:
                 if took is not None:
                     self._tell(took)
             with self._changed:
+                if took is not None:
+                    self._n_under_way = IMAGES_UNDER_WAY
                 self._changed.wait_for(lambda: self._is_over, EVERY_S)
                 self._shown = None

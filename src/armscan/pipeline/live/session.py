@@ -31,7 +31,7 @@ from armscan.pipeline.live.acquire import (
     WaitingInstant,
     WaitingInstants,
 )
-from armscan.pipeline.live.exposure import ExposureControl, ExposureSettings
+from armscan.pipeline.live.exposure import ExposureControl, ExposureSettings, LineBrightness
 from armscan.pipeline.live.rig import Rig, RigDescription, told_as_fault_of
 from armscan.pipeline.measure import (
     MeasuredInstant,
@@ -149,8 +149,6 @@ class LiveSnapshot:
         The latest pose; None where it is not known.
     range_mm
         Median depth in Sensor of the latest points; None where nothing was measured.
-    incidence_rad
-        Not measured yet: None.
     n_passes, n_points
         Passes and shown points.
     cloud_version
@@ -161,6 +159,8 @@ class LiveSnapshot:
         Instants a second that arrived lately.
     latency_ms
         Median and 95 % of exposure to shown; None before anything was placed.
+    brightness
+        Of the lines, one a camera and choice of lasers, where exposure times are controlled.
     n_waiting
         Elements that wait to be recorded.
     streams
@@ -171,13 +171,13 @@ class LiveSnapshot:
     cameras: tuple[CameraView, ...]
     base_from_tool: Pose[Base, Tool] | None
     range_mm: float | None
-    incidence_rad: float | None
     n_passes: int
     n_points: int
     cloud_version: int
     counts: dict[LiveStatus, int]
     rate_hz: float
     latency_ms: tuple[float, float] | None
+    brightness: tuple[tuple[LineBrightness, ...], ...]
     n_waiting: int
     streams: tuple[str, ...]
 
@@ -375,11 +375,8 @@ class LiveSession:
     def undo_pass(self) -> range:
         """Take the last pass out of the live cloud; the recorder has and keeps all of it.
 
-        Returns
-        -------
-        numbers
-            Of the instants that came since the pass began, also those that were not placed; empty
-            if there was no pass.
+        Returns the numbers of the instants since the pass began, also of those that were not
+        placed; none if there was no pass.
         """
         self._acquisition.wait_until_kept()
         with self._lock:
@@ -391,13 +388,7 @@ class LiveSession:
         return range(start, end)
 
     def clear(self) -> range:
-        """Empty the live cloud; the recorder has and keeps all of it.
-
-        Returns
-        -------
-        numbers
-            Of all instants that came.
-        """
+        """Empty the live cloud, which the recorder keeps; returns the numbers of all instants."""
         self._acquisition.wait_until_kept()
         with self._lock:
             self._passes.clear()
@@ -454,7 +445,6 @@ class LiveSession:
                 cameras=views,
                 base_from_tool=self._latest,
                 range_mm=self._range_mm,
-                incidence_rad=None,
                 n_passes=len(self._passes),
                 n_points=sum(len(one.voxels) for one in self._passes),
                 cloud_version=self._version,
@@ -463,6 +453,7 @@ class LiveSession:
                 latency_ms=(float(np.median(late)), float(np.quantile(late, 0.95)))
                 if late
                 else None,
+                brightness=tuple(one.brightness for one in self._controls),
                 n_waiting=self._acquisition.n_waiting,
                 streams=tuple(one.counts.words for one in monitors),
             )

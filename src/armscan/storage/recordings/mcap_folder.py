@@ -20,7 +20,6 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import zstandard
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from mcap import records
@@ -30,12 +29,9 @@ from mcap.opcode import Opcode
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
-from armscan.errors import FileFormatError, InputError
-from armscan.geometry.arrays import FloatArray, ImageArray
-from armscan.records.recording import ExposureRow, Session
+from armscan.errors import FileFormatError
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE
 from armscan.storage.files import is_file, path_text, read_bytes
-from armscan.storage.images import image_format, raw_encoding
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
     MOST_CAMERAS,
@@ -243,46 +239,6 @@ def stored_image(message: StoredMessage, said: Mapping[str, Any]) -> CompressedI
     if message.topic != facts["topic"] or zlib.crc32(shown.data) != facts["crc32"]:
         raise ValueError("an image is not the one that was recorded")
     return shown
-
-
-def transform_message(t_ns: int, place_mm: FloatArray, quaternion: FloatArray) -> bytes:
-    """Where the tool is in Base, as viewers draw it: (3,) mm and (4,) x, y, z, w."""
-    shown = FrameTransform(parent_frame_id="base", child_frame_id="tool")
-    shown.timestamp.seconds, shown.timestamp.nanos = divmod(max(t_ns, 0), NS_PER_S)
-    shown.translation.x, shown.translation.y, shown.translation.z = map(float, 1e-3 * place_mm)
-    turn = shown.rotation
-    turn.x, turn.y, turn.z, turn.w = map(float, quaternion)
-    return bytes(shown.SerializeToString())
-
-
-def _varint(value: int) -> bytes:
-    n = max(1, -(-value.bit_length() // 7))
-    return bytes(value >> 7 * k & 0x7F | (k + 1 < n) << 7 for k in range(n))
-
-
-def image_message(
-    row: ExposureRow, image: ImageArray | bytes, session: Session
-) -> tuple[tuple[bytes, ...], dict[str, Any]]:
-    """Bytes of an image's message without a copy of the pixels into it, and what is stored."""
-    shown: Any
-    if isinstance(image, bytes):
-        kind = image_format(image)
-        if kind is None:
-            raise InputError("these bytes are no image file", where=row.source)
-        shown, data, tag = CompressedImage(frame_id="sensor", format=kind.lower()), image, 0x12
-        facts: dict[str, Any] = {"stored": "file", "format": kind.lower()}
-    else:
-        encoding = raw_encoding(image, session.cameras[row.camera].colour, row.source)
-        height, width = image.shape[:2]
-        data, tag = np.ascontiguousarray(image).tobytes(), 0x32
-        shown = RawImage(
-            frame_id="sensor", width=width, height=height, encoding=encoding,
-            step=len(data) // height,
-        )  # fmt: skip
-        facts = {"stored": "raw", "encoding": encoding, "width_px": width, "height_px": height}
-    shown.timestamp.seconds, shown.timestamp.nanos = divmod(max(row.t_ns, 0), NS_PER_S)
-    facts |= {"crc32": zlib.crc32(data), "bytes": len(data)}
-    return (shown.SerializeToString(), bytes([tag]) + _varint(len(data)), data), facts
 
 
 def raw_pixels(shown: RawImage) -> NDArray[Any]:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import struct
 import sys
 import threading
 import time
@@ -21,36 +20,32 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import zstandard
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from mcap import records
-from mcap.data_stream import RecordBuilder
-from mcap.opcode import Opcode
 from mcap_protobuf.schema import build_file_descriptor_set
 from scipy.spatial.transform import Rotation
 
 from armscan.errors import InputError, OutputError
-from armscan.geometry.arrays import ImageArray
+from armscan.geometry.arrays import FloatArray, ImageArray
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from armscan.storage.arm import arm_columns
 from armscan.storage.files import path_text
+from armscan.storage.images import image_format, raw_encoding
 from armscan.storage.recording_session import (
     SESSION_FILE,
     banded_image,
     exposure_columns,
     session_toml,
 )
+from armscan.storage.recordings.mcap_file import Chunk, GrowingFile
 from armscan.storage.recordings.mcap_folder import (
     ARM_TOPIC,
     DOCUMENT_TOPIC,
     EVENT_TOPIC,
     EXPOSURE_TOPIC,
-    MAGIC,
+    NS_PER_S,
     TRANSFORM_TOPIC,
-    image_message,
-    transform_message,
 )
 
 CHUNK_BYTES = 4 << 20
@@ -64,10 +59,6 @@ NICENESS = 10
 """Of the packing thread: a scan is measured with nine tenths of a core that both want."""
 DOCUMENTS_SECONDS, MOST_REPEATED_BYTES = 5.0, 1 << 16
 """So often documents up to this size come again: a broken file is read without its beginning."""
-SYNC_SECONDS = 1.0
-"""So often the system is asked to put all on the disk: a power cut loses about as much."""
-NEW_FILE = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
-
 Compression = Literal["auto", "raw", "zstd"]
 
 
@@ -132,34 +123,12 @@ class _Message:
 
 
 @dataclass
-class _Chunk:
-    """An open chunk: messages whose bytes are not joined before they are written, and what they
-    need of schemas and channels, so that it can be read alone.
-    """
+class _Waiting:
+    """A chunk, how many exposures it lists, and when the first of its messages came."""
 
-    pieces: list[bytes] = field(default_factory=list)
-    n_bytes: int = 0
-    times: list[int] = field(default_factory=list)
-    index: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    chunk: Chunk = field(default_factory=Chunk)
     n_exposures: int = 0
     since: float = math.inf
-    """When the first of its messages came."""
-
-    def add(self, message: _Message, sequence: int, declared: Sequence[bytes]) -> None:
-        if message.channel not in self.index:
-            self.pieces += declared
-            self.n_bytes += sum(map(len, declared))
-        time_ns = max(message.t_ns, 0)
-        length = 22 + message.n_bytes
-        head = struct.pack(
-            "<BQHIQQ", Opcode.MESSAGE, length, message.channel, sequence, time_ns, time_ns
-        )
-        self.index.setdefault(message.channel, []).append((time_ns, self.n_bytes))
-        self.pieces += (head, *message.pieces)
-        self.n_bytes += 9 + length
-        self.times.append(time_ns)
-        self.n_exposures += message.n_exposures
-        self.since = min(self.since, message.since)
 
     @property
     def is_late(self) -> bool:
@@ -168,9 +137,9 @@ class _Chunk:
 
 @dataclass(frozen=True, slots=True)
 class _Closed:
-    """A chunk that waits to be written, and how it is packed; None to write it raw."""
+    """A chunk that is to be written, and how it is packed; None to write it raw."""
 
-    chunk: _Chunk
+    waiting: _Waiting
     packed: Future[list[bytes]] | None
 
 
@@ -196,19 +165,12 @@ class RecordingWriter:
         self._queued_bytes = 0
         self._is_closing = False
         self._failure: BaseException | None = None
-        self._has_summary = False
-        self._n_accepted = self._n_written = self._n_waits = self._size = 0
-        self._handle = -1
-        self._schemas: list[records.Schema] = []
-        self._channels: list[records.Channel] = []
-        self._attachments: list[records.AttachmentIndex] = []
-        self._chunks: list[records.ChunkIndex] = []
+        self._n_accepted = self._n_written = self._n_waits = 0
+        self._file = GrowingFile()
         self._sequence: Counter[int] = Counter()
-        self._counts: Counter[int] = Counter()
-        self._synced = 0.0
         self._documented = -math.inf
         self._documents: tuple[_Message, ...] = ()
-        self._declared: dict[int, tuple[bytes, ...]] = {}
+        self._declared: dict[int, bytes] = {}
         self._session = Session()
         self._of_topic: dict[str, int] = {}
         self._closed: deque[_Closed] = deque()
@@ -240,11 +202,11 @@ class RecordingWriter:
             kept[SESSION_FILE] = session_toml(session)
         self._session = session
         try:
-            self._handle = os.open(self._path, NEW_FILE, 0o666)
+            self._file.create(self._path)
             self._write_head({SESSION_FILE: session_toml(session), **kept})
             self._thread.start()
         except BaseException as error:
-            if self._handle >= 0:
+            if self._file.is_open:
                 self._leave_nothing()
             if not isinstance(error, OSError):
                 raise
@@ -257,17 +219,15 @@ class RecordingWriter:
     def _leave_nothing(self) -> None:
         """Remove the file that this writer made and could not begin."""
         with suppress(OSError):
-            os.close(self._handle)
-        self._handle = -1
+            self._file.close()
         self._is_closing = True
         with suppress(OSError):
             self._path.unlink()
 
     def _write_head(self, documents: Mapping[str, bytes]) -> None:
-        self._write((MAGIC, _record(records.Header("", "armscan"))))
         self._declare(len(self._session.cameras))
         for name, data in documents.items():
-            self._attach(name, data)
+            self._file.attach(name, data)
         self._documents = tuple(
             self._json(DOCUMENT_TOPIC, 0, {"name": name, "base64": b64encode(data).decode()})
             for name, data in documents.items()
@@ -374,7 +334,8 @@ class RecordingWriter:
         """How far the recording is."""
         with self._ready:
             fill = min(1.0, self._queued_bytes / self._options.queue_bytes)
-            return WriterStatus(self._n_accepted, self._n_written, fill, self._n_waits, self._size)
+            counts = self._n_accepted, self._n_written, fill, self._n_waits
+            return WriterStatus(*counts, self._file.n_bytes)
 
     def close(self) -> WriterStatus:
         """Write all that waits, and the summary with which readers find exposures.
@@ -389,12 +350,10 @@ class RecordingWriter:
             self._ready.notify_all()
         if self._thread.is_alive():
             self._thread.join()
-        if self._handle >= 0:
-            handle, self._handle = self._handle, -1
-            try:
-                os.close(handle)
-            except OSError as error:
-                self._failure = self._failure or error
+        try:
+            self._file.close()
+        except OSError as error:
+            self._failure = self._failure or error
         self._refuse_failed()
         return self.status()
 
@@ -409,7 +368,7 @@ class RecordingWriter:
             return
         cause = self._failure
         why = getattr(cause, "strerror", None) or f"{type(cause).__name__}: {cause}"
-        first = "" if self._has_summary else "run `armscan recover` on the file, "
+        first = "" if self._file.has_summary else "run `armscan recover` on the file, "
         raise OutputError(
             f"the recording stopped ({why}): {self._n_written} exposures of "
             f"{self._n_accepted} are safe",
@@ -425,7 +384,7 @@ class RecordingWriter:
             while self._is_full(n_bytes) and self._failure is None:
                 self._ready.wait()
             self._refuse_failed()
-            if self._is_closing or self._handle < 0:
+            if self._is_closing or not self._file.is_open:
                 raise InputError("the recording is not open", remedy="call begin first")
             n_exposures = sum(message.n_exposures for message in messages)
             if n_exposures:
@@ -452,14 +411,14 @@ class RecordingWriter:
 
     def _fill_chunks(self) -> None:
         """Fill chunks, close them when they are full or old, write them."""
-        chunks = {kind: _Chunk() for kind in ("images", "views", "tables")}
+        chunks = {kind: _Waiting() for kind in ("images", "views", "tables")}
         begun = time.monotonic()
         while True:
             messages, is_last = self._take(self._next_look(begun))
             for message in messages:
                 self._add(chunks, message)
                 # facts last: an exposure that is listed has its image
-                if message.n_exposures and chunks["images"].n_bytes >= CHUNK_BYTES:
+                if message.n_exposures and chunks["images"].chunk.n_bytes >= CHUNK_BYTES:
                     self._close_chunk(chunks, "images")
                     self._close_chunk(chunks, "tables")
                 with self._ready:
@@ -471,17 +430,15 @@ class RecordingWriter:
                 begun = time.monotonic()
             self._write_closed(is_last=is_last)
             if is_last:
-                self._write(self._summary())
-                os.fsync(self._handle)
-                self._has_summary = True
+                self._file.finish()
                 return
 
     def _next_look(self, begun: float) -> float:
         """When something is to be done though no message came."""
-        waits = [one.chunk.since + PACKED_WITHIN_SECONDS for one in self._closed]
+        waits = [one.waiting.since + PACKED_WITHIN_SECONDS for one in self._closed]
         return min([begun + CHUNK_SECONDS, *waits[:1]])
 
-    def _add(self, chunks: dict[str, _Chunk], message: _Message) -> None:
+    def _add(self, chunks: dict[str, _Waiting], message: _Message) -> None:
         if message.kind == "tables" and time.monotonic() > self._documented + DOCUMENTS_SECONDS:
             self._documented = time.monotonic()
             for document in self._documents:
@@ -489,7 +446,11 @@ class RecordingWriter:
                 self._add(chunks, again)
         sequence = self._sequence[message.channel] if message.number is None else message.number
         self._sequence[message.channel] += 1
-        chunks[message.kind].add(message, sequence, self._declared[message.channel])
+        waiting, channel = chunks[message.kind], message.channel
+        declared = self._declared[channel]
+        waiting.chunk.add(channel, sequence, message.t_ns, message.pieces, declared)
+        waiting.n_exposures += message.n_exposures
+        waiting.since = min(waiting.since, message.since)
 
     def _take(self, until: float) -> tuple[list[_Message], bool]:
         with self._ready:
@@ -505,14 +466,12 @@ class RecordingWriter:
     def _stop(self, error: BaseException) -> None:
         """Cut what was begun off, and close what is whole as well as the disk allows."""
         try:
-            self._cut_off()
-            self._write(self._summary())
-            os.fsync(self._handle)
-            self._has_summary = True
+            self._file.cut_off()
+            self._file.finish()
         except Exception:
             # a summary that is cut is none: without it the file is an unfinished one
             with suppress(OSError):
-                self._cut_off()
+                self._file.cut_off()
         finally:
             with self._ready:
                 self._failure = error
@@ -521,107 +480,55 @@ class RecordingWriter:
                 self._queued_bytes = 0
                 self._ready.notify_all()
 
-    def _cut_off(self) -> None:
-        os.ftruncate(self._handle, self._size)
-        os.lseek(self._handle, self._size, os.SEEK_SET)
-
-    def _close_chunk(self, chunks: dict[str, _Chunk], kind: str) -> None:
+    def _close_chunk(self, chunks: dict[str, _Waiting], kind: str) -> None:
         """Let a chunk wait to be written, and be packed meanwhile."""
-        chunk, chunks[kind] = chunks[kind], _Chunk()
-        if not chunk.n_bytes:
+        waiting, chunks[kind] = chunks[kind], _Waiting()
+        if not waiting.chunk.n_bytes:
             return
-        is_packing = self._is_packing(chunk)
-        packed = self._packing.submit(_packed, chunk) if is_packing else None
+        is_packing = self._is_packing(waiting)
+        packed = self._packing.submit(waiting.chunk.packed) if is_packing else None
         with self._ready:
-            self._closed.append(_Closed(chunk, packed))
-            self._queued_bytes += chunk.n_bytes
+            self._closed.append(_Closed(waiting, packed))
+            self._queued_bytes += waiting.chunk.n_bytes
 
     def _write_closed(self, *, is_last: bool) -> None:
         """Write chunks in their order: packed where that is done, as they are where it is late."""
         while self._closed:
-            one, packed = self._closed[0], self._closed[0].packed
+            waiting, packed = self._closed[0].waiting, self._closed[0].packed
             if packed is not None and not packed.done() and not self._must_pack:
-                is_late = is_last or one.chunk.is_late
+                is_late = is_last or waiting.is_late
                 if not is_late and 2 * self._queued_bytes < self._options.queue_bytes:
                     return
                 packed.cancel()
                 packed = None
             # what cannot be packed, for want of memory, is written as it is
             is_raw = packed is None or packed.exception() is not None
-            self._write_chunk(one.chunk, None if packed is None or is_raw else packed.result())
+            chunk = waiting.chunk
+            self._file.add_chunk(chunk, None if packed is None or is_raw else packed.result())
             with self._ready:
+                self._n_written += waiting.n_exposures
                 self._closed.popleft()
-                self._queued_bytes -= one.chunk.n_bytes
+                self._queued_bytes -= chunk.n_bytes
                 self._ready.notify_all()
-
-    def _write_chunk(self, chunk: _Chunk, packed: list[bytes] | None) -> None:
-        crc = 0
-        for piece in chunk.pieces:
-            crc = zlib.crc32(piece, crc)
-        pieces, name = (chunk.pieces, "") if packed is None else (packed, "zstd")
-        n_bytes = sum(map(len, pieces))
-        first, last = min(chunk.times), max(chunk.times)
-        inner = struct.pack("<QQQII", first, last, chunk.n_bytes, crc, len(name))
-        inner += name.encode() + struct.pack("<Q", n_bytes)
-        head = struct.pack("<BQ", Opcode.CHUNK, len(inner) + n_bytes) + inner
-        start, length = self._size, len(head) + n_bytes
-        indexes = {n: _record(records.MessageIndex(n, at)) for n, at in chunk.index.items()}
-        offsets, place = {}, start + length
-        for channel, content in indexes.items():
-            offsets[channel] = place
-            place += len(content)
-        self._write((head, *pieces, *indexes.values()))
-        self._chunks.append(
-            records.ChunkIndex(
-                chunk_length=length,
-                chunk_start_offset=start,
-                compression=name,
-                compressed_size=n_bytes,
-                message_end_time=last,
-                message_index_length=place - start - length,
-                message_index_offsets=offsets,
-                message_start_time=first,
-                uncompressed_size=chunk.n_bytes,
-            )
-        )
-        self._counts.update({channel: len(at) for channel, at in chunk.index.items()})
-        with self._ready:
-            self._n_written += chunk.n_exposures
-        if time.monotonic() - self._synced > SYNC_SECONDS:
-            os.fsync(self._handle)
-            self._synced = time.monotonic()
+            self._file.sync()
 
     @property
     def _must_pack(self) -> bool:
         chosen = self._options.compression
         return chosen == "zstd" or (self._options.is_stripe_band and chosen != "raw")
 
-    def _is_packing(self, chunk: _Chunk) -> bool:
+    def _is_packing(self, waiting: _Waiting) -> bool:
         if self._must_pack or self._options.compression == "raw":
             return self._must_pack
-        is_behind = chunk.is_late or 2 * self._queued_bytes >= self._options.queue_bytes
+        is_behind = waiting.is_late or 2 * self._queued_bytes >= self._options.queue_bytes
         return (os.cpu_count() or 1) > 1 and not is_behind
-
-    def _write(self, pieces: Sequence[bytes]) -> None:
-        """Write pieces that belong together; the file's size counts them when all are written."""
-        total = 0
-        for first in range(0, len(pieces), 500):
-            rest = [memoryview(piece) for piece in pieces[first : first + 500] if piece]
-            while rest:
-                done = _write_some(self._handle, rest)
-                total += done
-                while rest and done >= len(rest[0]):
-                    done -= len(rest.pop(0))
-                if done:
-                    rest[0] = rest[0][done:]
-        self._size += total
 
     def _declare(self, n_cameras: int) -> None:
         for kind in (RawImage, CompressedImage, FrameTransform):
             data = build_file_descriptor_set(kind).SerializeToString()
-            self._schema(kind.DESCRIPTOR.full_name, "protobuf", data)
+            self._file.add_schema(kind.DESCRIPTOR.full_name, "protobuf", data)
         for name in ("Exposure", "ArmSamples", "Event", "Document"):
-            self._schema(f"armscan.{name}", "jsonschema", b'{"type": "object"}')
+            self._file.add_schema(f"armscan.{name}", "jsonschema", b'{"type": "object"}')
         for camera in range(n_cameras):
             self._channel(f"/camera/{camera}/raw", "protobuf", 1)
             self._channel(f"/camera/{camera}/file", "protobuf", 2)
@@ -631,25 +538,9 @@ class RecordingWriter:
         self._channel(EVENT_TOPIC, "json", 6)
         self._channel(DOCUMENT_TOPIC, "json", 7)
 
-    def _schema(self, name: str, encoding: str, data: bytes) -> None:
-        schema = records.Schema(len(self._schemas) + 1, data, encoding, name)
-        self._schemas.append(schema)
-        self._write((_record(schema),))
-
     def _channel(self, topic: str, encoding: str, schema: int) -> None:
-        channel = records.Channel(len(self._channels) + 1, topic, encoding, {}, schema)
-        self._channels.append(channel)
-        self._of_topic[topic] = channel.id
-        self._write((_record(channel),))
-        self._declared[channel.id] = (_record(self._schemas[schema - 1]), _record(channel))
-
-    def _attach(self, name: str, data: bytes) -> None:
-        content = _record(records.Attachment(0, 0, name, "application/octet-stream", data))
-        index = records.AttachmentIndex(
-            self._size, len(content), 0, 0, len(data), name, "application/octet-stream"
-        )
-        self._write((content,))
-        self._attachments.append(index)
+        channel = self._of_topic[topic] = self._file.add_channel(topic, encoding, schema)
+        self._declared[channel] = self._file.declaration(channel)
 
     def _json(self, topic: str, t_ns: int, facts: Any, n_exposures: int = 0) -> _Message:
         content = json.dumps(facts, ensure_ascii=False).encode()
@@ -660,28 +551,6 @@ class RecordingWriter:
         content = transform_message(t_ns, track.translations_mm[row], quaternion)
         return _Message(self._of_topic[TRANSFORM_TOPIC], "views", t_ns, (content,))
 
-    def _summary(self) -> tuple[bytes, ...]:
-        ends = [index.message_end_time for index in self._chunks]
-        starts = [index.message_start_time for index in self._chunks]
-        statistics = records.Statistics(
-            attachment_count=len(self._attachments),
-            channel_count=len(self._channels),
-            channel_message_counts=dict(self._counts),
-            chunk_count=len(self._chunks),
-            message_count=sum(self._counts.values()),
-            message_end_time=max(ends, default=0),
-            message_start_time=min(starts, default=0),
-            metadata_count=0,
-            schema_count=len(self._schemas),
-        )
-        end = _record(records.DataEnd(0))
-        listed = (*self._schemas, *self._channels, statistics, *self._chunks, *self._attachments)
-        body = b"".join(map(_record, listed))
-        start = self._size + len(end)
-        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0)
-        footer = head + struct.pack("<I", zlib.crc32(head, zlib.crc32(body)))
-        return (end, body, footer, MAGIC)
-
 
 def _yield_to_all() -> None:
     """Let this thread have what the others leave; where one thread's rank can be set."""
@@ -690,20 +559,41 @@ def _yield_to_all() -> None:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
 
 
-def _packed(chunk: _Chunk) -> list[bytes]:
-    """A chunk's bytes as one frame; piece by piece, which needs no copy of all of them."""
-    frame = zstandard.ZstdCompressor(level=1).compressobj(size=chunk.n_bytes)
-    return [*(frame.compress(piece) for piece in chunk.pieces), frame.flush()]
+def transform_message(t_ns: int, place_mm: FloatArray, quaternion: FloatArray) -> bytes:
+    """Where the tool is in Base, as viewers draw it: (3,) mm and (4,) x, y, z, w."""
+    shown = FrameTransform(parent_frame_id="base", child_frame_id="tool")
+    shown.timestamp.seconds, shown.timestamp.nanos = divmod(max(t_ns, 0), NS_PER_S)
+    shown.translation.x, shown.translation.y, shown.translation.z = map(float, 1e-3 * place_mm)
+    turn = shown.rotation
+    turn.x, turn.y, turn.z, turn.w = map(float, quaternion)
+    return bytes(shown.SerializeToString())
 
 
-def _write_some(handle: int, pieces: list[memoryview]) -> int:
-    """Windows cannot write several pieces at once."""
-    if hasattr(os, "writev"):
-        return os.writev(handle, pieces)
-    return os.write(handle, pieces[0])
+def _varint(value: int) -> bytes:
+    n = max(1, -(-value.bit_length() // 7))
+    return bytes(value >> 7 * k & 0x7F | (k + 1 < n) << 7 for k in range(n))
 
 
-def _record(record: records.McapRecord) -> bytes:
-    builder = RecordBuilder()
-    record.write(builder)
-    return bytes(builder.end())
+def image_message(
+    row: ExposureRow, image: ImageArray | bytes, session: Session
+) -> tuple[tuple[bytes, ...], dict[str, Any]]:
+    """Bytes of an image's message without a copy of the pixels into it, and what is stored."""
+    shown: Any
+    if isinstance(image, bytes):
+        kind = image_format(image)
+        if kind is None:
+            raise InputError("these bytes are no image file", where=row.source)
+        shown, data, tag = CompressedImage(frame_id="sensor", format=kind.lower()), image, 0x12
+        facts: dict[str, Any] = {"stored": "file", "format": kind.lower()}
+    else:
+        encoding = raw_encoding(image, session.cameras[row.camera].colour, row.source)
+        height, width = image.shape[:2]
+        data, tag = np.ascontiguousarray(image).tobytes(), 0x32
+        shown = RawImage(
+            frame_id="sensor", width=width, height=height, encoding=encoding,
+            step=len(data) // height,
+        )  # fmt: skip
+        facts = {"stored": "raw", "encoding": encoding, "width_px": width, "height_px": height}
+    shown.timestamp.seconds, shown.timestamp.nanos = divmod(max(row.t_ns, 0), NS_PER_S)
+    facts |= {"crc32": zlib.crc32(data), "bytes": len(data)}
+    return (shown.SerializeToString(), bytes([tag]) + _varint(len(data)), data), facts

@@ -131,8 +131,8 @@ def calibrate_sheets(
         return FitFailure(
             f"no straight stripe with {MIN_POINTS} accepted points lies on the board in "
             f"any of {len(vote.images)} images",
-            "check that laser-on and board images belong together, the target's size, and the "
-            "stripe extraction",
+            "check that the laser is on and crosses the board, that laser-on and board images "
+            "belong together, and the target's size",
         )
     assignment = assign_sheets(vote.images, options)
     while not isinstance(assignment, FitFailure):

@@ -177,10 +177,10 @@ class BoardScatter:
 
     ``factor``, at least 1, is the standard deviations of the boards' poses over what is claimed for
     them, by the offsets and slopes of the stripes; ``of_boards`` (M,) those of each board by the
-    mean of its weight, larger for boards that stray. ``log_likelihood`` is that of the stripes' shapes, curvature included, up
-    to a constant that all models share: of poses that scatter, and of what each board's own form,
-    or the lens where it stands, adds to every shape term. A pose does not curve a stripe, and a
-    bend is not a pose that is known a hundred times worse.
+    mean of its weight, larger for boards that stray. ``log_likelihood`` is that of the stripes'
+    shapes, curvature included, up to a constant that all models share: of poses that scatter, and
+    of what each board's own form, or the lens where it stands, adds to every shape term. A pose
+    does not curve a stripe, and a bend is not a pose that is known a hundred times worse.
     """
 
     factor: float

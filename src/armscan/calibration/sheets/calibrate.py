@@ -18,6 +18,7 @@ from armscan.calibration.sheets.board_points import (
 )
 from armscan.calibration.sheets.checks import (
     check_points,
+    compare_planes,
     estimate_shapes_mm,
     find_outlier_view,
 )
@@ -32,7 +33,6 @@ from armscan.calibration.sheets.labels import SheetAssignment, assign_sheets, bo
 from armscan.calibration.sheets.model import (
     SheetModel,
     choose_model,
-    compare_planes,
     scatter_by_stripe,
     sheet_geometry,
     start_sheet,

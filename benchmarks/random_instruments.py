@@ -198,9 +198,9 @@ def print_outcomes(found: dict[str, list[tuple[Row, Row]]], n_draws: int) -> Non
         mean, right = certainty(pairs), certainty(_right(pairs))
         over = np.array([o["over_bound"] for _, o in pairs if o["over_bound"]], dtype=float)
         bound = f"{np.nanmedian(over):.2f}" if np.isfinite(over).any() else "-"
-        of_likely = np.array([o.get("over_likely", np.nan) for _, o in pairs], dtype=float)
-        if np.isfinite(of_likely).any():
-            bound += f" ({np.nanmedian(of_likely):.2f})"
+        granted = np.array([o.get("over_granted", np.nan) for _, o in pairs], dtype=float)
+        if np.isfinite(granted).any():
+            bound += f" ({np.nanmedian(granted):.2f})"
         print(f"| {stage} | {len(pairs)} | {' | '.join(cells)} | {mean} | {right} | {bound} |")
     few = [
         o for pairs in found.values() for _, o in pairs if o["reason"].startswith("few postures")

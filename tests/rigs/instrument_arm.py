@@ -100,7 +100,7 @@ def run_hand_eye(
     except ArmscanError as error:
         found = FitFailure(str(error))
     seconds = time.process_time() - begun
-    best = hand_eye_bound(made, seen, sensor, on_sphere)
+    best = hand_eye_bound(made, seen, sensor.covariance, on_sphere)
     stage = "hand-eye on sphere" if on_sphere else "hand-eye on plate"
     if isinstance(found, FitFailure):
         least = LEAST_CROSSED if len(lights) > 1 and not on_sphere else LEAST_POSTURES
@@ -112,23 +112,31 @@ def run_hand_eye(
         return Outcome(stage, result, reason, seconds=seconds)
     calibration = found.calibration
     covariance, follow = calibration.covariance, calibration.dhand_eye_dsensor
+    granted = np.nan
     if follow is not None:
+        stored = hand_eye_bound(made, seen, np.zeros_like(sensor.covariance), on_sphere)
+        granted = _over(covariance, stored)
         covariance = covariance + follow @ sensor.covariance @ follow.T
     pose, truth = calibration.tool_from_sensor, made.tool_from_sensor
     turn = Rotation.from_matrix(pose.rotation @ truth.rotation.T).as_rotvec()
     error = np.concatenate([turn, pose.translation_mm - truth.shift])
-    ratio = np.nan
-    if best is not None:
-        ratio = float(np.exp(0.5 * np.log(np.diag(covariance) / np.diag(best)).mean()))
     return judged(
         stage,
         error,
         covariance,
         GROUPS,
-        over_bound=ratio,
+        over_bound=_over(covariance, best),
+        over_granted=granted,
         warnings=found.warnings,
         seconds=seconds,
     )
+
+
+def _over(covariance: FloatArray, best: FloatArray | None) -> float:
+    """Geometric mean of standard deviations over those of a bound; NaN where there is none."""
+    if best is None:
+        return float("nan")
+    return float(np.exp(0.5 * np.log(np.diag(covariance) / np.diag(best)).mean()))
 
 
 def _calibrated(
@@ -358,9 +366,9 @@ def probed(made: Instrument, waves: Waves, rng: np.random.Generator) -> PlateRef
 
 
 def hand_eye_bound(
-    made: Instrument, seen: list[Seen], sensor: SensorCalibration, on_sphere: bool
+    made: Instrument, seen: list[Seen], sensor: FloatArray, on_sphere: bool
 ) -> FloatArray | None:
-    """(6, 6) smallest covariance given the sensor as it is known; None where there is none.
+    """(6, 6) smallest covariance, the sensor's parameters known to theirs (P, P); None for none.
 
     Some points of each stripe stand for all, their noise lowered accordingly.
     """
@@ -405,7 +413,7 @@ def hand_eye_bound(
     same = [who[:, k][:, None] == who[:, k][None, :] for k in (0, 1)]
     covariance = alike * ((1.0 - share**2) * same[0] + share**2 * same[1])
     by_sensor = np.concatenate(known)
-    covariance += by_sensor @ sensor.covariance @ by_sensor.T
+    covariance += by_sensor @ sensor @ by_sensor.T
     covariance += np.diag(np.concatenate(noise))
     if not on_sphere:
         touched = probed_places(made)

@@ -63,7 +63,8 @@ class Outcome:
 
     ``result`` is right, silently wrong, rightly refused, wrongly refused or not reached; ``chi2``
     the joint normalised error over ``freedom`` parameters; ``over_bound`` the stated standard
-    deviations over the Cramer-Rao bound, ``over_likely`` over that of planes that may be bowed.
+    deviations over the Cramer-Rao bound, ``over_granted`` over that of the question that is
+    answered: of planes that may be bowed as is likely, of the hand-eye of the stored sensor.
     """
 
     stage: str
@@ -73,7 +74,7 @@ class Outcome:
     freedom: int = 0
     groups: dict[str, float] = field(default_factory=dict)
     over_bound: float = float("nan")
-    over_likely: float = float("nan")
+    over_granted: float = float("nan")
     warnings: tuple[str, ...] = ()
     seconds: float = 0.0
 
@@ -398,7 +399,7 @@ def judge_sheets(
     best_likely = _light_bounds(whole, first, widths)
     squares, freedom, is_wrong = 0.0, 0, False
     ratios: list[float] = []
-    over_likely: list[float] = []
+    over_granted: list[float] = []
     groups: dict[str, float] = {}
     for sheet, k in zip(fit.sheets, names, strict=True):
         points = points_of_light(made, lines, k)
@@ -417,7 +418,7 @@ def judge_sheets(
         squares, freedom = squares + one.chi2, freedom + (3 if is_plane else n)
         _, _, by = sheet.sheet.height_with_jacobian(points)
         stated = np.einsum("ni,ij,nj->n", by[:, :n], sheet.covariance[:n, :n], by[:, :n]).mean()
-        for found, bounds in ((ratios, best), (over_likely, best_likely)):
+        for found, bounds in ((ratios, best), (over_granted, best_likely)):
             terms = light_terms(made, made.lights[k], points, len(bounds[k]))
             least = np.einsum("ni,ij,nj->n", terms, bounds[k], terms).mean()
             found.append(float(np.sqrt(stated / least)))
@@ -435,7 +436,7 @@ def judge_sheets(
         freedom,
         groups,
         float(np.median(ratios)),
-        float(np.median(over_likely)),
+        float(np.median(over_granted)),
         warnings,
         seconds,
     )

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from armscan.calibration.sheets.model import cross_ratio_points, projective_coordinate
+from armscan.calibration.sheets.checks import cross_ratio_points, projective_coordinate
 from rigs.sheet_rig import exact, stripe_on_board, thesis_rig
 
 RIG = exact(thesis_rig())

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from armscan.calibration.sheets.model import algebraic_plane
+from armscan.calibration.sheets.checks import algebraic_plane
 
 PLANE = np.array([0.6, 0.0, 0.8, -100.0])
 NOISE_MM = 5.0

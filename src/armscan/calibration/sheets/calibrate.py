@@ -18,6 +18,7 @@ from armscan.calibration.sheets.board_points import (
 )
 from armscan.calibration.sheets.checks import (
     check_points,
+    compare_planes,
     estimate_shapes_mm,
     find_outlier_view,
 )
@@ -32,7 +33,6 @@ from armscan.calibration.sheets.labels import SheetAssignment, assign_sheets, bo
 from armscan.calibration.sheets.model import (
     SheetModel,
     choose_model,
-    compare_planes,
     scatter_by_stripe,
     sheet_geometry,
     start_sheet,
@@ -131,8 +131,8 @@ def calibrate_sheets(
         return FitFailure(
             f"no straight stripe with {MIN_POINTS} accepted points lies on the board in "
             f"any of {len(vote.images)} images",
-            "check that laser-on and board images belong together, the target's size, and the "
-            "stripe extraction",
+            "check that the laser is on and crosses the board, that laser-on and board images "
+            "belong together, and the target's size",
         )
     assignment = assign_sheets(vote.images, options)
     while not isinstance(assignment, FitFailure):

@@ -8,6 +8,8 @@ difference of two things that share the cameras, and, where the board took part 
 errors. Each board is also left out: its points then rest on the other boards alone.
 
 What a sheet's model leaves of its shape shows in the same place of the sheet on every board.
+
+Beside it stand other methods: eq. 2.44, total least squares and cross ratios on rows of points.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from armscan.calibration.sheets.result import (
     LACK_OF_FIT_P,
     BoardDistances,
     BoardPointCheck,
+    PlaneComparison,
+    PlaneMethod,
     SheetPointCheck,
 )
 from armscan.calibration.sheets.solve import (
@@ -37,7 +41,10 @@ from armscan.calibration.sheets.solve import (
 from armscan.calibration.sheets.stripes_on_board import BoardImage
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.shapes import Line, fit_line, fit_plane
+from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
+from armscan.vision.targets.target import TargetView
 
 FEWEST_OTHERS = 2
 """Boards that must remain when one is left out: the stripe of one alone is a line."""
@@ -251,6 +258,129 @@ def _probability_without(
     share = replace(noise, degrees_of_freedom=noise.degrees_of_freedom * float(rest.mean()))
     n_stripes = len(np.unique(observations.stripe[rest]))
     return lack_of_fit(chi2, n_stripes, whole.n_parameters, share).p_value
+
+
+MIN_COLLINEAR = 3
+MIN_CROSSING_SINE = 0.5
+"""Rows that the stripe crosses at less than 30 degrees give no sharp point."""
+
+
+def compare_planes(
+    sheet: LightSheet,
+    observations: SheetObservations,
+    images: Sequence[BoardImage],
+    cameras: HeadCameras,
+) -> tuple[PlaneComparison, ...]:
+    """Compare eq. 2.44, total least squares and the cross-ratio points with the sheet in use.
+
+    ``observations`` are the sheet's points, the cameras are for the cross-ratio points.
+    """
+    points = observations.points_mm
+    crossings = []
+    for of in observations.each_stripe():
+        image = images[int(observations.image[of][0])]
+        stripe_px = image.data.profile.points_px[observations.row[of]]
+        camera = cameras.model(image.data.camera)
+        on_board = cross_ratio_points(image.data.view, stripe_px, camera)
+        pose = image.placed.sensor_from_board
+        crossings.append(on_board @ pose.rotation[:, :2].T + pose.translation_mm)
+    found = [_comparison("algebraic", algebraic_plane(points), sheet, points)]
+    methods: tuple[PlaneMethod, ...] = ("total least squares", "cross ratio")
+    for method, chosen in zip(methods, (points, np.concatenate(crossings)), strict=True):
+        plane = fit_plane(chosen)
+        if not isinstance(plane, FitFailure):
+            found.append(_comparison(method, plane.value.coefficients, sheet, points))
+    return tuple(found)
+
+
+def _comparison(
+    method: PlaneMethod, plane: FloatArray, sheet: LightSheet, points_mm: FloatArray
+) -> PlaneComparison:
+    if plane[:3] @ sheet.axes[2] < 0.0:
+        plane = -plane
+    height, _, _ = sheet.height_with_jacobian(points_mm)
+    on_sheet = points_mm - height[:, None] * sheet.axes[2]
+    sine = float(np.linalg.norm(np.cross(plane[:3], sheet.axes[2])))
+    a, b, c, d = (float(value) for value in plane)
+    return PlaneComparison(
+        method,
+        (a, b, c, d),
+        float(np.degrees(np.arcsin(min(sine, 1.0)))),
+        float(np.abs(on_sheet @ plane[:3] + plane[3]).max()),
+    )
+
+
+def algebraic_plane(points_mm: FloatArray) -> FloatArray:
+    """(4,) ``a b c D`` of the plane by eq. 2.44, scaled to a unit normal.
+
+    The print lacks the inverse of the normal matrix. The method minimises the algebraic error
+    ``a X + b Y + c Z - 1``, which is the distance over the plane's own distance from the camera:
+    it draws the plane away from the camera.
+    """
+    coefficients = np.linalg.lstsq(points_mm, np.ones(len(points_mm)), rcond=None)[0]
+    return np.asarray(np.array([*coefficients, -1.0]) / np.linalg.norm(coefficients))
+
+
+def cross_ratio_points(view: TargetView, stripe_px: FloatArray, camera: CameraModel) -> FloatArray:
+    """Points where a straight stripe crosses rows and columns of target points.
+
+    In the undistorted image the stripe's line meets the line of a row. Four collinear points keep
+    their cross ratio, so the known points of the row give the board coordinate of the crossing;
+    three suffice, more are used by least squares of the row's projective map.
+
+    Rows and columns of the view are points with equal y, or equal x, on the board; ``stripe_px``
+    (K, 2) are points of one straight stripe. The crossings (C, 2) are in the Board frame, mm.
+    """
+    stripe_xy, is_valid = camera.undistort(stripe_px)
+    stripe = fit_line(stripe_xy[is_valid]) if is_valid.sum() >= 2 else FitFailure("no stripe")
+    points_xy, is_known = camera.undistort(view.points_px)
+    if isinstance(stripe, FitFailure):
+        return np.zeros((0, 2))
+    board = view.points_board_mm
+    found = []
+    for along in (0, 1):
+        level = np.round(board[:, 1 - along], 9)
+        for value in np.unique(level[is_known]):
+            row = is_known & (level == value)
+            coordinate = _crossing(points_xy[row], board[row, along], stripe)
+            if coordinate is not None:
+                crossing = np.full(2, value)
+                crossing[along] = coordinate
+                found.append(crossing)
+    return np.array(found).reshape(-1, 2)
+
+
+def _crossing(row_xy: FloatArray, row_mm: FloatArray, stripe: Line) -> float | None:
+    """Board coordinate where the stripe crosses a row, or None where it does not."""
+    line = fit_line(row_xy) if len(row_xy) >= MIN_COLLINEAR else FitFailure("no row")
+    if isinstance(line, FitFailure):
+        return None
+    sine = line.direction[0] * stripe.direction[1] - line.direction[1] * stripe.direction[0]
+    if abs(sine) < MIN_CROSSING_SINE:
+        return None
+    offset = stripe.point - line.point
+    at = (offset[0] * stripe.direction[1] - offset[1] * stripe.direction[0]) / sine
+    along = line.along(row_xy)
+    if not along.min() <= at <= along.max():
+        return None
+    return projective_coordinate(along, row_mm, float(at))
+
+
+def projective_coordinate(image: FloatArray, board_mm: FloatArray, at: float) -> float:
+    """Board coordinate at the image coordinate ``at`` on a line of K >= 3 known points.
+
+    ``image`` and ``board_mm`` (K,) are their coordinates along the line. The cross ratio with any
+    three of the points equals that in the image; for K > 3 by least squares.
+    """
+    centre, reach = float(image.mean()), float(np.ptp(image))
+    t = (image - centre) / reach
+    middle, size = float(board_mm.mean()), float(np.ptp(board_mm))
+    s = (board_mm - middle) / size
+    # s = (h0 t + h1) / (h2 t + 1)
+    design = np.stack([t, np.ones_like(t), -t * s], axis=1)
+    h = np.linalg.lstsq(design, s, rcond=None)[0]
+    t_at = (at - centre) / reach
+    return float(middle + size * (h[0] * t_at + h[1]) / (h[2] * t_at + 1.0))
 
 
 CELLS = 12

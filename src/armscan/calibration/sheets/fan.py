@@ -59,8 +59,8 @@ UNEVEN_SHARE = 0.3
 """Distances of neighbouring sheets that differ from whole spacings by more do not tell how many
 sheets are missing between them."""
 REMEDY = (
-    "show each line on boards at several depths and tilts, and let neighbouring placements share "
-    "lines"
+    "show each line on boards at several depths and tilts, let neighbouring placements share "
+    "lines, and check that the laser is on in the images that are given as such"
 )
 
 

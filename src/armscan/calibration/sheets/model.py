@@ -16,9 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.coplanarity import SheetGeometry, refuse_lost_spread
-from armscan.calibration.sheets.result import LACK_OF_FIT_P, PlaneComparison, PlaneMethod
+from armscan.calibration.sheets.result import LACK_OF_FIT_P
 from armscan.calibration.sheets.solve import (
     N_PLANE,
     CommonErrors,
@@ -30,11 +29,9 @@ from armscan.calibration.sheets.stripes_on_board import BoardImage
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma
-from armscan.geometry.shapes import Line, Plane, fit_line, fit_plane
+from armscan.geometry.shapes import Plane, fit_plane
 from armscan.models.calibration import FTest
-from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import BOW_TERMS, LightSheet
-from armscan.vision.targets.target import TargetView
 
 SHAPE_DEGREE = 3
 N_SHAPE = SHAPE_DEGREE + 1
@@ -177,14 +174,16 @@ class BoardScatter:
 
     ``factor``, at least 1, is the standard deviations of the boards' poses over what is claimed for
     them, by the offsets and slopes of the stripes; ``of_boards`` (M,) those of each board by the
-    mean of its weight, larger for boards that stray. ``log_likelihood`` is that of the stripes' shapes, curvature included, up
-    to a constant that all models share: of poses that scatter, and of what each board's own form,
-    or the lens where it stands, adds to every shape term. A pose does not curve a stripe, and a
-    bend is not a pose that is known a hundred times worse.
+    mean of its weight, larger for boards that stray, ``of_places`` the logarithm of its likelihood.
+    ``log_likelihood`` is that of the stripes' shapes, curvature included, up to a constant that all
+    models share: of poses that scatter, and of what each board's own form, or the lens where it
+    stands, adds to every shape term. A pose does not curve a stripe, and a bend is not a pose that
+    is known a hundred times worse.
     """
 
     factor: float
     of_boards: tuple[float, ...]
+    of_places: float
     log_likelihood: float
 
 
@@ -226,10 +225,11 @@ def board_scatter(
         of_poses[board] += _log_likelihood(
             terms[by_a_pose], covariance[by_a_pose, by_a_pose], follow[by_a_pose], np.zeros(1)
         )
-    common = int(np.argmax(_with_strays(of_poses).sum(axis=(0, 1))))
+    likely = _with_strays(of_poses).sum(axis=(0, 1))
+    common = int(np.argmax(likely))
     shapes = _with_strays(of_shapes).sum(axis=0)
     own = _own_factors(of_poses[:, 0], common)
-    return BoardScatter(float(FACTORS[common]), own, float(shapes.max()))
+    return BoardScatter(float(FACTORS[common]), own, float(likely[common]), float(shapes.max()))
 
 
 def _with_strays(log_likelihood: FloatArray) -> FloatArray:
@@ -271,6 +271,8 @@ NO_SPARE = 2
 MOST_OF_TWO = 5.0
 """Largest scatter that is charged to them; more is a board in the wrong place, and told as such."""
 SCATTER_ROUNDS = 12
+N_DOUBTED = 4
+"""Boards that are left out for a trial: more than one in ten of the sets of a user."""
 SCATTER_SETTLED = 0.06
 """A step of the factors that are tried."""
 MAX_RAISES = 10
@@ -281,9 +283,6 @@ USUAL_FAN = 0.5
 the calibrated region is wide. It only keeps them finite."""
 MAX_FAN = 0.8
 U2, UV, U2V = (BOW_TERMS.index(term) for term in ((2, 0), (1, 1), (2, 1)))
-MIN_COLLINEAR = 3
-MIN_CROSSING_SINE = 0.5
-"""Rows that the stripe crosses at less than 30 degrees give no sharp point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -477,6 +476,25 @@ class _OneSheet:
     def board_scatter(self, solution: SheetSolution, noise: StripeNoise) -> BoardScatter:
         return board_scatter(self.points, solution, self.errors, noise)
 
+    def likeliest_scatter(self, solution: SheetSolution, noise: StripeNoise) -> BoardScatter:
+        """Of the solution, or of the sheet without one of the boards that seem to stray most.
+
+        A stray that pulls the sheet hides: all others then seem to scatter.
+        """
+        best = self.board_scatter(solution, noise)
+        for board in np.argsort(best.of_boards)[-N_DOUBTED:]:
+            normal = solution.system.solve(solution.weight, 0, without_board=int(board))
+            if normal is None:
+                continue
+            step = np.zeros(len(solution.active))
+            step[solution.active] = normal.step[: normal.n_sheet]
+            sheet = solution.sheets[0].updated(step)
+            common = normal.step[normal.n_sheet :]
+            other = self.board_scatter(replace(solution, sheets=(sheet,), common=common), noise)
+            if other.of_places > best.of_places:
+                best = other
+        return best
+
     def solve_bowed(self, start: LightSheet, sigma_factor: float) -> SheetSolution | FitFailure:
         """Fit a bowed sheet, and find from the bow itself how its light spreads.
 
@@ -548,7 +566,7 @@ class _OneSheet:
             solution = wider.solve(model.sheet, model.sigma_factor, is_bowed=model.is_bowed)
             if isinstance(solution, FitFailure):
                 return solution
-            found = np.array(self.board_scatter(solution, model.noise).of_boards)
+            found = np.array(self.likeliest_scatter(solution, model.noise).of_boards)
             found *= min(1.0, min(factors) / found.min())
             if np.allclose(np.log(found), np.log(factors), rtol=0.0, atol=SCATTER_SETTLED):
                 break
@@ -580,121 +598,3 @@ def _bow_condition(observations: SheetObservations, flat: SheetSolution) -> floa
     scaled = by_sheet / np.maximum(np.linalg.norm(by_sheet, axis=0), 1e-300)
     values = np.linalg.eigvalsh(scaled.T @ scaled)
     return float(values[-1] / max(values[0], 1e-300))
-
-
-def compare_planes(
-    sheet: LightSheet,
-    observations: SheetObservations,
-    images: Sequence[BoardImage],
-    cameras: HeadCameras,
-) -> tuple[PlaneComparison, ...]:
-    """Compare eq. 2.44, total least squares and the cross-ratio points with the sheet in use.
-
-    ``observations`` are the sheet's points, the cameras are for the cross-ratio points.
-    """
-    points = observations.points_mm
-    crossings = []
-    for of in observations.each_stripe():
-        image = images[int(observations.image[of][0])]
-        stripe_px = image.data.profile.points_px[observations.row[of]]
-        camera = cameras.model(image.data.camera)
-        on_board = cross_ratio_points(image.data.view, stripe_px, camera)
-        pose = image.placed.sensor_from_board
-        crossings.append(on_board @ pose.rotation[:, :2].T + pose.translation_mm)
-    found = [_comparison("algebraic", algebraic_plane(points), sheet, points)]
-    methods: tuple[PlaneMethod, ...] = ("total least squares", "cross ratio")
-    for method, chosen in zip(methods, (points, np.concatenate(crossings)), strict=True):
-        plane = fit_plane(chosen)
-        if not isinstance(plane, FitFailure):
-            found.append(_comparison(method, plane.value.coefficients, sheet, points))
-    return tuple(found)
-
-
-def _comparison(
-    method: PlaneMethod, plane: FloatArray, sheet: LightSheet, points_mm: FloatArray
-) -> PlaneComparison:
-    if plane[:3] @ sheet.axes[2] < 0.0:
-        plane = -plane
-    height, _, _ = sheet.height_with_jacobian(points_mm)
-    on_sheet = points_mm - height[:, None] * sheet.axes[2]
-    sine = float(np.linalg.norm(np.cross(plane[:3], sheet.axes[2])))
-    a, b, c, d = (float(value) for value in plane)
-    return PlaneComparison(
-        method,
-        (a, b, c, d),
-        float(np.degrees(np.arcsin(min(sine, 1.0)))),
-        float(np.abs(on_sheet @ plane[:3] + plane[3]).max()),
-    )
-
-
-def algebraic_plane(points_mm: FloatArray) -> FloatArray:
-    """(4,) ``a b c D`` of the plane by eq. 2.44, scaled to a unit normal.
-
-    The print lacks the inverse of the normal matrix. The method minimises the algebraic error
-    ``a X + b Y + c Z - 1``, which is the distance over the plane's own distance from the camera:
-    it draws the plane away from the camera.
-    """
-    coefficients = np.linalg.lstsq(points_mm, np.ones(len(points_mm)), rcond=None)[0]
-    return np.asarray(np.array([*coefficients, -1.0]) / np.linalg.norm(coefficients))
-
-
-def cross_ratio_points(view: TargetView, stripe_px: FloatArray, camera: CameraModel) -> FloatArray:
-    """Points where a straight stripe crosses rows and columns of target points.
-
-    In the undistorted image the stripe's line meets the line of a row. Four collinear points keep
-    their cross ratio, so the known points of the row give the board coordinate of the crossing;
-    three suffice, more are used by least squares of the row's projective map.
-
-    Rows and columns of the view are points with equal y, or equal x, on the board; ``stripe_px``
-    (K, 2) are points of one straight stripe. The crossings (C, 2) are in the Board frame, mm.
-    """
-    stripe_xy, is_valid = camera.undistort(stripe_px)
-    stripe = fit_line(stripe_xy[is_valid]) if is_valid.sum() >= 2 else FitFailure("no stripe")
-    points_xy, is_known = camera.undistort(view.points_px)
-    if isinstance(stripe, FitFailure):
-        return np.zeros((0, 2))
-    board = view.points_board_mm
-    found = []
-    for along in (0, 1):
-        level = np.round(board[:, 1 - along], 9)
-        for value in np.unique(level[is_known]):
-            row = is_known & (level == value)
-            coordinate = _crossing(points_xy[row], board[row, along], stripe)
-            if coordinate is not None:
-                crossing = np.full(2, value)
-                crossing[along] = coordinate
-                found.append(crossing)
-    return np.array(found).reshape(-1, 2)
-
-
-def _crossing(row_xy: FloatArray, row_mm: FloatArray, stripe: Line) -> float | None:
-    """Board coordinate where the stripe crosses a row, or None where it does not."""
-    line = fit_line(row_xy) if len(row_xy) >= MIN_COLLINEAR else FitFailure("no row")
-    if isinstance(line, FitFailure):
-        return None
-    sine = line.direction[0] * stripe.direction[1] - line.direction[1] * stripe.direction[0]
-    if abs(sine) < MIN_CROSSING_SINE:
-        return None
-    offset = stripe.point - line.point
-    at = (offset[0] * stripe.direction[1] - offset[1] * stripe.direction[0]) / sine
-    along = line.along(row_xy)
-    if not along.min() <= at <= along.max():
-        return None
-    return projective_coordinate(along, row_mm, float(at))
-
-
-def projective_coordinate(image: FloatArray, board_mm: FloatArray, at: float) -> float:
-    """Board coordinate at the image coordinate ``at`` on a line of K >= 3 known points.
-
-    ``image`` and ``board_mm`` (K,) are their coordinates along the line. The cross ratio with any
-    three of the points equals that in the image; for K > 3 by least squares.
-    """
-    centre, reach = float(image.mean()), float(np.ptp(image))
-    t = (image - centre) / reach
-    middle, size = float(board_mm.mean()), float(np.ptp(board_mm))
-    s = (board_mm - middle) / size
-    # s = (h0 t + h1) / (h2 t + 1)
-    design = np.stack([t, np.ones_like(t), -t * s], axis=1)
-    h = np.linalg.lstsq(design, s, rcond=None)[0]
-    t_at = (at - centre) / reach
-    return float(middle + size * (h[0] * t_at + h[1]) / (h[2] * t_at + 1.0))

@@ -11,6 +11,7 @@ from armscan.kernels.arrays import (
     COLUMN,
     ROW,
     Floats,
+    FloatsOut,
     Ints,
     IntsOut,
     MapOut,
@@ -216,6 +217,30 @@ def find_other_lines(
                         if far <= reach and far < distance[i, side]:
                             distance[i, side] = far
                     j = following[j]
+
+
+@compiled()
+def measure_chains(
+    points: Table, chain: Ints, start: IntsOut, stop: IntsOut, length_px: FloatsOut
+) -> None:
+    """First index, index after the last, and arc length of each point's chain: (N,) each.
+
+    ``points``: (N, >= 2) x, y. ``chain``: (N,) numbers; a chain's points are consecutive.
+    """
+    n = points.shape[0]
+    first = 0
+    while first < n:
+        last = first
+        length = 0.0
+        while last + 1 < n and chain[last + 1] == chain[first]:
+            dx = points[last + 1, 0] - points[last, 0]
+            dy = points[last + 1, 1] - points[last, 1]
+            length += math.sqrt(dx * dx + dy * dy)
+            last += 1
+        start[first : last + 1] = first
+        stop[first : last + 1] = last + 1
+        length_px[first : last + 1] = length
+        first = last + 1
 
 
 @compiled()

@@ -67,7 +67,71 @@ def read_sides(image: Image, points: Table, sigma_px: Floats, sides: TableOut) -
             sides[i, 2 * side + 1] = n
 
 
-LANES = 32
+@compiled(error_model="numpy")
+def average_sides(
+    raw: Table,
+    ground: Table,
+    neighbour: Table,
+    clear_px: float,
+    chain: Ints,
+    half: int,
+    result: TableOut,
+) -> None:
+    """Background on both sides, averaged over the neighbours on a chain along the same axis.
+
+    Both are of light on ground of reflectance 1. A side that another line lights up takes the value
+    of the other side.
+
+    ``raw``, ``ground``: (N, 4) of `read_sides`, of the image and of its reflectance. ``neighbour``:
+    (N, 2) distance to other lines; nearer than ``clear_px`` they light a side up. ``chain``: (N,)
+    numbers of places; sides swap where it changes. ``half``: Neighbours to both sides. ``result``:
+    (N, 3) output: lower and upper side, and the sigma of their difference over a pixel's.
+    """
+    n = raw.shape[0]
+    weight, light = np.zeros((2, n + 1)), np.zeros((2, n + 1))
+    first = 0
+    while first < n:
+        stop = first
+        while stop < n and chain[stop] == chain[first]:
+            for side in range(2):
+                count = raw[stop, 2 * side + 1]
+                seen = ground[stop, 2 * side] if count > 0.0 else 1.0
+                is_clear = neighbour[stop, side] > clear_px
+                w = count * seen * seen if is_clear else 0.0
+                weight[side, stop + 1] = w + (weight[side, stop] if stop > first else 0.0)
+                own = w * raw[stop, 2 * side] / seen
+                light[side, stop + 1] = own + (light[side, stop] if stop > first else 0.0)
+            stop += 1
+        weight[:, first] = 0.0
+        light[:, first] = 0.0
+        places = min(stop - first, 2 * half + 1)
+        for i in range(first, stop):
+            low, high = max(i - half, first), min(i + half + 1, stop)
+            lowest, least, fewest, n_own = np.inf, np.inf, np.inf, 0
+            for side in range(2):
+                count = raw[i, 2 * side + 1]
+                seen = ground[i, 2 * side] if count > 0.0 else 1.0
+                least = min(least, seen)
+                fewest = min(fewest, count)
+                if count > 0.0:
+                    lowest = min(lowest, raw[i, 2 * side] / seen)
+                total = weight[side, high] - weight[side, low]
+                if total > 0.0 and neighbour[i, side] > clear_px:
+                    n_own += 1
+                    result[i, side] = (light[side, high] - light[side, low]) / total
+                else:
+                    result[i, side] = np.nan
+            for side in range(2):
+                if n_own == 0:
+                    result[i, side] = lowest if lowest < np.inf else 0.0
+                elif np.isnan(result[i, side]):
+                    result[i, side] = result[i, 1 - side]
+            pixels = (fewest if n_own == 2 else 1.0) * places
+            result[i, 2] = math.sqrt(2.0 / max(pixels, 1.0)) / least
+        first = stop
+
+
+LANES = 16
 """Points that are fitted together, so that the loops over them are vectorised."""
 EXPONENT_HALVINGS = 12
 

@@ -4,8 +4,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils as numba_code
+from numba.extending import intrinsic
 
 from armscan.kernels.arrays import (
     COLUMN,
@@ -14,8 +19,6 @@ from armscan.kernels.arrays import (
     Floats,
     FloatsOut,
     Image,
-    ImageOut,
-    IntsOut,
     Mask,
     Row,
     RowOut,
@@ -113,18 +116,21 @@ def split_run(
     return count
 
 
+ALL_LIT = 0x0101010101010101
+"""Eight pixels, each marked by a byte."""
 ROUNDING = 1e-3
 """Of the threshold, in grey levels."""
 
 
-@compiled()
+@compiled(fastmath=True)
 def is_any_above(pixels: Row, level: float) -> bool:
     """True if one of some pixels is brighter."""
     limit = np.float32(level)
-    count = np.int32(0)
+    # of single precision, whose sums are vectorised
+    count = np.float32(0.0)
     for k in range(pixels.shape[0]):
-        count += np.int32(pixels[k] > limit)
-    return bool(count > 0)
+        count += np.float32(1.0) if pixels[k] > limit else np.float32(0.0)
+    return bool(count > np.float32(0.0))
 
 
 @compiled()
@@ -168,9 +174,7 @@ def find_runs(
     upper = np.zeros(width, np.float32)
     lower = np.zeros(width, np.float32)
     n_words = -(-width // 8)
-    is_lit = np.zeros(8 * n_words, np.uint8)
-    words = is_lit.view(np.int64)
-    n_open = np.zeros(n_words, np.int64)
+    is_lit, was_lit = np.zeros(8 * n_words, np.uint8), np.zeros(8 * n_words, np.uint8)
     above = -1
     start = np.full(width, -1, np.int64)
     count = 0
@@ -179,7 +183,9 @@ def find_runs(
     n_columns = 0
     for y in range(height + 1):
         row_start = -1
+        is_lit, was_lit = was_lit, is_lit
         is_lit[:] = 0
+        words, before = is_lit.view(np.int64), was_lit.view(np.int64)
         if n_columns == 0 and (y == height or not is_lit_cell[y // cell_px].any()):
             continue
         if y < height:
@@ -203,13 +209,14 @@ def find_runs(
                     own = slice(low, high)
                     mark_lit(row[own], upper[own], lower[own], v - cell, rise, is_lit[low:])
         for word in range(n_words):
-            if words[word] == 0 and n_open[word] == 0 and row_start < 0:
+            # pixels that are dark, or lit, as those above and before them, begin and end nothing
+            same = ALL_LIT if row_start >= 0 and word < n_words - 1 else 0
+            if words[word] == same and before[word] == same and (same != 0 or row_start < 0):
                 continue
             for x in range(8 * word, min(8 * word + 8, width)):
                 if is_lit[x]:
                     if start[x] < 0:
                         start[x] = y
-                        n_open[word] += 1
                         n_columns += 1
                     if row_start < 0:
                         row_start = x
@@ -224,7 +231,6 @@ def find_runs(
                                 image, COLUMN, x, start[x], y - 1, base, rise, levels, runs, count
                             )
                         start[x] = -1
-                        n_open[word] -= 1
                         n_columns -= 1
                     stop = x - 1
                 if row_start >= 0:
@@ -240,9 +246,11 @@ def find_runs(
 REACH_SIGMAS = 3.5
 """Taps cut at 3 sigma lock to pixels by 0.02 px, at 3.5 sigma by 0.003 px."""
 STEEPNESS_SLACK = 0.85
+"""Least of the normal's component across the run, over the other one."""
 REPEAT_PX = 1.5
 ROUNDS = 3
-LANES = 8
+FIRST_SLACK = 0.5
+"""As the one before it, while the walk to the ridge goes on: candidates of the flanks are many."""
 
 
 def gaussian_taps(sigma_px: float) -> Image:
@@ -261,289 +269,225 @@ def gaussian_taps(sigma_px: float) -> Image:
     return np.stack([smooth, slope, bend]).astype(np.float32)
 
 
-@compiled(fastmath=True)
-def smooth_columns(
-    image: Image, left: int, n: int, y: int, taps: Image, radius: int, columns: ImageOut
-) -> None:
-    """Smooth and differentiate ``n`` columns from ``left`` on, once and twice, down around ``y``.
+PATCH_LANES = 8
+"""Columns of a patch that are summed together, in one register."""
+FAST = ("fast",)
+cg: Any = numba_code
+"""Numba's own parts of code; without types."""
 
-    ``image``: (H, W) grey levels, of which the columns are a part; beyond its first and last row it
-    is continued constantly. ``taps``: (3, m) from `gaussian_taps`. ``radius``: Theirs; more columns
-    of the taps are 0. ``columns``: (3, >= n) output.
+
+class _Lanes:
+    """Instructions on rows of `PATCH_LANES` numbers of single precision."""
+
+    def __init__(self, builder: Any) -> None:
+        self.builder = builder
+        self.place = ir.IntType(64)
+        self.row = ir.VectorType(ir.FloatType(), PATCH_LANES)
+        self.zero = ir.Constant(self.row, [0.0] * PATCH_LANES)
+        self._undefined = ir.Constant(self.row, ir.Undefined)
+        self._first = ir.Constant(ir.VectorType(ir.IntType(32), PATCH_LANES), [0] * PATCH_LANES)
+
+    def load(self, data: Any, at: Any) -> Any:
+        """A row from a place on."""
+        where = self.builder.gep(data, [at])
+        return self.builder.load(self.builder.bitcast(where, self.row.as_pointer()), align=4)
+
+    def repeat(self, data: Any, at: Any) -> Any:
+        """A row of one number."""
+        one = self.builder.load(self.builder.gep(data, [at]))
+        first = ir.Constant(ir.IntType(32), 0)
+        row = self.builder.insert_element(self._undefined, one, first)
+        return self.builder.shuffle_vector(row, self._undefined, self._first)
+
+    def add_product(self, total: Any, a: Any, b: Any) -> None:
+        """Add the product of two rows to a sum in memory."""
+        product = self.builder.fmul(a, b, flags=FAST)
+        before = self.builder.load(total)
+        self.builder.store(self.builder.fadd(before, product, flags=FAST), total)
+
+    def sum(self, total: Any) -> Any:
+        """Sum of the numbers of a row in memory."""
+        kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), self.row])
+        name = f"llvm.vector.reduce.fadd.v{PATCH_LANES}f32"
+        reduce = cg.get_or_insert_function(self.builder.module, kind, name)
+        start = ir.Constant(ir.FloatType(), 0.0)
+        return self.builder.call(reduce, [start, self.builder.load(total)], fastmath=FAST)
+
+
+def _sum_patch(
+    typing: Any, image: Any, first: Any, taps: Any, radius: Any, sums: Any
+) -> tuple[Any, Any]:
+    """Sums of a patch times the five products of the taps, of which the compiler is told how.
+
+    What plain loops take several times as long for: short ones with several sums.
+
+    ``first``: Place of the middle row's first pixel in the image. The others: As for
+    `derivatives_at`; the patch and the columns beside it up to whole lanes lie in the image.
     """
-    height = image.shape[0]
-    # views, because an index that might be negative keeps the loops from being vectorised
-    down0, down1, down2 = columns[0, :n], columns[1, :n], columns[2, :n]
-    middle = image[y, left : left + n]
-    smooth, bend = taps[0, radius], taps[2, radius]
-    for i in range(n):
-        down0[i] = smooth * middle[i]
-        down1[i] = np.float32(0.0)
-        down2[i] = bend * middle[i]
-    for j in range(1, radius + 1):
-        upper = image[max(y - j, 0), left : left + n]
-        lower = image[min(y + j, height - 1), left : left + n]
-        smooth, slope, bend = taps[0, radius + j], taps[1, radius + j], taps[2, radius + j]
-        for i in range(n):
-            both = lower[i] + upper[i]
-            apart = lower[i] - upper[i]
-            down0[i] += smooth * both
-            down1[i] += slope * apart
-            down2[i] += bend * both
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        lanes = _Lanes(builder)
+        images, tap_rows, out = (
+            context.make_array(signature.args[k])(context, builder, args[k]) for k in (0, 2, 4)
+        )
+        width = cg.unpack_tuple(builder, images.shape, 2)[1]
+        m = cg.unpack_tuple(builder, tap_rows.shape, 2)[1]
+        row_of = [builder.mul(m, ir.Constant(lanes.place, k)) for k in range(3)]
+        middle = [builder.add(row, args[3]) for row in row_of]
+        totals = [cg.alloca_once_value(builder, lanes.zero) for _ in range(5)]
+        n_groups = builder.sdiv(m, ir.Constant(lanes.place, PATCH_LANES))
+        down = [cg.alloca_once_value(builder, lanes.zero) for _ in range(3)]
+        one = ir.Constant(lanes.place, 1)
+        with cg.for_range(builder, n_groups) as group:
+            left = builder.mul(group.index, ir.Constant(lanes.place, PATCH_LANES))
+            at = builder.add(args[1], left)
+            for total in down:
+                builder.store(lanes.zero, total)
+            for k in (0, 2):
+                lanes.add_product(
+                    down[k], lanes.repeat(tap_rows.data, middle[k]), lanes.load(images.data, at)
+                )
+            with cg.for_range(builder, args[3]) as row:
+                j = builder.add(row.index, one)
+                away = builder.mul(j, width)
+                lower = lanes.load(images.data, builder.add(at, away))
+                upper = lanes.load(images.data, builder.sub(at, away))
+                both = builder.fadd(lower, upper, flags=FAST)
+                apart = builder.fsub(lower, upper, flags=FAST)
+                for k, part in enumerate((both, apart, both)):
+                    tap = lanes.repeat(tap_rows.data, builder.add(middle[k], j))
+                    lanes.add_product(down[k], tap, part)
+            along = [lanes.load(tap_rows.data, builder.add(row, left)) for row in row_of]
+            for total, (k, n) in zip(totals, ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2)), strict=True):
+                lanes.add_product(total, along[k], builder.load(down[n]))
+        for k, total in enumerate(totals):
+            where = builder.gep(out.data, [ir.Constant(lanes.place, k)])
+            builder.store(lanes.sum(total), where)
+        return context.get_dummy_value()
+
+    return types.void(image, types.intp, taps, types.intp, sums), generate
+
+
+def _sum_patch_slowly(image: Image, first: int, taps: Image, radius: int, sums: RowOut) -> None:
+    """The same where compilation is switched off."""
+    y, x = divmod(first + radius, image.shape[1])
+    rows = slice(x - radius, x - radius + taps.shape[1])
+    patch = image[y - radius : y + radius + 1, rows]
+    down = taps[:, : 2 * radius + 1] @ patch
+    for k, (i, n) in enumerate(((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))):
+        sums[k] = taps[i] @ down[n]
+
+
+# compiled functions have what they were made of; plain ones are where compilation is switched off
+IS_PLAIN = not hasattr(interpolate_columns, "py_func")
+sum_patch: Any = _sum_patch_slowly if IS_PLAIN else intrinsic(_sum_patch)
 
 
 @compiled(fastmath=True)
-def smooth_border(
-    image: Image, left: int, n: int, y: int, taps: Image, radius: int, columns: ImageOut
-) -> None:
-    """As `smooth_columns`, of columns of which some lie beyond the image's border."""
+def sum_at_border(image: Image, x: int, y: int, taps: Image, radius: int, sums: RowOut) -> None:
+    """As `sum_patch`, where pixels lie beyond the image's border: it is continued constantly."""
     height, width = image.shape
-    columns[:, :n] = np.float32(0.0)
-    for j in range(2 * radius + 1):
-        row = min(max(y + j - radius, 0), height - 1)
-        for i in range(n):
-            value = image[row, min(max(left + i, 0), width - 1)]
-            columns[0, i] += taps[0, j] * value
-            columns[1, i] += taps[1, j] * value
-            columns[2, i] += taps[2, j] * value
+    sums[:5] = np.float32(0.0)
+    for i in range(2 * radius + 1):
+        column = min(max(x + i - radius, 0), width - 1)
+        smooth = slope = bend = np.float32(0.0)
+        for j in range(2 * radius + 1):
+            value = image[min(max(y + j - radius, 0), height - 1), column]
+            smooth += taps[0, j] * value
+            slope += taps[1, j] * value
+            bend += taps[2, j] * value
+        sums[0] += taps[1, i] * smooth
+        sums[1] += taps[0, i] * slope
+        sums[2] += taps[2, i] * smooth
+        sums[3] += taps[1, i] * slope
+        sums[4] += taps[0, i] * bend
 
 
-@compiled(fastmath=True)
-def derivatives_at(
-    image: Image,
-    x: int,
-    y: int,
-    taps: Image,
-    radius: int,
-    columns: ImageOut,
-    result: FloatsOut,
-) -> None:
+@compiled(is_inlined=True)
+def derivatives_at(image: Image, x: int, y: int, taps: Image, radius: int, result: RowOut) -> None:
     """Smoothed derivatives at one pixel; beyond the border the image is continued constantly.
 
     ``image``: (H, W) grey levels. ``x``, ``y``: Pixel. ``taps``: (3, m) from `gaussian_taps`, of
-    which the first 2 radius + 1 columns count and the rest is 0.
-    ``columns``: (3, >= m) scratch. ``result``: (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
+    which the first 2 radius + 1 columns count and the rest is 0; m a multiple of `PATCH_LANES`.
+    ``result``: (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
     """
+    height, width = image.shape
     m = taps.shape[1]
-    left = x - radius
-    if left >= 0 and left + m <= image.shape[1]:
-        smooth_columns(image, left, m, y, taps, radius, columns)
+    is_inside = (x >= radius) & (x - radius + m <= width)
+    if is_inside & (y >= radius) & (y + radius < height):
+        sum_patch(image, y * width + x - radius, taps, radius, result)
     else:
-        smooth_border(image, left, m, y, taps, radius, columns)
-    down0, down1, down2 = columns[0, :m], columns[1, :m], columns[2, :m]
-    taps0, taps1, taps2 = taps[0], taps[1], taps[2]
-    gx = gy = gxx = gxy = gyy = np.float32(0.0)
-    for i in range(m):
-        gx += taps1[i] * down0[i]
-        gxx += taps2[i] * down0[i]
-        gxy += taps1[i] * down1[i]
-        gy += taps0[i] * down1[i]
-        gyy += taps0[i] * down2[i]
-    result[0] = gx
-    result[1] = gy
-    result[2] = gxx
-    result[3] = gxy
-    result[4] = gyy
-
-
-@compiled(fastmath=True)
-def derivatives_along(
-    image: Image,
-    x: int,
-    n: int,
-    y: int,
-    taps: Image,
-    radius: int,
-    columns: ImageOut,
-    result: ImageOut,
-) -> None:
-    """As `derivatives_at`, at ``n`` pixels of a row from ``x`` on, which share their columns.
-
-    All columns lie inside the image. ``columns``: (3, >= n + 2 radius) scratch. ``result``:
-    (5, >= n) output.
-    """
-    smooth_columns(image, x - radius, n + 2 * radius, y, taps, radius, columns)
-    gx, gy, gxx, gxy, gyy = (
-        result[0, :n],
-        result[1, :n],
-        result[2, :n],
-        result[3, :n],
-        result[4, :n],
-    )
-    result[:, :n] = np.float32(0.0)
-    for i in range(2 * radius + 1):
-        down0, down1, down2 = columns[0, i : i + n], columns[1, i : i + n], columns[2, i : i + n]
-        smooth, slope, bend = taps[0, i], taps[1, i], taps[2, i]
-        for k in range(n):
-            gx[k] += slope * down0[k]
-            gxx[k] += bend * down0[k]
-            gxy[k] += slope * down1[k]
-            gy[k] += smooth * down1[k]
-            gyy[k] += smooth * down2[k]
+        sum_at_border(image, x, y, taps, radius, result)
 
 
 NO_RIDGE, FOUND, MOVED = range(3)
 
 
-@compiled()
-def step_across(derivatives: Floats, x: int, y: int, radius: int, result: FloatsOut) -> int:
+@compiled(fastmath=True, error_model="numpy", is_inlined=True)
+def step_across(derivatives: Row, x: int, y: int, radius: int, result: FloatsOut) -> int:
     """One Newton step across the line from a pixel.
 
     The eigenvector of the eigenvalue of largest curvature is the normal ``n``; along it the Taylor
     polynomial has its maximum at ``t = -(g . n) / (n' H n)``.
 
     ``derivatives``: (5,) of `derivatives_at`. ``result``: (5,) output: x, y, normal x, normal y,
-    negative second derivative along the normal; x and y alone where the step leaves the pixel.
+    negative second derivative along the normal.
     Returns `NO_RIDGE`, `FOUND`, or `MOVED`.
     """
-    half = 0.5 * (derivatives[2] - derivatives[4])
+    half = np.float32(0.5) * (derivatives[2] - derivatives[4])
     gxy = derivatives[3]
-    root = math.sqrt(half * half + gxy * gxy)
-    bend = 0.5 * (derivatives[2] + derivatives[4]) - root
-    if bend >= 0.0 or root <= 0.0:
+    root = np.float32(math.sqrt(half * half + gxy * gxy))
+    bend = np.float32(0.5) * (derivatives[2] + derivatives[4]) - root
+    if bend >= np.float32(0.0) or root <= np.float32(0.0):
         return NO_RIDGE
-    nx = root - half if half < 0.0 else -gxy
-    ny = -gxy if half < 0.0 else root + half
-    length = math.sqrt(nx * nx + ny * ny)
-    nx /= length
-    ny /= length
+    nx = root - half if half < np.float32(0.0) else -gxy
+    ny = -gxy if half < np.float32(0.0) else root + half
+    share = np.float32(1.0) / np.float32(math.sqrt(nx * nx + ny * ny))
+    nx *= share
+    ny *= share
     step = -(derivatives[0] * nx + derivatives[1] * ny) / bend
-    dx = step * nx
-    dy = step * ny
+    dx = float(step * nx)
+    dy = float(step * ny)
     result[0] = x + dx
     result[1] = y + dy
+    result[2] = nx
+    result[3] = ny
+    result[4] = -bend
     if abs(dx) <= 0.6 and abs(dy) <= 0.6:
-        result[2] = nx
-        result[3] = ny
-        result[4] = -bend
         return FOUND
     return NO_RIDGE if abs(step) > radius else MOVED
 
 
-@compiled()
-def step_to_ridge(
-    image: Image,
-    x: int,
-    y: int,
-    rounds: int,
-    taps: Image,
-    radius: int,
-    scratch: ImageOut,
-    derivatives: FloatsOut,
-    result: FloatsOut,
+@compiled(error_model="numpy")
+def walk_to_ridge(
+    image: Image, is_row: bool, taps: Image, radius: int, derivatives: RowOut, result: FloatsOut
 ) -> bool:
-    """Walk from a pixel to the nearest ridge; False if there is none.
+    """Walk on to the nearest ridge; False if there is none of the candidate's direction.
 
-    The expansion point is moved while the step leaves its pixel, in so many ``rounds`` at most.
-
-    ``image``, ``taps``, ``radius``, ``scratch``: As for `derivatives_at`. ``derivatives``: (5,)
-    scratch. ``result``: (5,) output of `step_across`.
+    ``image``, ``taps``, ``radius``: As for `derivatives_at`. ``is_row``: True of candidates along a
+    row. ``derivatives``: (5,) scratch. ``result``: (5,) of `step_across`, input of a first step
+    that left its pixel, and output.
     """
     height, width = image.shape
-    for _ in range(rounds):
+    for _ in range(ROUNDS - 1):
+        across, along = result[3 - is_row], result[2 + is_row]
+        if abs(across) < FIRST_SLACK * abs(along):
+            return False
+        x = math.floor(result[0] + 0.5)
+        y = math.floor(result[1] + 0.5)
         if x < 0 or y < 0 or x >= width or y >= height:
             return False
-        derivatives_at(image, x, y, taps, radius, scratch, derivatives)
+        derivatives_at(image, x, y, taps, radius, derivatives)
         state = step_across(derivatives, x, y, radius, result)
         if state != MOVED:
             return state == FOUND
-        x = math.floor(result[0] + 0.5)
-        y = math.floor(result[1] + 0.5)
     return False
 
 
-BLOCK_PX = 32
-"""Columns by which candidates of a row are sorted, and so found together."""
-MOST_BLOCKS = 3
-"""Blocks of a row that are looked at together where a line runs along it."""
-MOST_APART = 6
-"""Pixels of a row for each candidate up to which its columns are smoothed together."""
-SHARED_FROM = 3
-"""Candidates beside each other from which on sharing columns is worth its time."""
+CHUNK = 256
 
 
-@compiled()
-def sort_candidates(runs: Table, n_runs: int, cell: IntsOut, order: IntsOut) -> int:
-    """Sort candidates by row, and by block of columns within it.
-
-    ``runs``, ``n_runs``: As for `refine_candidates`. ``cell``: (n_runs,) output: number of the row
-    and block of each. ``order``: (n_runs,) output: candidates by rising cell. Returns count of
-    blocks of a row.
-    """
-    blocks = rows = 0
-    for r in range(n_runs):
-        blocks = max(blocks, math.floor(runs[r, 0] + 0.5) // BLOCK_PX + 1)
-        rows = max(rows, math.floor(runs[r, 1] + 0.5) + 1)
-    place = np.zeros(rows * blocks + 1, np.int64)
-    for r in range(n_runs):
-        own = math.floor(runs[r, 1] + 0.5) * blocks + math.floor(runs[r, 0] + 0.5) // BLOCK_PX
-        cell[r] = own
-        place[own + 1] += 1
-    for k in range(rows * blocks):
-        place[k + 1] += place[k]
-    for r in range(n_runs):
-        order[place[cell[r]]] = r
-        place[cell[r]] += 1
-    return blocks
-
-
-@compiled()
-def find_ridges(image: Image, runs: Table, n_runs: int, taps: Image, ridges: TableOut) -> None:
-    """Walk from each candidate to its ridge; ``ridges``: (n_runs, 5) output, 0 where there is none.
-
-    The others: As for `refine_candidates` and `step_across`.
-    """
-    height, width = image.shape
-    radius = taps.shape[1] // 2
-    # whole registers: what is left over of a row would take as long as the rest
-    padded = np.zeros((3, -(-taps.shape[1] // LANES) * LANES), np.float32)
-    padded[:, : taps.shape[1]] = taps
-    widest = MOST_BLOCKS * BLOCK_PX
-    scratch = np.zeros((3, max(widest + 2 * radius, padded.shape[1])), np.float32)
-    along = np.zeros((5, widest), np.float32)
-    derivatives = np.zeros(5)
-    cell = np.zeros(n_runs, np.int64)
-    order = np.zeros(n_runs, np.int64)
-    blocks = sort_candidates(runs, n_runs, cell, order)
-    first = 0
-    while first < n_runs:
-        stop = first
-        low, high = width, -1
-        row = cell[order[first]] // blocks
-        last = min(cell[order[first]] + MOST_BLOCKS, (row + 1) * blocks)
-        while stop < n_runs and cell[order[stop]] < last:
-            x = math.floor(runs[order[stop], 0] + 0.5)
-            low, high = min(low, x), max(high, x)
-            stop += 1
-        n = high - low + 1
-        is_shared = (stop - first >= SHARED_FROM) & (n <= MOST_APART * (stop - first))
-        is_shared &= (low >= radius) & (high + radius < width) & (0 <= row < height)
-        if is_shared:
-            derivatives_along(image, low, n, row, padded, radius, scratch, along)
-        for k in range(first, stop):
-            r = order[k]
-            x = math.floor(runs[r, 0] + 0.5)
-            y = math.floor(runs[r, 1] + 0.5)
-            state = MOVED
-            rounds = ROUNDS
-            if is_shared:
-                for m in range(5):
-                    derivatives[m] = along[m, x - low]
-                state = step_across(derivatives, x, y, radius, ridges[r])
-                x = math.floor(ridges[r, 0] + 0.5)
-                y = math.floor(ridges[r, 1] + 0.5)
-                rounds -= 1
-            if state == MOVED:
-                is_found = step_to_ridge(
-                    image, x, y, rounds, padded, radius, scratch, derivatives, ridges[r]
-                )
-                state = FOUND if is_found else NO_RIDGE
-            if state != FOUND:
-                ridges[r, 4] = 0.0
-        first = stop
-
-
-@compiled()
+@compiled(error_model="numpy")
 def refine_candidates(
     image: Image,
     runs: Table,
@@ -567,16 +511,27 @@ def refine_candidates(
     """
     height, width = image.shape
     latest = np.full((2, max(height, width)), -1e9)
-    ridges = np.zeros((n_runs, 5))
-    find_ridges(image, runs, n_runs, taps, ridges)
+    radius = taps.shape[1] // 2
+    # whole registers: what is left over of a row would take as long as the rest
+    padded = np.zeros((3, -(-taps.shape[1] // PATCH_LANES) * PATCH_LANES), np.float32)
+    padded[:, : taps.shape[1]] = taps
+    derivatives = np.zeros(5, np.float32)
+    ridges, states = np.zeros((CHUNK, 5)), np.zeros(CHUNK, np.int64)
     count = 0
     for r in range(n_runs):
+        if r % CHUNK == 0:
+            # first steps of many, before what is unlike in each: a processor overlaps them
+            for k in range(min(CHUNK, n_runs - r)):
+                x, y = math.floor(runs[r + k, 0] + 0.5), math.floor(runs[r + k, 1] + 0.5)
+                derivatives_at(image, x, y, padded, radius, derivatives)
+                states[k] = step_across(derivatives, x, y, radius, ridges[k])
+        ridge, state = ridges[r % CHUNK], states[r % CHUNK]
         is_row = runs[r, 2] == ROW
         side = ROW if is_row else COLUMN
-        ridge = ridges[r]
-        if ridge[4] <= 0.0:
-            continue
-        if ridge[4] < least_bend:
+        if state == MOVED:
+            is_found = walk_to_ridge(image, is_row, padded, radius, derivatives, ridge)
+            state = FOUND if is_found else NO_RIDGE
+        if state != FOUND or ridge[4] < least_bend:
             continue
         nx = abs(ridge[2])
         ny = abs(ridge[3])

@@ -13,10 +13,11 @@ import numpy as np
 
 from armscan.kernels.arrays import (
     Floats,
-    FloatsOut,
+    ImageOut,
     Ints,
+    Row,
+    RowOut,
     Table,
-    TableOut,
     compiled,
 )
 
@@ -24,8 +25,8 @@ SHIFT, SLOPE, BEND, BEND_SIGMA, SMOOTH_SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA
 SMOOTH_ROWS = 8
 """Rows of a smoothing result."""
 LEAST_POINTS = 5
-MOST_TURNED_COSINE = 0.6
-X, Y, NORMAL_X, NORMAL_Y, WEIGHT, CHAIN = range(6)
+MOST_TURNED_COSINE = np.float32(0.6)
+X, Y, NORMAL_X, NORMAL_Y, CHAIN, WEIGHT = range(6)
 COURSE_ROWS = 6
 LANES = 32
 """Points that are taken together; a course has so many places before its first and after its last
@@ -35,55 +36,87 @@ MOMENTS = 9
 """Sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d, and the count of points."""
 NOWHERE = -1.0
 """Chain of a place without a point."""
-BEYOND = 1e9
-LEAST_DETERMINANT = 1e-9
+ZERO, ONE, TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+BEYOND = np.float32(1e9)
+LEAST_DETERMINANT = np.float32(1e-5)
+"""Of the product of its diagonal; five neighbours on one side of a point leave 0.013."""
+TILE = 256
+MARGIN = (TILE - LANES) // 2
+NEIGHBOURS_PER_PX = 3.0
+"""More than points of a chain lie within a pixel along it."""
+REACHED, ALONG, ACROSS = (WEIGHT + k for k in range(3))
+LANE_ROWS = ACROSS + 1
+
+
+@compiled()
+def cut_tile(course: Table, first: int, margin: int, tile: RowOut) -> None:
+    """Copy a block of points and so many neighbours; places count from the block's first point.
+
+    ``course``: (6, P) as `Neighbourhoods` lays it out. ``first``: Place of lane 0. ``tile``:
+    (6 `TILE`,) output, lane 0 at place `MARGIN`.
+    """
+    origin_x, origin_y = course[X, first], course[Y, first]
+    low = max(first - margin, 0)
+    high = min(first + LANES + margin, course.shape[1])
+    at = MARGIN + low - first
+    tile[CHAIN * TILE : (CHAIN + 1) * TILE] = np.float32(NOWHERE)
+    for i in range(high - low):
+        tile[X * TILE + at + i] = np.float32(course[X, low + i] - origin_x)
+        tile[Y * TILE + at + i] = np.float32(course[Y, low + i] - origin_y)
+    for row in range(NORMAL_X, COURSE_ROWS):
+        for i in range(high - low):
+            tile[row * TILE + at + i] = np.float32(course[row, low + i])
 
 
 @compiled(fastmath=True)
-def reach_neighbours(course: Table, first: int, other: int, lanes: FloatsOut) -> float:
-    """Places of one neighbour of each lane in the lane's tangent frame; the nearest one's reach.
+def reach_neighbours(tile: Row, other: int, lanes: RowOut) -> None:
+    """Places of one neighbour of each lane in the lane's tangent frame.
 
-    ``course``: (6, P) as `Neighbourhoods` lays it out. ``first``: Place of lane 0. ``other``: Of
-    its neighbour. ``lanes``: (8 `LANES`,) x, y, normal, chain and largest distance so far of each
-    point, which grows to `BEYOND` where the chain ends or turns; output: distance along the tangent
-    and along the normal.
+    ``tile``: Of `cut_tile`. ``other``: Place in it of lane 0's neighbour. ``lanes``: (8 `LANES`,)
+    place, normal and chain of the points; the largest distance so far, which grows to `BEYOND`
+    where the chain ends or turns; output: distance along the tangent and along the normal.
     """
-    x = course[X, other : other + LANES]
-    y = course[Y, other : other + LANES]
-    nx = course[NORMAL_X, other : other + LANES]
-    ny = course[NORMAL_Y, other : other + LANES]
-    chain = course[CHAIN, other : other + LANES]
-    nearest = BEYOND
+    near = tile[other : other + CHAIN * TILE + LANES]
     for k in range(LANES):
-        dx = x[k] - lanes[k]
-        dy = y[k] - lanes[LANES + k]
-        own_x = lanes[2 * LANES + k]
-        own_y = lanes[3 * LANES + k]
+        dx = near[X * TILE + k] - lanes[X * LANES + k]
+        dy = near[Y * TILE + k] - lanes[Y * LANES + k]
+        nx, ny = near[NORMAL_X * TILE + k], near[NORMAL_Y * TILE + k]
+        chain = near[CHAIN * TILE + k]
+        own_x = lanes[NORMAL_X * LANES + k]
+        own_y = lanes[NORMAL_Y * LANES + k]
         along = dy * own_x - dx * own_y
-        lanes[6 * LANES + k] = along
-        lanes[7 * LANES + k] = dx * own_x + dy * own_y
-        reach = max(lanes[5 * LANES + k], abs(along))
-        is_turned = abs(nx[k] * own_x + ny[k] * own_y) < MOST_TURNED_COSINE
-        is_other = (chain[k] != lanes[4 * LANES + k]) | (chain[k] < 0.0)
+        lanes[ALONG * LANES + k] = along
+        lanes[ACROSS * LANES + k] = dx * own_x + dy * own_y
+        reach = max(lanes[REACHED * LANES + k], abs(along))
+        is_turned = abs(nx * own_x + ny * own_y) < MOST_TURNED_COSINE
+        is_other = (chain != lanes[CHAIN * LANES + k]) | (chain < ZERO)
         reach = BEYOND if is_turned | is_other else reach
-        lanes[5 * LANES + k] = reach
-        nearest = min(nearest, reach)
-    return nearest
+        lanes[REACHED * LANES + k] = reach
+
+
+@compiled(fastmath=True)
+def count_within(lanes: Row, reach: np.float32) -> np.float32:
+    """Count of the lanes whose neighbour lies not beyond a reach."""
+    # as a sum, which is vectorised, as a minimum is not
+    count = ZERO
+    for k in range(LANES):
+        count += ONE if lanes[REACHED * LANES + k] <= reach else ZERO
+    return count
 
 
 @compiled(fastmath=True)
 def add_neighbours(
-    weight: Floats, lanes: Floats, inner: float, outer: float, moments: FloatsOut
+    weight: Row, lanes: Row, inner: np.float32, outer: np.float32, moments: RowOut
 ) -> None:
     """Add the neighbours that lie farther than ``inner`` and not beyond ``outer``.
 
     ``weight``: (`LANES`,) theirs. ``lanes``: Of `reach_neighbours`. ``moments``: (9 `LANES`,).
     """
     for k in range(LANES):
-        reach = lanes[5 * LANES + k]
-        w = weight[k] if (reach > inner) & (reach <= outer) else 0.0
-        s = lanes[6 * LANES + k]
-        d = lanes[7 * LANES + k]
+        reach = lanes[REACHED * LANES + k]
+        w = weight[k] if (reach > inner) & (reach <= outer) else ZERO
+        s = lanes[ALONG * LANES + k]
+        d = lanes[ACROSS * LANES + k]
         ws = w * s
         wss = ws * s
         wsss = wss * s
@@ -95,66 +128,56 @@ def add_neighbours(
         moments[5 * LANES + k] += w * d
         moments[6 * LANES + k] += ws * d
         moments[7 * LANES + k] += wss * d
-        moments[8 * LANES + k] += 1.0 if w > 0.0 else 0.0
+        moments[8 * LANES + k] += ONE if w > ZERO else ZERO
 
 
 @compiled(fastmath=True)
-def gather_moments(course: Table, windows_px: Floats, is_asked: Ints, moments: FloatsOut) -> None:
-    """Moments of the neighbours of each point, ring by ring of the windows.
+def gather_moments(tile: Row, margin: int, windows_px: Row, lanes: RowOut, moments: RowOut) -> None:
+    """Moments of the neighbours of one block of points, ring by ring of the windows.
 
     Neighbours are taken in the tangent frame of a point while they lie on its chain, within reach
     along the tangent and not turned by more than about 50 degrees. The point itself counts in the
     first ring.
 
-    ``course``: (6, P) as `Neighbourhoods` lays it out. ``windows_px``: (K,) half widths along the
-    tangent, increasing. ``is_asked``: (P / `LANES`,) 0 for blocks whose moments stay as they are.
-    ``moments``: (P K 9,) output, by block, ring, moment and lane.
+    ``tile``, ``margin``: Of `cut_tile`. ``windows_px``: (K,) half widths along the tangent,
+    increasing. ``lanes``: (8 `LANES`,) scratch. ``moments``: (9 K `LANES`,) output, by ring, moment
+    and lane.
     """
     n_windows = windows_px.shape[0]
-    places = course.shape[1]
     of_ring = MOMENTS * LANES
     largest = windows_px[n_windows - 1]
-    lanes = np.zeros(8 * LANES)
-    for block in range(1, places // LANES - 1):
-        if is_asked[block] == 0:
-            continue
-        first = block * LANES
-        own = moments[block * n_windows * of_ring : (block + 1) * n_windows * of_ring]
-        own[:] = 0.0
-        for k in range(LANES):
-            weight = course[WEIGHT, first + k]
-            own[k] = weight
-            own[COUNT * LANES + k] = 1.0 if weight > 0.0 else 0.0
-            for row in range(4):
-                lanes[row * LANES + k] = course[row, first + k]
-            lanes[4 * LANES + k] = course[CHAIN, first + k]
-        for direction in (-1, 1):
-            lanes[5 * LANES : 6 * LANES] = 0.0
-            other = first + direction
-            ring = 0
-            while 0 <= other <= places - LANES:
-                nearest = reach_neighbours(course, first, other, lanes)
-                if nearest > largest:
+    moments[:] = ZERO
+    for k in range(LANES):
+        weight = tile[WEIGHT * TILE + MARGIN + k]
+        moments[k] = weight
+        moments[COUNT * LANES + k] = ONE if weight > ZERO else ZERO
+    for row in range(CHAIN + 1):
+        own = row * TILE + MARGIN
+        lanes[row * LANES : (row + 1) * LANES] = tile[own : own + LANES]
+    for direction in (-1, 1):
+        lanes[REACHED * LANES : (REACHED + 1) * LANES] = ZERO
+        other = MARGIN + direction
+        ring = 0
+        while abs(other - MARGIN) <= margin:
+            reach_neighbours(tile, other, lanes)
+            n_near = count_within(lanes, largest)
+            if n_near == ZERO:
+                break
+            while count_within(lanes, windows_px[ring]) == ZERO:
+                ring += 1
+            weights = tile[WEIGHT * TILE + other : WEIGHT * TILE + other + LANES]
+            at = ring
+            inner = windows_px[ring - 1] if ring > 0 else -ONE
+            while True:
+                outer = windows_px[at]
+                add_neighbours(
+                    weights, lanes, inner, outer, moments[at * of_ring : (at + 1) * of_ring]
+                )
+                if count_within(lanes, outer) == n_near:
                     break
-                while nearest > windows_px[ring]:
-                    ring += 1
-                farthest = 0.0
-                for k in range(LANES):
-                    reach = lanes[5 * LANES + k]
-                    farthest = max(farthest, reach if reach <= largest else 0.0)
-                weights = course[WEIGHT, other : other + LANES]
-                at = ring
-                inner = windows_px[ring - 1] if ring > 0 else -1.0
-                while True:
-                    outer = windows_px[at]
-                    add_neighbours(
-                        weights, lanes, inner, outer, own[at * of_ring : (at + 1) * of_ring]
-                    )
-                    if farthest <= outer:
-                        break
-                    inner = outer
-                    at += 1
-                other += direction
+                inner = outer
+                at += 1
+            other += direction
 
 
 LOWER, UPPER, IS_OPEN, INFLATED, CHOSEN = (MOMENTS + SMOOTH_ROWS + k for k in range(5))
@@ -163,12 +186,12 @@ STATE_ROWS = CHOSEN + MOMENTS
 
 @compiled(fastmath=True)
 def widen(
-    moments: Floats, reach: float, inflation: float, confidence: float, state: FloatsOut
+    moments: Row, reach: np.float32, inflation: np.float32, confidence: np.float32, state: RowOut
 ) -> None:
     """Fit parabolas to one more ring, and take those that agree with the narrower ones.
 
     ``moments``: (9 `LANES`,) of the ring. ``reach``, ``inflation``, ``confidence``: As for
-    `choose_windows`. ``state``: (31 `LANES`,) moments so far, results, interval and chosen moments.
+    `smooth_lanes`. ``state``: (31 `LANES`,) moments so far, results, interval and chosen moments.
     """
     for k in range(MOMENTS * LANES):
         state[k] += moments[k]
@@ -189,13 +212,13 @@ def widen(
         c22 = s0 * s2 - s1 * s1
         determinant = s0 * c00 + s1 * c01 + s2 * c02
         is_open = state[IS_OPEN * LANES + k]
-        is_told = state[COUNT * LANES + k] >= LEAST_POINTS
+        is_told = state[COUNT * LANES + k] >= np.float32(LEAST_POINTS)
         is_told &= determinant > LEAST_DETERMINANT * s0 * s2 * s4
-        is_told &= is_open > 0.0
-        share = 1.0 / (determinant if is_told else 1.0)
+        is_told &= is_open > ZERO
+        share = ONE / (determinant if is_told else ONE)
         value = (c00 * d0 + c01 * d1 + c02 * d2) * share
         variance = c00 * share * inflation
-        sigma = math.sqrt(variance if is_told else 0.0)
+        sigma = np.float32(math.sqrt(variance if is_told else ZERO))
         lower = state[LOWER * LANES + k]
         upper = state[UPPER * LANES + k]
         lower = max(lower, value - confidence * sigma) if is_told else lower
@@ -203,16 +226,16 @@ def widen(
         state[LOWER * LANES + k] = lower
         state[UPPER * LANES + k] = upper
         is_taken = is_told & (lower <= upper)
-        state[IS_OPEN * LANES + k] = 0.0 if is_told & (lower > upper) else is_open
+        state[IS_OPEN * LANES + k] = ZERO if is_told & (lower > upper) else is_open
         at = (MOMENTS + SHIFT) * LANES + k
         state[at] = value if is_taken else state[at]
         at = (MOMENTS + SLOPE) * LANES + k
         state[at] = (c01 * d0 + c11 * d1 + c12 * d2) * share if is_taken else state[at]
         at = (MOMENTS + BEND) * LANES + k
-        state[at] = 2.0 * (c02 * d0 + c12 * d1 + c22 * d2) * share if is_taken else state[at]
+        state[at] = TWO * (c02 * d0 + c12 * d1 + c22 * d2) * share if is_taken else state[at]
         at = (MOMENTS + BEND_SIGMA) * LANES + k
-        square = 4.0 * c22 * share * inflation
-        state[at] = math.sqrt(square) if is_taken else state[at]
+        square = TWO * TWO * c22 * share * inflation
+        state[at] = np.float32(math.sqrt(square)) if is_taken else state[at]
         at = (MOMENTS + SMOOTH_SIGMA) * LANES + k
         state[at] = sigma if is_taken else state[at]
         at = (MOMENTS + WINDOW) * LANES + k
@@ -226,7 +249,7 @@ def widen(
 
 
 @compiled(fastmath=True)
-def predict(weight: Floats, state: FloatsOut) -> None:
+def predict(weight: Row, state: RowOut) -> None:
     """What the neighbours alone say of each lane's point, of the moments that were chosen.
 
     ``weight``: (`LANES`,) of the points. ``state``: As for `widen`.
@@ -241,41 +264,40 @@ def predict(weight: Floats, state: FloatsOut) -> None:
         c01 = s2 * s3 - s1 * s4
         c02 = s1 * s3 - s2 * s2
         determinant = s0 * c00 + s1 * c01 + s2 * c02
-        is_told = state[(MOMENTS + WINDOW) * LANES + k] > 0.0
+        is_told = state[(MOMENTS + WINDOW) * LANES + k] > ZERO
         is_told &= determinant > LEAST_DETERMINANT * s0 * s2 * s4
-        share = 1.0 / (determinant if is_told else 1.0)
+        share = ONE / (determinant if is_told else ONE)
         value = c00 * state[(CHOSEN + 5) * LANES + k]
         value += c01 * state[(CHOSEN + 6) * LANES + k]
         value += c02 * state[(CHOSEN + 7) * LANES + k]
         variance = c00 * share * state[INFLATED * LANES + k]
-        state[(MOMENTS + PREDICTED) * LANES + k] = value * share if is_told else 0.0
-        sigma = math.sqrt(variance if is_told else 0.0)
+        state[(MOMENTS + PREDICTED) * LANES + k] = value * share if is_told else ZERO
+        sigma = np.float32(math.sqrt(variance if is_told else ZERO))
         state[(MOMENTS + PREDICTED_SIGMA) * LANES + k] = sigma
 
 
 @compiled()
-def choose_windows(
+def smooth_lanes(
     course: Table,
-    moments: Floats,
     scale: float,
     sigma_px: Floats,
-    windows_px: Floats,
-    inflation: Floats,
+    windows_px: Row,
+    inflation: Row,
     confidence: float,
     is_asked: Ints,
-    result: TableOut,
+    result: ImageOut,
 ) -> None:
     """Smooth every point along its chain by a local quadratic in its own tangent frame.
 
     Windows grow while their estimates agree within the noise (intersection of confidence
     intervals): a bend stops the growth before its bias exceeds the noise.
 
-    ``course``: (6, P) as `Neighbourhoods` lays it out. ``moments``: Of `gather_moments`, with the
-    same windows.
-    ``scale``: Variance of the points over what their weights say. ``sigma_px``: (N,) standard
-    deviation along the normal. ``inflation``: (K,) factor on the variance of each window because
-    neighbours' noise is correlated. ``confidence``: Half width of the confidence intervals in
-    sigmas. ``is_asked``: (P / `LANES`,) 0 for blocks whose results stay as they are. ``result``:
+    ``course``: (6, P) as `Neighbourhoods` lays it out. ``scale``: Variance of the
+    points over what their weights say. ``sigma_px``: (N,) standard deviation along the normal.
+    ``windows_px``: (K,) half widths along the tangent, increasing. ``inflation``: (K,) factor on
+    the variance of each window because neighbours' noise is correlated. ``confidence``: Half width
+    of the confidence intervals in sigmas. ``is_asked``: (P / `LANES`,) 0 for blocks whose results
+    stay as they are. ``result``:
     (8, N) output: shift along the normal, slope of the line against the
     tangent, its second derivative (curvature) and that one's sigma, sigma of the shift, half window
     (0: not smoothed), prediction of the point's shift by its neighbours alone, and that
@@ -284,23 +306,30 @@ def choose_windows(
     n = sigma_px.shape[0]
     n_windows = windows_px.shape[0]
     of_ring = MOMENTS * LANES
-    state = np.zeros(STATE_ROWS * LANES)
+    state = np.zeros(STATE_ROWS * LANES, np.float32)
+    lanes = np.zeros(LANE_ROWS * LANES, np.float32)
+    moments = np.zeros(n_windows * of_ring, np.float32)
+    tile = np.zeros(COURSE_ROWS * TILE, np.float32)
+    margin = min(math.ceil(NEIGHBOURS_PER_PX * windows_px[n_windows - 1]), MARGIN)
     for first in range(0, n, LANES):
         block = first // LANES + 1
         if is_asked[block] == 0:
             continue
         last = min(n - first, LANES)
-        state[:] = 0.0
+        cut_tile(course, first + LANES, margin, tile)
+        gather_moments(tile, margin, windows_px, lanes, moments)
+        state[:] = ZERO
         state[LOWER * LANES : (LOWER + 1) * LANES] = -BEYOND
         state[UPPER * LANES : (UPPER + 1) * LANES] = BEYOND
-        state[IS_OPEN * LANES : (IS_OPEN + 1) * LANES] = 1.0
+        state[IS_OPEN * LANES : (IS_OPEN + 1) * LANES] = ONE
         for k in range(last):
-            state[(MOMENTS + SMOOTH_SIGMA) * LANES + k] = sigma_px[first + k]
+            state[(MOMENTS + SMOOTH_SIGMA) * LANES + k] = np.float32(sigma_px[first + k])
         for k in range(n_windows):
-            at = (block * n_windows + k) * of_ring
-            ring = moments[at : at + of_ring]
-            widen(ring, windows_px[k], inflation[k] * scale, confidence, state)
-        predict(course[WEIGHT, block * LANES : (block + 1) * LANES], state)
+            ring = moments[k * of_ring : (k + 1) * of_ring]
+            inflated = np.float32(inflation[k] * scale)
+            widen(ring, windows_px[k], inflated, np.float32(confidence), state)
+        own = WEIGHT * TILE + MARGIN
+        predict(tile[own : own + LANES], state)
         for row in range(SMOOTH_ROWS):
             at = (MOMENTS + row) * LANES
             result[row, first : first + last] = state[at : at + last]

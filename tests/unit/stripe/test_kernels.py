@@ -3,28 +3,29 @@
 
 import numpy as np
 import pytest
-from scipy.ndimage import correlate, map_coordinates
+from scipy.ndimage import correlate, map_coordinates, maximum_filter
 from scipy.optimize import curve_fit
 
-from armscan.kernels.chains import find_other_lines, sum_windows, walk_chains
+from armscan.kernels.chains import find_other_lines, measure_chains, sum_windows, walk_chains
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
     CENTRE,
     SIGMA,
     VARIANCE,
+    average_sides,
     fit_profiles,
     read_sides,
 )
 from armscan.kernels.ridge import (
-    derivatives_along,
     derivatives_at,
     find_runs,
     gaussian_taps,
     interpolate_columns,
     refine_candidates,
     sample_across,
+    sum_at_border,
 )
-from armscan.kernels.section import bin_residuals, common_terms, weigh_section
+from armscan.kernels.section import bin_residuals, common_terms, mark_points, weigh_section
 
 FLOAT32 = 3e-5
 """Rounding of 32-bit sums over a few hundred pixels of grey level 255, relative to 1."""
@@ -48,8 +49,10 @@ def test_taps_differentiate_polynomials_exactly() -> None:
 def test_derivatives_match_scipy(pixel: tuple[int, int]) -> None:
     image = np.random.default_rng(1).uniform(0, 255, (30, 40)).astype(np.float32)
     taps = gaussian_taps(1.7)
-    result = np.zeros(5)
-    derivatives_at(image, *pixel, taps, taps.shape[1] // 2, np.zeros_like(taps), result)
+    radius, result = taps.shape[1] // 2, np.zeros(5, np.float32)
+    padded = np.zeros((3, 16), np.float32)
+    padded[:, : taps.shape[1]] = taps
+    derivatives_at(image, *pixel, padded, radius, result)
     g0, g1, g2 = taps.astype(np.float64)
     pairs = ((g0, g1), (g1, g0), (g0, g2), (g1, g1), (g2, g0))
     x, y = pixel
@@ -425,17 +428,107 @@ def test_sums_along_chains_are_those_of_each_chain() -> None:
     assert sums == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("row", [17, 0, 39])
-def test_pixels_of_a_row_share_their_columns(row: int) -> None:
-    image = np.random.default_rng(1).uniform(0, 255, (40, 128)).astype(np.float32)
-    taps = gaussian_taps(1.7)
-    radius = taps.shape[1] // 2
-    own, along = np.zeros(5), np.zeros((5, 40), np.float32)
-    derivatives_along(image, 60, 37, row, taps, radius, np.zeros((3, 80), np.float32), along)
-    for k in (0, 20, 36):
-        derivatives_at(image, 60 + k, row, taps, radius, np.zeros_like(taps), own)
-        assert along[:, k] == pytest.approx(own, rel=FLOAT32, abs=255.0 * FLOAT32)
-    assert not along[:, 37:].any()
+def test_patches_are_summed_as_at_the_border() -> None:
+    """The lanes of single precision against plain loops, of all widths of the taps."""
+    image = np.random.default_rng(12).uniform(0, 255, (70, 90)).astype(np.float32)
+    for sigma in (1.0, 3.0, 8.0):
+        taps = gaussian_taps(sigma)
+        radius, own, beside = taps.shape[1] // 2, np.zeros(5, np.float32), np.zeros(5, np.float32)
+        padded = np.zeros((3, -(-taps.shape[1] // 8) * 8), np.float32)
+        padded[:, : taps.shape[1]] = taps
+        for x, y in ((radius, radius), (40, 35), (90 - padded.shape[1] + radius, 69 - radius)):
+            derivatives_at(image, x, y, padded, radius, own)
+            sum_at_border(image, x, y, padded, radius, beside)
+            assert own == pytest.approx(beside, rel=FLOAT32, abs=255.0 * FLOAT32)
+
+
+def averaged(values: np.ndarray, weights: np.ndarray, chain: np.ndarray, half: int) -> np.ndarray:
+    """Twin: weighted means (N,) over the neighbours on a chain; NaN where nothing weighs."""
+    places = np.arange(len(chain))
+    near = np.abs(places[:, None] - places) <= half
+    near &= chain[:, None] == chain
+    total = near @ weights
+    return np.where(total > 0.0, near @ (weights * values) / np.maximum(total, 1e-300), np.nan)
+
+
+def test_sides_are_averaged_where_no_line_lights_them_up() -> None:
+    rng = np.random.default_rng(13)
+    n = 60
+    raw, ground = rng.uniform(5.0, 9.0, (n, 4)), rng.uniform(0.3, 1.0, (n, 4))
+    raw[:, 1::2] = rng.integers(0, 7, (n, 2))
+    neighbour = rng.uniform(0.0, 40.0, (n, 2))
+    neighbour[20:30] = 0.0
+    chain = np.repeat([0, 2, 3], [31, 1, 28])
+    found = np.zeros((n, 3))
+    average_sides(raw, ground, neighbour, 15.0, chain, 4, found)
+    count, clear = raw[:, 1::2], neighbour > 15.0
+    seen = np.where(count > 0.0, ground[:, ::2], 1.0)
+    level = raw[:, ::2] / seen
+    mean = np.stack(
+        [averaged(level[:, k], (count * clear * seen**2)[:, k], chain, 4) for k in (0, 1)], axis=1
+    )
+    own = np.where(clear, mean, np.nan)
+    lowest = np.where(count > 0.0, level, np.inf).min(axis=1)
+    lowest = np.where(np.isfinite(lowest), lowest, 0.0)[:, None]
+    sides = np.where(np.isnan(own), own[:, ::-1], own)
+    assert found[:, :2] == pytest.approx(np.where(np.isnan(sides), lowest, sides), rel=1e-9)
+    places = np.minimum([31, 1, 28], 9)[np.searchsorted([0, 2, 3], chain)]
+    pixels = np.where(np.isnan(own).any(axis=1), 1.0, count.min(axis=1)) * places
+    expected = np.sqrt(2.0 / np.maximum(pixels, 1.0)) / seen.min(axis=1)
+    assert found[:, 2] == pytest.approx(expected, rel=1e-9)
+    assert (found[20:30, 0] == found[20:30, 1]).all()
+
+
+def test_marks_follow_their_definitions() -> None:
+    """Each flag against its definition in NumPy, on profiles of which a part shows each."""
+    rng = np.random.default_rng(14)
+    n = 200
+    chain = np.repeat([0, 1], [120, 80])
+    turn = rng.uniform(0.0, np.pi, n)
+    is_row = np.abs(np.cos(turn)) > np.abs(np.sin(turn))
+    line = rng.integers(2, 38, n).astype(np.float64)
+    points = np.zeros((n, 6))
+    points[:, 2], points[:, 3], points[:, 5] = np.cos(turn), np.sin(turn), is_row
+    points[np.arange(n), is_row.astype(int)] = line
+    fits = np.abs(rng.normal(1.0, 0.5, (n, 8))) + 0.2
+    fits[:, 0] = rng.uniform(1.0, 38.0, n)
+    fits[:, 4] = rng.normal(0.0, 3.0, n)
+    fits[60:90, 4] = 12.0
+    sides, side_sigma = rng.normal(0.0, 0.3, (n, 2)), rng.uniform(0.02, 0.2, n)
+    neighbour = rng.uniform(0.0, 20.0, (n, 2))
+    saturated = (rng.uniform(size=(40, 40)) > 0.93).astype(np.uint8)
+    marks, flags = np.zeros((n, 4)), np.zeros(n, np.int64)
+    given = (points, fits, sides, side_sigma, neighbour, chain, saturated)
+    mark_points(*given, np.array([1, 2, 4, 8]), marks, flags)
+    across = np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
+    centre = np.where(is_row[:, None], np.stack([fits[:, 0], line], 1), 0.0)
+    centre += np.where(is_row[:, None], 0.0, np.stack([line, fits[:, 0]], 1))
+    width = fits[:, 2] * across
+    expected = np.stack([*centre.T, np.sqrt(fits[:, 3]) * across, width], axis=1)
+    assert marks == pytest.approx(expected, rel=1e-12)
+    x, y = np.rint(centre).astype(int).T
+    step = np.abs(np.diff(sides, axis=1)[:, 0])
+    near = np.abs(np.arange(n)[:, None] - np.arange(n)) <= 4
+    near &= chain[:, None] == chain
+    lean, norm = np.abs(near @ fits[:, 4]), near @ fits[:, 5]
+    definitions = (
+        maximum_filter(saturated, 3, mode="nearest")[y, x] > 0,
+        (step > 5.0 * side_sigma) & (step > 0.2 * fits[:, 1]),
+        (lean > 5.0 * np.sqrt(norm)) & (lean / norm > np.maximum(0.1, 0.3 / width)),
+        neighbour.min(axis=1) < 4.5 * width,
+    )
+    for bit, holds in enumerate(definitions):
+        assert 0 < holds.sum() < n
+        assert (((flags >> bit) & 1) == holds).all()
+
+
+def test_extents_are_those_of_each_chain() -> None:
+    points = np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 5.0], [9.0, 9.0], [0.0, 0.0], [0.0, 2.0]])
+    start, stop, length = np.zeros(6, np.int64), np.zeros(6, np.int64), np.zeros(6)
+    measure_chains(points, np.array([0, 0, 0, 4, 7, 7]), start, stop, length)
+    assert start.tolist() == [0, 0, 0, 3, 4, 4]
+    assert stop.tolist() == [3, 3, 3, 4, 6, 6]
+    assert length.tolist() == [6.0, 6.0, 6.0, 0.0, 2.0, 2.0]
 
 
 def test_dark_cells_are_not_read() -> None:

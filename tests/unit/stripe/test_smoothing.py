@@ -87,16 +87,18 @@ def test_each_point_is_that_of_a_fit_of_its_own() -> None:
                 break
             expected, sigma, window, rows, inflated = fit, spread, reach, near, inflation
         taken.append(window)
-        assert result[WINDOW, i] == window
-        assert result[[SHIFT, SLOPE], i] == pytest.approx(expected[:2], rel=1e-7, abs=1e-9)
-        assert result[BEND, i] == pytest.approx(2.0 * expected[2], rel=1e-7, abs=1e-9)
-        assert result[SMOOTH_SIGMA, i] == pytest.approx(sigma, rel=1e-7)
+        assert result[WINDOW, i] == np.float32(window)
+        # single precision: what a fit of points on one side of theirs cancels leaves 4 digits
+        assert result[SHIFT, i] == pytest.approx(expected[0], abs=1e-3 * sigma)
+        assert result[SLOPE, i] == pytest.approx(expected[1], rel=1e-4, abs=1e-5)
+        assert result[BEND, i] == pytest.approx(2.0 * expected[2], rel=1e-3, abs=1e-5)
+        assert result[SMOOTH_SIGMA, i] == pytest.approx(sigma, rel=1e-4)
         others = [j for j in rows if j != i]
         if len(others) > LEAST_POINTS:
             fit, covariance = parabola(course, i, others)
-            assert result[PREDICTED, i] == pytest.approx(fit[0], rel=1e-6, abs=1e-9)
             spread = np.sqrt(covariance[0, 0] * inflated * scale)
-            assert result[PREDICTED_SIGMA, i] == pytest.approx(spread, rel=1e-6)
+            assert result[PREDICTED, i] == pytest.approx(fit[0], abs=1e-3 * spread)
+            assert result[PREDICTED_SIGMA, i] == pytest.approx(spread, rel=1e-4)
     assert set(taken) >= {0.0, 7.7, 12.0}, "windows stop growing at bends"
 
 

@@ -7,18 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.kernels.profile_fit import AMPLITUDE, BEND_GAIN, CENTRE, SIGMA, VARIANCE
+from armscan.geometry.arrays import FloatArray
+from armscan.kernels.profile_fit import AMPLITUDE, BEND_GAIN, SIGMA
+from armscan.kernels.section import MARK_SIGMA, MARK_WIDTH
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, Profile, StripeFlag
-from armscan.vision.stripe.fit import ProfileFits, axis_component, fit_ridge
+from armscan.vision.stripe.fit import ProfileFits, fit_ridge
 from armscan.vision.stripe.flags import (
-    is_asymmetric,
-    is_background_step,
+    MERGED_SIGMAS,
+    close_gaps,
     is_cut_off,
-    is_near_other_line,
     is_saturated,
     is_short,
+    mark,
 )
 from armscan.vision.stripe.image import (
     EVEN,
@@ -65,6 +66,8 @@ BEND_SPAN = 12
 """Points to both sides by which a sharper bend is seen, 0.001 to 0.002 of noise beside it."""
 BEND_MARGIN = 3.0
 """Times what is seen of a bend, for it is seen roughly."""
+BEYOND_BENDS = 1e9
+"""In 1/px, where the bend is not seen."""
 LEAST_PULL = 0.03
 """Of a centre's sigma: where not even the sharpest bend pulls so much, none is looked for."""
 
@@ -199,21 +202,18 @@ def to_profile(
     """Flag the fitted centres, smooth them along their chains and map them to the full sensor."""
     if not len(fits.ridge):
         return Profile.empty(source=exposure.source)
-    points, normals, sigma = fitted_centres(fits)
+    marks, flags = mark(fits, plane.saturated)
+    points, normals = np.ascontiguousarray(marks[:, :2]), fits.ridge.table[:, 2:4].copy()
+    sigma, width = np.maximum(marks[:, MARK_SIGMA], LEAST_SIGMA_PX), marks[:, MARK_WIDTH].copy()
     chain = fits.ridge.chain
-    width = fits.values[:, SIGMA] * axis_component(fits.ridge.table)
-    near = is_near_other_line(fits.neighbour, chain, width)
-    is_known = plane.reflectance.size > 1
-    flags = np.full(len(points), int(StripeFlag.GROUND_KNOWN) if is_known else 0)
-    for flag, holds in (
-        (StripeFlag.SATURATED, is_saturated(points, plane.saturated)),
-        (StripeFlag.BACKGROUND_STEP, is_background_step(fits)),
-        (StripeFlag.ASYMMETRIC, is_asymmetric(fits, width)),
-        (StripeFlag.NEIGHBOUR, near),
-        (StripeFlag.END, is_cut_off(fits, points, width, plane.image.shape)),
-        (StripeFlag.SHORT_SEGMENT, is_short(points, chain)),
-    ):
-        flags[holds] |= int(flag)
+    near = (flags & int(StripeFlag.NEIGHBOUR)) != 0
+    if near.any():
+        near = close_gaps(near, chain, MERGED_SIGMAS * width)
+        flags[near] |= int(StripeFlag.NEIGHBOUR)
+    if plane.reflectance.size > 1:
+        flags |= int(StripeFlag.GROUND_KNOWN)
+    flags[is_cut_off(fits, points, width, plane.image.shape)] |= int(StripeFlag.END)
+    flags[is_short(points, chain)] |= int(StripeFlag.SHORT_SEGMENT)
     usable = (flags & int(REJECTING)) == 0
     # beyond a crossing a chain may follow the other line: nothing is averaged across it
     is_new = (np.diff(chain) != 0) | (np.diff(near) != 0)
@@ -242,16 +242,6 @@ def to_profile(
     )
 
 
-def fitted_centres(fits: ProfileFits) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fitted centres (N, 2), normals (N, 2) and sigma along the normal (N,), in image pixels."""
-    table = fits.ridge.table
-    axis: IntArray = table[:, 5].astype(np.int64)
-    points = table[:, :2].copy()
-    points[np.arange(len(table)), 1 - axis] = fits.values[:, CENTRE]
-    sigma = np.sqrt(fits.values[:, VARIANCE]) * axis_component(table)
-    return points, table[:, 2:4].copy(), np.maximum(sigma, LEAST_SIGMA_PX)
-
-
 def straighten(course: Polyline, fits: ProfileFits) -> Polyline:
     """Take out the bias of a column or row that cuts a bent line at a slant.
 
@@ -277,9 +267,9 @@ def straighten(course: Polyline, fits: ProfileFits) -> Polyline:
 def seen_bend(course: Polyline) -> FloatArray:
     """Curvature (N,) in 1/px of the circle through a point and those `BEND_SPAN` to both sides.
 
-    Infinite where the chain ends so near.
+    `BEYOND_BENDS` where the chain ends so near.
     """
-    bend = np.full(len(course), np.inf)
+    bend = np.full(len(course), BEYOND_BENDS)
     if len(course) <= 2 * BEND_SPAN:
         return bend
     before, own = slice(0, -2 * BEND_SPAN), slice(BEND_SPAN, len(course) - BEND_SPAN)
@@ -289,5 +279,5 @@ def seen_bend(course: Polyline) -> FloatArray:
         across += (place[before] + place[after] - 2.0 * place[own]) * normal[own]
         square += (place[after] - place[before]) ** 2
     is_one = course.chain[before] == course.chain[after]
-    bend[own] = np.where(is_one, 4.0 * np.abs(across) / square, np.inf)
+    bend[own] = np.where(is_one, 4.0 * np.abs(across) / square, BEYOND_BENDS)
     return bend

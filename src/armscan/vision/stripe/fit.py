@@ -20,6 +20,7 @@ from armscan.kernels.profile_fit import (
     SIDE_SPAN,
     SIGMA,
     VARIANCE,
+    average_sides,
     fit_profiles,
     read_sides,
 )
@@ -43,9 +44,7 @@ from armscan.vision.stripe.ridge import (
     SHORTEST_PX,
     RidgePoints,
     chain_bounds,
-    chain_lengths_px,
-    mean_along,
-    sum_along,
+    chain_extents,
 )
 
 START_CONTRAST2 = 0.03
@@ -239,8 +238,8 @@ def fit_ridge(
     neighbour = _neighbours(plane, ridge, line_sigma_px)
     room = np.minimum(*neighbour.T) / line_sigma_px - FOOT_SIGMAS
     reach = np.clip(room, LEAST_REACH_SIGMAS, REACH_SIGMAS)
-    is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
-    sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
+    beside = (ridge, sigma, neighbour, CLEAR_SIGMAS * line_sigma_px)
+    sides, side_sigma = _sides(plane, *beside)
     guess = noise = start_noise(background_noise)
     bare, black = plane, 0.0
     section = np.zeros(4)
@@ -275,7 +274,7 @@ def fit_ridge(
         if plane.reflectance.size > 1:
             black += estimate_black(fitted.said(noise, section))
             plane = bare.with_black(black)
-            sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
+            sides, side_sigma = _sides(plane, *beside)
     values = np.zeros((len(table), FIT_COLUMNS))
     values[pick] = sample
     ground = plane.reflectance
@@ -290,7 +289,7 @@ def fit_ridge(
         ridge,
         values,
         sides,
-        side_sigma,
+        background_noise * side_sigma,
         neighbour,
         noise,
         section,
@@ -353,12 +352,12 @@ def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatAr
 
 def _neighbours(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> FloatArray:
     height, width = plane.image.shape
-    length = chain_lengths_px(ridge.table[:, :2], ridge.chain)
+    start, stop, length = chain_extents(ridge.table, ridge.chain)
     distance = np.zeros((len(ridge), 2))
     reach = max(CLEAR_SIGMAS * line_sigma_px, LEAST_REACH_PX)
     is_line = (length >= SHORTEST_PX).astype(np.int64)
-    bounds = chain_bounds(ridge.chain)
-    find_other_lines(ridge.table, ridge.chain, *bounds, is_line, height, width, reach, distance)
+    given = (ridge.table, ridge.chain, start, stop, is_line)
+    find_other_lines(*given, height, width, reach, distance)
     return distance
 
 
@@ -366,31 +365,17 @@ def _sides(
     plane: StripePlane,
     ridge: RidgePoints,
     sigma: FloatArray,
-    is_clear: BoolArray,
-    background_noise: float,
+    neighbour: FloatArray,
+    clear_px: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Background on both sides, averaged along the line, and the sigma of their difference.
-
-    Both are of light on ground of reflectance 1. A side that another line lights up takes the value
-    of the other side.
-    """
+    """Background (N, 2) of `average_sides`, and the sigma (N,) of its difference, in pixels'."""
     raw, ground = np.zeros((len(ridge), 4)), np.ones((len(ridge), 4))
     read_sides(plane.image, ridge.table, sigma, raw)
     if plane.reflectance.size > 1:
         read_sides(plane.reflectance, ridge.table, sigma, ground)
-    clear = is_clear.T
-    count, seen = raw.T[1::2] * clear, np.where(raw.T[1::2] > 0.0, ground.T[0::2], 1.0)
-    level, weight = raw.T[0::2] / seen, count * seen**2
-    stretch = _axis_runs(ridge)
-    places = np.minimum(np.subtract(*chain_bounds(stretch)[::-1]), 2 * SIDE_HALF + 1)
-    has_own = (sum_along(weight, stretch, SIDE_HALF) > 0.0) & clear
-    mean = mean_along(level, weight, stretch, SIDE_HALF)
-    lowest = np.minimum(*np.where(raw.T[1::2] > 0.0, level, np.inf))
-    lowest = np.where(np.isfinite(lowest), lowest, 0.0)
-    sides = np.where(has_own, mean, np.where(has_own[::-1], mean[::-1], lowest))
-    pixels = np.where(has_own[0] & has_own[1], np.minimum(*count), 1.0) * places
-    on_ground = background_noise / np.minimum(*seen)
-    return np.ascontiguousarray(sides.T), on_ground * np.sqrt(2.0 / np.maximum(pixels, 1.0))
+    found = np.zeros((len(ridge), 3))
+    average_sides(raw, ground, neighbour, clear_px, _axis_runs(ridge), SIDE_HALF, found)
+    return np.ascontiguousarray(found[:, :2]), found[:, 2].copy()
 
 
 def _axis_runs(ridge: RidgePoints) -> IntArray:

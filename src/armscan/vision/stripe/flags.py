@@ -11,53 +11,41 @@ from numpy.typing import NDArray
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX
-from armscan.kernels.profile_fit import AMPLITUDE, REACH_SIGMAS, SKEW, SKEW_NORM
+from armscan.kernels.profile_fit import REACH_SIGMAS, SKEW, SKEW_NORM
+from armscan.kernels.section import MARK_COLUMNS, mark_points
+from armscan.records.profile import StripeFlag
 from armscan.vision.stripe.fit import ProfileFits, axis_component
 from armscan.vision.stripe.ridge import (
     SHORTEST_PX,
     chain_bounds,
-    chain_lengths_px,
+    chain_extents,
     mean_along,
     sum_along,
 )
 
-SIGNIFICANT = 5.0
-BACKGROUND_STEP = 0.2
-"""Smallest step that matters, as a share of the line's amplitude."""
-NEIGHBOUR_SIGMAS = 4.5
-"""Another line within this many sigmas pulls the centre."""
 MERGED_SIGMAS = 20.0
 """Where two lines cross at a small angle they run as one over about this many sigmas."""
-SKEW_HALF = 4
-LEAST_SKEW = 0.1
-"""Smallest third-order part of a profile that counts as leaning."""
-SKEW_PX = 0.3
-"""The part in px that counts on narrow lines, which few pixels describe."""
 
 
-def is_background_step(fits: ProfileFits) -> BoolArray:
-    """(N,) True where the two sides differ enough to move the centre.
+MARKS = (
+    StripeFlag.SATURATED,
+    StripeFlag.BACKGROUND_STEP,
+    StripeFlag.ASYMMETRIC,
+    StripeFlag.NEIGHBOUR,
+)
 
-    A step of height d beside a line of amplitude A and sigma s moves every method by about s d / A.
+
+def mark(fits: ProfileFits, saturated: NDArray[np.uint8]) -> tuple[FloatArray, IntArray]:
+    """Fitted centres x, y, their sigma, the line's sigma (N, 4), and the flags (N,) of each alone.
+
+    ``saturated``: (H, W) 1 where the laser's channel is; (1, 1) zero if it is nowhere.
     """
-    step = np.abs(fits.sides[:, 1] - fits.sides[:, 0])
-    is_certain = step > SIGNIFICANT * fits.side_sigma
-    return np.asarray(is_certain & (step > BACKGROUND_STEP * fits.values[:, AMPLITUDE]))
-
-
-def is_asymmetric(fits: ProfileFits, width_px: FloatArray) -> BoolArray:
-    """(N,) True where the profile's third-order part is certain and moves the centre.
-
-    The part is ``c m (u^3 - 3 u)`` beside the Gaussian ``m``; it moves the centre by about 0.6 c
-    sigmas.
-
-    ``fits``: Fitted profiles. ``width_px``: (N,) sigma of the line.
-    """
-    lean, norm = sum_along(fits.values[:, [SKEW, SKEW_NORM]].T, fits.ridge.chain, SKEW_HALF)
-    norm = np.maximum(norm, 1e-12)
-    size = np.abs(lean) / norm
-    limit = np.maximum(LEAST_SKEW, SKEW_PX / width_px)
-    return np.asarray((size * np.sqrt(norm) > SIGNIFICANT) & (size > limit))
+    n = len(fits.ridge)
+    marks, flags = np.zeros((n, MARK_COLUMNS)), np.zeros(n, np.int64)
+    bits = np.array([int(flag) for flag in MARKS])
+    given = (fits.ridge.table, fits.values, fits.sides, fits.side_sigma, fits.neighbour)
+    mark_points(*given, fits.ridge.chain, saturated, bits, marks, flags)
+    return marks, flags
 
 
 def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:
@@ -76,18 +64,6 @@ def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:
     return found
 
 
-def is_near_other_line(distance: FloatArray, chain: IntArray, width_px: FloatArray) -> BoolArray:
-    """(N,) True where another line is within `NEIGHBOUR_SIGMAS`, and where two lines have merged.
-
-    ``distance``: (N, 2) to the nearest other line on both sides. ``chain``: (N,) chain numbers.
-    ``width_px``: (N,) sigma of the line.
-    """
-    near = np.asarray(np.minimum(*distance.T) < NEIGHBOUR_SIGMAS * width_px)
-    if not near.any():
-        return near
-    return close_gaps(near, chain, MERGED_SIGMAS * width_px)
-
-
 def close_gaps(flags: BoolArray, chain: IntArray, span: FloatArray) -> BoolArray:
     """Set also the points between two flagged ones of a chain that are within ``span`` (N,)."""
     place = np.arange(len(flags))
@@ -100,7 +76,7 @@ def close_gaps(flags: BoolArray, chain: IntArray, span: FloatArray) -> BoolArray
 
 def is_short(points: FloatArray, chain: IntArray) -> BoolArray:
     """(N,) True where the point's chain is shorter than `SHORTEST_PX`."""
-    return np.asarray(chain_lengths_px(points, chain) < SHORTEST_PX)
+    return np.asarray(chain_extents(points, chain)[2] < SHORTEST_PX)
 
 
 SHAPE_HALF = 4

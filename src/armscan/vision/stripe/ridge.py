@@ -15,7 +15,13 @@ from scipy.ndimage import minimum_filter
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
-from armscan.kernels.chains import find_neighbours, place_points, sum_windows, walk_chains
+from armscan.kernels.chains import (
+    find_neighbours,
+    measure_chains,
+    place_points,
+    sum_windows,
+    walk_chains,
+)
 from armscan.kernels.ridge import (
     ROUNDING,
     find_runs,
@@ -184,13 +190,15 @@ def mean_along(values: FloatArray, weights: FloatArray, chain: IntArray, half: i
     return np.asarray(np.where(total > 0.0, mean / np.where(total > 0.0, total, 1.0), 0.0))
 
 
-def chain_lengths_px(points_px: FloatArray, chain: IntArray) -> FloatArray:
-    """Arc length (N,) of each point's chain."""
-    n = int(chain.max()) + 1 if len(chain) else 0
-    x, y = np.diff(points_px[:, 0]), np.diff(points_px[:, 1])
-    step = np.sqrt(x * x + y * y) * (chain[1:] == chain[:-1])
-    total = np.bincount(chain[1:], weights=step, minlength=n) if n else np.zeros(0)
-    return np.asarray(total[chain])
+def chain_extents(points: FloatArray, chain: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """First index, index after the last, and arc length in px of each point's chain: (N,) each.
+
+    ``points``: (N, >= 2) x, y. ``chain``: (N,) numbers; a chain's points are consecutive.
+    """
+    n = len(chain)
+    start, stop, length = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n)
+    measure_chains(np.ascontiguousarray(points), chain, start, stop, length)
+    return start, stop, length
 
 
 def strong_median(values: FloatArray) -> float:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -16,7 +17,6 @@ from armscan.kernels.smoothing import (
     CHAIN,
     COURSE_ROWS,
     LANES,
-    MOMENTS,
     NORMAL_X,
     NORMAL_Y,
     NOWHERE,
@@ -29,8 +29,7 @@ from armscan.kernels.smoothing import (
     WEIGHT,
     X,
     Y,
-    choose_windows,
-    gather_moments,
+    smooth_lanes,
 )
 
 SMALLEST_WINDOW_PX = 3.2
@@ -50,8 +49,6 @@ LEAST_HALF = 8
 OUTLIER_SIGMAS = 6.0
 RESIDUAL_WIDENING = 1.5
 """A wider parabola takes less of the noise with it."""
-NEIGHBOURS_PER_PX = 3.0
-"""More than points of a chain lie within a pixel along it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,56 +77,48 @@ class Polyline:
 
 
 class Neighbourhoods:
-    """Sums over the neighbours of each point of a polyline, in windows along its chain.
-
-    They are gathered once, and again only where points no longer count.
-    """
+    """The neighbours of each point of a polyline, in windows along its chain."""
 
     def __init__(
         self, course: Polyline, windows_px: FloatArray, asked: BoolArray | None = None
     ) -> None:
-        """Gather the neighbours.
+        """Lay the points out.
 
         ``windows_px``: (K,) half widths, increasing. ``asked``: (N,) points without which others
         tell nothing; the rest may be left out, and is then not smoothed. None for all.
         """
         n = len(course)
-        self._windows = windows_px
-        self._own = slice(LANES, LANES + n)
+        self._windows = windows_px.astype(np.float32)
         n_blocks = -(-n // LANES) + 2
+        own = slice(LANES, LANES + n)
         self._laid = np.zeros((COURSE_ROWS, n_blocks * LANES))
         self._laid[CHAIN] = NOWHERE
-        self._laid[X : Y + 1, self._own] = course.points.T
-        self._laid[NORMAL_X : NORMAL_Y + 1, self._own] = course.normals.T
-        self._laid[CHAIN, self._own] = course.chain
-        self._laid[WEIGHT, self._own] = course.weight
-        self._moments = np.zeros(n_blocks * LANES * len(windows_px) * MOMENTS)
+        self._laid[X : Y + 1, own] = course.points.T
+        self._laid[NORMAL_X : NORMAL_Y + 1, own] = course.normals.T
+        self._laid[CHAIN, own] = course.chain
+        # weights up to 1, so that their products stay within single precision
+        self._unit = float(course.sigma.min(initial=1.0)) ** 2
+        self._laid[WEIGHT, own] = course.weight * self._unit
         self._asked = np.ones(n_blocks, np.int64)
         if asked is not None:
             self._asked[:] = 0
             self._asked[np.flatnonzero(asked) // LANES + 1] = 1
-        gather_moments(self._laid, windows_px, self._asked, self._moments)
 
     def leave_out(self, rows: IntArray) -> None:
         """Let points (M,) of the polyline count no longer."""
         self._laid[WEIGHT, LANES + rows] = 0.0
-        is_asked = np.zeros(self._laid.shape[1] // LANES, np.int64)
-        far = int(np.ceil(NEIGHBOURS_PER_PX * self._windows[-1] / LANES))
-        for shift in range(-far, far + 1):
-            is_asked[np.clip(rows // LANES + 1 + shift, 0, len(is_asked) - 1)] = 1
-        gather_moments(self._laid, self._windows, is_asked, self._moments)
 
     def fit_parabolas(
         self, inflation: FloatArray, sigma: FloatArray, scale: float = 1.0
-    ) -> FloatArray:
-        """Result (8, N) of `choose_windows`.
+    ) -> NDArray[np.float32]:
+        """Result (8, N) of `smooth_lanes`.
 
         ``inflation``: (K,). ``sigma``: (N,) of the points. ``scale``: Their variance over that by
         which the neighbours were weighted.
         """
-        result = np.zeros((SMOOTH_ROWS, len(sigma)))
-        given = (self._laid, self._moments, scale, sigma, self._windows, inflation)
-        choose_windows(*given, CONFIDENCE, self._asked, result)
+        result = np.zeros((SMOOTH_ROWS, len(sigma)), np.float32)
+        given = (self._laid, scale * self._unit, sigma, self._windows)
+        smooth_lanes(*given, inflation.astype(np.float32), CONFIDENCE, self._asked, result)
         return result
 
 

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Lock
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast, get_args
 
@@ -144,6 +145,9 @@ MostViews: TypeAlias = Mapping[TwinScene, int | None]
 
 _here: list[Scenes] = []
 """The scenes of a rendering process; empty in any other process."""
+_first: list[Lock] = []
+"""Of a rendering process until its first image, during which it holds this: what is compiled for
+that, the next process takes from the cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,15 +267,19 @@ def rendered(name: TwinName, scenes: Scenes, processes: int) -> Generator[bytes]
         for scene, row in rows:
             yield scenes.png(scene, row)
         return
-    given = (name, dict(scenes.most_views))
+    given = (name, dict(scenes.most_views), get_context("spawn").Lock())
     yield from in_processes(_render, rows, n_processes, _start_rendering, given)
 
 
-def _start_rendering(name: TwinName, most_views: MostViews) -> None:
+def _start_rendering(name: TwinName, most_views: MostViews, first: Lock) -> None:
     _here.append(Scenes(name.build(), most_views))
+    _first.append(first)
 
 
 def _render(row: tuple[TwinScene, int]) -> bytes:
+    if _first:
+        with _first.pop():
+            return _here[0].png(*row)
     return _here[0].png(*row)
 
 

@@ -286,7 +286,8 @@ class TwinBench:
         return tuple(self._rendered(scene, first[camera]) for camera in sorted(first))
 
     def rest(self) -> None:
-        """As of `Bench`."""
+        """As of `Bench`: what is looked at next is shown, whatever was shown before."""
+        self._seen = None
 
     def _rendered(self, scene: TwinScene, row: int) -> Exposure:
         """An image of a scene; the latest are kept: they are looked at, and then taken."""

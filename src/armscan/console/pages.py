@@ -290,8 +290,13 @@ class ConsolePage:
     def take_one(self) -> None:
         """Record the placement or touch that is drawn, and say what is seen in it."""
         self.take()
-        if BY_NAME[self.step].filling == "placements":
-            self._seen = self.worker.run(seen_in_take, self.journey.folder, self.step)
+        step = self.step
+        if BY_NAME[step].filling == "placements":
+            n_taken = self.journey.n_taken(step)
+            seen = self.worker.run(seen_in_take, self.journey.folder, step)
+            # of something else, if the person has gone on meanwhile
+            if self.step is step and self.journey.n_taken(step) == n_taken:
+                self._seen = seen
 
     def take_all(self) -> None:
         """Record all that is left, as the twin shows it."""

@@ -33,9 +33,10 @@ from armscan.devices.protocols import (
 from armscan.devices.registry import open_device
 from armscan.devices.sources import Preset, ScanSource, TwinScene
 from armscan.errors import DeviceError, FileFormatError, OptionError
+from armscan.pipeline.live.acquire import exposure_of
 from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription, read_rig, told_as_fault_of
-from armscan.pipeline.live.session import LiveOptions, LiveSession, exposure_of
+from armscan.pipeline.live.session import LiveOptions, LiveSession
 from armscan.pipeline.simulate import TwinName, fewer_views
 from armscan.records.exposure import Exposure
 from armscan.records.recording import NO_TRIGGER, CameraSetup, ExposureRow, PoseForm, Session
@@ -83,34 +84,50 @@ class _Hand:
     at: int = 0
     due: float = 0.0
     _sample: int = 0
+    _ready: dict[int, Frame] = field(default_factory=dict)
+    """Of the other cameras, taken at the same moment."""
 
     @property
     def is_over(self) -> bool:
         return self.at >= len(self.source.rows)
 
     def frame(self, camera: int, timeout_s: float) -> Frame | None:
-        """The next exposure, rendered when it is due; None while the hand is held."""
+        """The next exposure, rendered when it is due; None while the hand is held.
+
+        All cameras' images of a moment are rendered before the first of them is given: one after
+        the other they would come too far apart to belong together.
+        """
+        if camera in self._ready:
+            return self._ready.pop(camera)
         wait = min(max(self.due - time.monotonic(), 0.0), timeout_s)
         if self.is_held or self.is_over or wait >= timeout_s:
             time.sleep(timeout_s if wait == 0.0 else wait)
             return None
         time.sleep(wait)
-        row = self.source.rows[self.at]
-        if row.camera != camera:
+        rows, first = self.source.rows, self.at
+        if rows[first].camera != camera or self._ready:
             time.sleep(0.002)
             return None
-        shot = self.source.exposure(self.at)
-        frame = Frame(
-            shot.image,
-            self.at // len(self.source.session.cameras),
-            row.t_ns,
-            time.monotonic_ns(),
-            trigger_id=row.trigger_id,
-            lasers=row.lasers,
-            window=shot.window,
-        )
+        last = first + 1
+        while last < len(rows) and rows[last].t_ns == rows[first].t_ns:
+            last += 1
+        shots = [self.source.exposure(k) for k in range(first, last)]
+        number, now_ns = first // len(self.source.session.cameras), time.monotonic_ns()
+        frames = {
+            row.camera: Frame(
+                shot.image,
+                number,
+                row.t_ns,
+                now_ns,
+                trigger_id=row.trigger_id,
+                lasers=row.lasers,
+                window=shot.window,
+            )
+            for row, shot in zip(rows[first:last], shots, strict=True)
+        }
         self.due = max(self.due, time.monotonic()) + 1.0 / self.rate_hz
-        self.at += 1
+        frame = frames.pop(camera)
+        self._ready, self.at = frames, last
         return frame
 
     def samples(self, timeout_s: float) -> tuple[ArmSample, ...]:
@@ -286,7 +303,8 @@ class TwinBench:
         return tuple(self._rendered(scene, first[camera]) for camera in sorted(first))
 
     def rest(self) -> None:
-        """As of `Bench`."""
+        """As of `Bench`: what is looked at next is shown, whatever was shown before."""
+        self._seen = None
 
     def _rendered(self, scene: TwinScene, row: int) -> Exposure:
         """An image of a scene; the latest are kept: they are looked at, and then taken."""

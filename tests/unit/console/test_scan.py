@@ -38,7 +38,7 @@ from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.reconstruction.sync import PoseStatus
-from armscan.records.exposure import SensorWindow
+from armscan.records.exposure import Exposure, SensorWindow
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings import mcap_file
 from rigs.console_rig import DrawnBench, FailingBench, drawn_scan, waited
@@ -342,6 +342,36 @@ def test_an_instant_that_is_recorded_after_it_was_taken_back_is_not_listed(tmp_p
     recorder.finish()
     assert [row.index for row in read_recording(tmp_path / "s.mcap").rows] == [0, 4]
     bench.close()
+
+
+def test_a_simulated_hand_gives_both_cameras_images_at_one_moment() -> None:
+    """Rendering takes longer than a matcher waits for a partner."""
+    one = drawn_scan(3)
+    rows = tuple(
+        replace(row, index=2 * k + camera, camera=camera)
+        for k, row in enumerate(one.rows)
+        for camera in (0, 1)
+    )
+
+    class SlowSource:
+        def __init__(self) -> None:
+            self.rows, self.arm = rows, one.arm
+            self.session = replace(one.session, cameras=one.session.cameras * 2)
+
+        def exposure(self, k: int) -> Exposure:
+            time.sleep(0.2)
+            return one.exposure(k // 2)
+
+    hand = _Hand(SlowSource(), rate_hz=1000.0, is_held=False)  # type: ignore[arg-type]
+    for k in range(3):
+        assert hand.frame(1, 0.01) is None, "the left one is first"
+        left = hand.frame(0, 0.01)
+        asked = time.monotonic()
+        right = hand.frame(1, 0.01)
+        assert time.monotonic() - asked < 0.15 and left is not None and right is not None
+        assert left.t_host_ns == right.t_host_ns
+        assert (left.number, right.number, left.trigger_id, right.trigger_id) == (k, k, k, k)
+    assert hand.is_over and hand.frame(0, 0.01) is None
 
 
 def test_both_cameras_of_an_instant_are_taken_back_together(tmp_path: Path) -> None:

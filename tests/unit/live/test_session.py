@@ -18,10 +18,16 @@ from armscan.devices.matching import InstantMatcher, MatchedInstant
 from armscan.devices.protocols import ArmSample, CameraSettings, Frame, LaserEvent
 from armscan.errors import DeviceError, InputError, OutputError
 from armscan.models.arm import forward, thesis_arm
-from armscan.pipeline.live.acquire import Acquisition, LiveEvent, WaitingInstant, WaitingInstants
+from armscan.pipeline.live.acquire import (
+    Acquisition,
+    LiveEvent,
+    WaitingInstant,
+    WaitingInstants,
+    exposure_of,
+)
 from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
-from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus, exposure_of
+from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
 from armscan.pipeline.measure import measure_instants
 from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.reconstruction.labels import SingleLabeller
@@ -467,6 +473,19 @@ def test_the_newest_is_measured_and_what_waits_is_recorded(
     counts = session.snapshot().counts
     assert counts == {LiveStatus.PLACED: 1, LiveStatus.NOT_SHOWN: 7}
     assert list(clouds) == [7] and kept.instants == list(range(8))
+
+
+def test_stripes_are_shown_on_the_image_in_which_they_were_measured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scan = triggered_scan(4)
+    dark = replace(frame(scan, 3), lasers=())
+    for newer_ns, shown in ((10**12, 2), (-(10**12), 3)):
+        monkeypatch.setattr("armscan.pipeline.live.session.NEWER_NS", newer_ns)
+        session, _, _ = run(rig_of(scan, [*(frame(scan, k) for k in range(3)), dark]), 4)
+        (view,) = session.snapshot().cameras
+        np.testing.assert_array_equal(view.image, frame(scan, shown).image)
+        assert bool(len(view.points_px)) == (shown == 2)
 
 
 def waiting(number: int, lasers: tuple[str, ...]) -> WaitingInstant:

@@ -11,11 +11,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
+import numpy as np
+
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import InstantMatcher, MatchedInstant, TimedSample
 from armscan.devices.protocols import ArmSample, Frame, LaserEvent
 from armscan.errors import ArmscanError
 from armscan.pipeline.live.rig import Rig, told_as_fault_of
+from armscan.records.exposure import Exposure
+from armscan.records.recording import CameraSetup
+from armscan.storage.recording import demosaiced
 
 READ_S = 0.1
 """A device is asked again after so long, so that a stop is obeyed at once."""
@@ -451,6 +456,33 @@ class WaitingInstants:
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
+
+
+def instant_ns(instant: MatchedInstant) -> int:
+    """Time of an instant; by the camera's own clock where no other is known."""
+    first = next(frame for frame in instant.frames if frame is not None)
+    return first.t_device_ns if instant.t_ns is None else instant.t_ns
+
+
+def exposure_of(
+    frame: Frame, setup: CameraSetup, instant: MatchedInstant, camera: int = 0
+) -> Exposure:
+    """An image as the measuring loop takes it, equal to what a recording of it gives."""
+    image = frame.image
+    if setup.align == "high":
+        image = np.right_shift(image, 8 * image.dtype.itemsize - setup.bits_used)
+    if setup.colour == "bayer_rggb":
+        image = demosaiced(image)
+    return Exposure(
+        image,
+        f"camera {camera} frame {frame.number}",
+        bits_used=setup.bits_used,
+        window=frame.window,
+        lasers=instant.lasers or (),
+        t_ns=instant_ns(instant),
+        camera=camera,
+        trigger_id=frame.trigger_id,
+    )
 
 
 def _lasers(one: WaitingInstant) -> tuple[str, ...] | None:

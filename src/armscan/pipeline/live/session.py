@@ -30,6 +30,8 @@ from armscan.pipeline.live.acquire import (
     Recorder,
     WaitingInstant,
     WaitingInstants,
+    exposure_of,
+    instant_ns,
 )
 from armscan.pipeline.live.exposure import ExposureControl, ExposureSettings, LineBrightness
 from armscan.pipeline.live.rig import Rig, RigDescription, told_as_fault_of
@@ -43,9 +45,6 @@ from armscan.pipeline.measure import (
 from armscan.reconstruction.labels import PointStatus, StripeLabeller
 from armscan.reconstruction.place import BaseTransform, merge_clouds, propagate_to_base
 from armscan.records.cloud import PointCloud
-from armscan.records.exposure import Exposure
-from armscan.records.recording import CameraSetup
-from armscan.storage.recording import demosaiced
 
 NEW_PASS_RAD = np.radians(25.0)
 """The head shows another side: a pass of its own, that can be undone by itself."""
@@ -53,6 +52,8 @@ STILL_MM, STILL_RAD = 0.05, 5e-4
 """A hand at rest and an arm's scatter move the tool by less between exposures."""
 STOP_NS = 500_000_000
 """Standing still for so long ends a pass."""
+NEWER_NS = 1_000_000_000
+"""An image that came so long after the last one that was measured is shown without stripes."""
 SELDOM_NS = 500_000_000
 """While recording is behind, one instant in so long is measured: it needs the processor."""
 LATENCIES = 500
@@ -115,7 +116,7 @@ class LiveOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraView:
-    """The latest image of one camera.
+    """The latest image of one camera that was measured, or one that is a second newer.
 
     Parameters
     ----------
@@ -124,7 +125,7 @@ class CameraView:
     lasers
         Sources that were on; None where it is not known.
     points_px
-        (N, 2) measured stripe points, full-sensor pixels.
+        (N, 2) stripe points measured in this image, full-sensor pixels.
     sheet
         (N,) index into the sensor's sheets.
     """
@@ -271,7 +272,7 @@ class LiveSession:
         self._version = self._n_instants = 0
         self._counts: Counter[LiveStatus] = Counter()
         self._frames: dict[int, tuple[Frame, tuple[str, ...] | None]] = {}
-        self._stripes: dict[int, tuple[FloatArray, IntArray]] = {}
+        self._measured: dict[int, tuple[int, CameraView]] = {}
         self._latest: Pose[Base, Tool] | None = None
         self._moved_ns = 0
         self._last_moved: Pose[Base, Tool] | None = None
@@ -430,12 +431,8 @@ class LiveSession:
 
     def snapshot(self) -> LiveSnapshot:
         """What there is to show now."""
-        nobody = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
         with self._lock:
-            views = tuple(
-                CameraView(frame.image, lasers, *self._stripes.get(k, nobody))
-                for k, (frame, lasers) in sorted(self._frames.items())
-            )
+            views = tuple(self._view(k) for k in sorted(self._frames))
             times, late = list(self._arrivals), list(self._latencies)
             span = (times[-1] - times[0]) * 1e-9 if len(times) > 1 else 0.0
             matcher = self._acquisition.matcher
@@ -457,6 +454,14 @@ class LiveSession:
                 n_waiting=self._acquisition.n_waiting,
                 streams=tuple(one.counts.words for one in monitors),
             )
+
+    def _view(self, camera: int) -> CameraView:
+        """The latest image that was measured, with its own stripes, or a much newer one."""
+        frame, lasers = self._frames[camera]
+        taken_ns, view = self._measured.get(camera, (0, None))
+        if view is not None and frame.t_host_ns - taken_ns < NEWER_NS:
+            return view
+        return CameraView(frame.image, lasers, np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
     def cloud(self) -> ShownCloud:
         """The live cloud of all passes that were not taken back."""
@@ -577,7 +582,7 @@ class LiveSession:
             yield InstantImages(
                 tuple((exposure, None) for exposure in exposures),
                 instant.pose @ self._scanner.hand_eye.tool_from_sensor,
-                Instant((number,) * len(exposures), _time_ns(instant)),
+                Instant((number,) * len(exposures), instant_ns(instant)),
             )
         self._now = None
 
@@ -638,11 +643,16 @@ class LiveSession:
                 start = self._next_pass if is_next and self._next_pass is not None else number
                 self._passes.append(_Pass(pose, start))
                 self._next_pass = None if is_next else self._next_pass
-            for camera, (found, cloud) in enumerate(zip(one.profiles, clouds, strict=True)):
-                seen = found.labelled.status == PointStatus.MEASURED
-                pixels = found.labelled.profile.points_px[seen]
-                self._stripes[camera] = pixels, found.labelled.sheet[seen]
+            for cloud in clouds:
                 self._passes[-1].add(cloud, number, self.options.voxel_mm)
+            for camera, (frame, found) in enumerate(
+                zip(instant.frames, one.profiles, strict=False)
+            ):
+                if frame is not None:
+                    seen = found.labelled.status == PointStatus.MEASURED
+                    pixels, sheet = found.labelled.profile.points_px, found.labelled.sheet
+                    view = CameraView(frame.image, instant.lasers, pixels[seen], sheet[seen])
+                    self._measured[camera] = frame.t_host_ns, view
             depth = np.concatenate(depths)
             self._range_mm = float(np.median(depth)) if len(depth) else None
             self._counts[LiveStatus.PLACED] += 1
@@ -669,29 +679,3 @@ def _is_still(one: Pose[Base, Tool], other: Pose[Base, Tool]) -> bool:
 def _turn_rad(one: Pose[Base, Tool], other: Pose[Base, Tool]) -> float:
     chord = float(np.linalg.norm(one.rotation - other.rotation)) / np.sqrt(8.0)
     return float(2.0 * np.arcsin(min(chord, 1.0)))
-
-
-def _time_ns(instant: MatchedInstant) -> int:
-    first = next(frame for frame in instant.frames if frame is not None)
-    return first.t_device_ns if instant.t_ns is None else instant.t_ns
-
-
-def exposure_of(
-    frame: Frame, setup: CameraSetup, instant: MatchedInstant, camera: int = 0
-) -> Exposure:
-    """An image as the measuring loop takes it, equal to what a recording of it gives."""
-    image = frame.image
-    if setup.align == "high":
-        image = np.right_shift(image, 8 * image.dtype.itemsize - setup.bits_used)
-    if setup.colour == "bayer_rggb":
-        image = demosaiced(image)
-    return Exposure(
-        image,
-        f"camera {camera} frame {frame.number}",
-        bits_used=setup.bits_used,
-        window=frame.window,
-        lasers=instant.lasers or (),
-        t_ns=_time_ns(instant),
-        camera=camera,
-        trigger_id=frame.trigger_id,
-    )

@@ -14,7 +14,7 @@ from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.calibration.cameras.result import reasons_to_refuse as camera_reasons
 from armscan.calibration.cameras.start import estimate_board_pose
-from armscan.calibration.sheets.board_points import HeadCameras, place_board
+from armscan.calibration.sheets.board_points import N_CAMERA, HeadCameras, place_board
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, SheetFit
 from armscan.calibration.sheets.result import reasons_to_refuse as sheet_reasons
@@ -64,7 +64,8 @@ class Outcome:
     ``result`` is right, silently wrong, rightly refused, wrongly refused or not reached; ``chi2``
     the joint normalised error over ``freedom`` parameters; ``over_bound`` the stated standard
     deviations over the Cramer-Rao bound, ``over_granted`` over that of the question that is
-    answered: of planes that may be bowed as is likely, of the hand-eye of the stored sensor.
+    answered: sheets of the stored camera, planes that may be bowed as is likely, the hand-eye of
+    the stored sensor.
     """
 
     stage: str
@@ -396,12 +397,14 @@ def judge_sheets(
         bow = first + N_TERMS * k + np.arange(3, N_TERMS)
         whole[bow, bow] += precision
     widths = {k: N_TERMS if bowed[k] or k in likely else 3 for k in names}
-    best_likely = _light_bounds(whole, first, widths)
+    stored = whole[n_shared:, n_shared:]
+    best_granted = _light_bounds(stored, first - n_shared, widths)
+    given_camera = _given_camera(fit, n_shared)
     squares, freedom, is_wrong = 0.0, 0, False
     ratios: list[float] = []
     over_granted: list[float] = []
     groups: dict[str, float] = {}
-    for sheet, k in zip(fit.sheets, names, strict=True):
+    for number, (sheet, k) in enumerate(zip(fit.sheets, names, strict=True)):
         points = points_of_light(made, lines, k)
         # A plane that was kept states what it may be bowed by; the bound is that of a plane.
         n = 8 if sheet.covariance[3, 3] > 0.0 else 3
@@ -417,8 +420,11 @@ def judge_sheets(
         # A true plane, kept as one, has no error in what a bow might be.
         squares, freedom = squares + one.chi2, freedom + (3 if is_plane else n)
         _, _, by = sheet.sheet.height_with_jacobian(points)
-        stated = np.einsum("ni,ij,nj->n", by[:, :n], sheet.covariance[:n, :n], by[:, :n]).mean()
-        for found, bounds in ((ratios, best), (over_granted, best_likely)):
+        for covariance, bounds, found in (
+            (given_camera[number], best_granted, over_granted),
+            (sheet.covariance, best, ratios),
+        ):
+            stated = np.einsum("ni,ij,nj->n", by[:, :n], covariance[:n, :n], by[:, :n]).mean()
             terms = light_terms(made, made.lights[k], points, len(bounds[k]))
             least = np.einsum("ni,ij,nj->n", terms, bounds[k], terms).mean()
             found.append(float(np.sqrt(stated / least)))
@@ -453,6 +459,19 @@ def _light_bounds(whole: FloatArray, first: int, widths: dict[int, int]) -> dict
         k: best[end - len(rows) : end, end - len(rows) : end]
         for (k, rows), end in zip(own.items(), ends, strict=True)
     }
+
+
+def _given_camera(fit: LaserFit, n_shared: int) -> list[FloatArray]:
+    """(8, 8) covariance of each sheet, the cameras being those that are stored."""
+    n = len(fit.sheets) * N_TERMS
+    camera = np.delete(np.arange(len(fit.covariance)), slice(N_CAMERA, N_CAMERA + n))[:n_shared]
+    known = np.diag(fit.covariance)[camera] > 0.0
+    camera, sheets = camera[known], slice(N_CAMERA, N_CAMERA + n)
+    sigma = np.sqrt(np.diag(fit.covariance)[camera])
+    cross = fit.covariance[sheets, camera] / sigma
+    alike = fit.covariance[np.ix_(camera, camera)] / np.outer(sigma, sigma)
+    given = fit.covariance[sheets, sheets] - cross @ np.linalg.pinv(alike, hermitian=True) @ cross.T
+    return [given[N_TERMS * k :, N_TERMS * k :][:N_TERMS, :N_TERMS] for k in range(len(fit.sheets))]
 
 
 def _likely_bows(made: Instrument, fit: LaserFit, names: Sequence[int]) -> dict[int, FloatArray]:

@@ -249,8 +249,6 @@ STEEPNESS_SLACK = 0.85
 """Least of the normal's component across the run, over the other one."""
 REPEAT_PX = 1.5
 ROUNDS = 3
-FIRST_SLACK = 0.5
-"""As the one before it, while the walk to the ridge goes on: candidates of the flanks are many."""
 
 
 def gaussian_taps(sigma_px: float) -> Image:
@@ -460,19 +458,15 @@ def step_across(derivatives: Row, x: int, y: int, radius: int, result: FloatsOut
 
 @compiled(error_model="numpy")
 def walk_to_ridge(
-    image: Image, is_row: bool, taps: Image, radius: int, derivatives: RowOut, result: FloatsOut
+    image: Image, taps: Image, radius: int, derivatives: RowOut, result: FloatsOut
 ) -> bool:
-    """Walk on to the nearest ridge; False if there is none of the candidate's direction.
+    """Walk on to the nearest ridge; False if there is none.
 
-    ``image``, ``taps``, ``radius``: As for `derivatives_at`. ``is_row``: True of candidates along a
-    row. ``derivatives``: (5,) scratch. ``result``: (5,) of `step_across`, input of a first step
-    that left its pixel, and output.
+    ``image``, ``taps``, ``radius``: As for `derivatives_at`. ``derivatives``: (5,) scratch.
+    ``result``: (5,) of `step_across`, input of a first step that left its pixel, and output.
     """
     height, width = image.shape
     for _ in range(ROUNDS - 1):
-        across, along = result[3 - is_row], result[2 + is_row]
-        if abs(across) < FIRST_SLACK * abs(along):
-            return False
         x = math.floor(result[0] + 0.5)
         y = math.floor(result[1] + 0.5)
         if x < 0 or y < 0 or x >= width or y >= height:
@@ -529,7 +523,7 @@ def refine_candidates(
         is_row = runs[r, 2] == ROW
         side = ROW if is_row else COLUMN
         if state == MOVED:
-            is_found = walk_to_ridge(image, is_row, padded, radius, derivatives, ridge)
+            is_found = walk_to_ridge(image, padded, radius, derivatives, ridge)
             state = FOUND if is_found else NO_RIDGE
         if state != FOUND or ridge[4] < least_bend:
             continue

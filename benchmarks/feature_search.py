@@ -32,8 +32,9 @@ from armscan.geometry.features import Shape
 from armscan.inspection import search
 from armscan.inspection.search import WantedFeature
 from armscan.inspection.selection import select
+from armscan.models.calibration import ScannerCalibration
 from armscan.records.cloud import PointCloud
-from armscan.storage.documents import ScannerCalibration, read_scanner_calibration
+from armscan.storage.documents import read_scanner_calibration
 from rigs import feature_clouds, traced_workpiece
 
 COUNTS = ("N_SAMPLE", "N_NEIGHBOURS", "ALONG_STRIPE", "FACES", "SEED_POINTS", "NEAR_POINTS",

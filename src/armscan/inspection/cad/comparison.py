@@ -273,13 +273,13 @@ def compare_with_part(
     Returns
     -------
     FitFailure
-        If fewer than half of the points lie near the model.
+        If there are no points, or fewer than half of them lie near the model.
     """
     part = surface.part
     found = measured(surface, cloud, alignment.cad_from_part)
     near = np.abs(found.signed_mm) <= options.reach_mm
     rows = np.flatnonzero(near)
-    if len(rows) < (1.0 - MOST_BEYOND) * len(cloud):
+    if len(rows) == 0 or len(rows) < (1.0 - MOST_BEYOND) * len(cloud):
         share = f"only {100 * len(rows) / len(cloud):.0f} % of the" if len(rows) else "no"
         lead = "leave --align none out, " if alignment.method == "none" else ""
         return FitFailure(

@@ -371,6 +371,9 @@ def test_a_cloud_that_lies_elsewhere_is_refused_and_table_about_a_part_is_not() 
         if isinstance(found, FitFailure):
             assert "only 40 % of the points come within 2 mm" in found.reason
             assert "--align none" in found.remedy
+    none = cloud_of(top_points(10)).select(np.zeros(10, dtype=np.bool_))
+    found = compare_with_part(BOX, none, align_none(none), CadOptions(), errors_known=False)
+    assert isinstance(found, FitFailure)
 
 
 def test_faces_without_points_and_with_too_few_are_told_apart() -> None:

@@ -4,7 +4,8 @@
 A pass is what was scanned without a pause, in one direction. Its own stripes lie side by side, so
 a wrong clock or pose bends it smoothly and nothing shows; where two passes cross, they then lie
 apart. So each pass makes local quadrics of its own stripes, and points of other passes that fall
-among those stripes are compared with them, in units of what both claim of themselves.
+among those stripes are compared with them, in units of what both claim of themselves. Near an edge
+a pass may have seen one face and another pass the next one: such points are not compared.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ CELLS = 6.0
 """Cells to its radius: stripes then count alike however dense their points are."""
 CENTRED = 0.4
 """The neighbours' middle lies within this part of their radius: a point is among the stripes."""
+SAME_FACE = 0.94
+"""Normals of two passes on one face differ by less than 20 degrees."""
 FEWEST_POINTS = 20
 """Points that a pair of passes must have in common to be compared."""
 AGREES = 5.0
@@ -131,6 +134,10 @@ class PassDistances:
     distance_mm: FloatArray
     sigma_mm: FloatArray
     claimed_mm: FloatArray
+
+    def of_rows(self, rows: BoolArray) -> PassDistances:
+        """Some of the points."""
+        return PassDistances(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,19 +246,25 @@ def pass_distances(stripes: Stripes) -> PassDistances | None:
         return None
     points, owner = stripes.points_base_mm, stripes.pass_of[stripes.exposure]
     chosen = np.arange(0, len(points), max(1, len(points) // MOST_QUERIES))
+    own_normal = np.full_like(points, np.nan)
     parts = []
     for surface in range(n_passes):
         own = np.flatnonzero(owner == surface)
-        asked = chosen[owner[chosen] != surface]
-        if len(own) < FEWEST_NEIGHBOURS or not len(asked):
+        is_own = owner[chosen] == surface
+        if len(own) < FEWEST_NEIGHBOURS or is_own.all():
             continue
         built = _PassSurface.of(stripes, points, own)
         if built is not None:
-            parts.append(built.distances(asked, surface))
+            parts.append(built.distances(chosen[~is_own], surface))
+            about = built.distances(chosen[is_own], surface)
+            own_normal[about.row] = about.normal
     if not sum(len(part.row) for part in parts):
         return None
     names = [item.name for item in fields(PassDistances)]
-    return PassDistances(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    found = PassDistances(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    # NaN, where a point's own pass shows no surface, is no other face
+    alike = np.abs(np.einsum("ni,ni->n", found.normal, own_normal[found.row]))
+    return found.of_rows(~(alike < SAME_FACE))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,6 +39,31 @@ def ball_passes(shift_mm: FloatArray, seed: int = 1) -> Stripes:
     )
 
 
+def faces_of_a_block(turn_rad: float, seed: int = 1) -> Stripes:
+    """Two passes of ten stripes that end at an edge: one saw the top only, one the side only.
+
+    The side leans by ``turn_rad`` from square to the top.
+    """
+    rng = np.random.default_rng(seed)
+    points = []
+    for number in range(20):
+        along = np.linspace(0.0, 15.0, 60)
+        at = np.full(60, 1.5 * (number % 10))
+        noise = NOISE_MM * rng.standard_normal(60)
+        on_top = np.stack([at, -along, noise], axis=1)
+        cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
+        on_side = np.stack([at, noise - sine * along, -cosine * along], axis=1)
+        points.append(on_top if number < 10 else on_side)
+    return Stripes(
+        np.concatenate(points),
+        np.broadcast_to(NOISE_MM**2 * np.eye(3), (20 * 60, 3, 3)),
+        np.repeat(np.arange(20), 60),
+        np.repeat([0, 1], 10),
+        np.broadcast_to(np.eye(3), (20, 3, 3)),
+        np.zeros((20, 3)),
+    )
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_passes_over_one_ball_agree(seed: int) -> None:
     found = pass_agreement(ball_passes(np.zeros(3), seed))
@@ -64,6 +89,11 @@ def test_a_shift_along_a_surface_shows_by_its_slope() -> None:
     found = pass_agreement(ball_passes(np.array([0.5, 0.0, 0.0])))
     assert found is not None
     assert found.ratio > 3.0
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.7])
+def test_passes_that_saw_the_faces_beside_an_edge_are_not_compared(turn_rad: float) -> None:
+    assert pass_agreement(faces_of_a_block(turn_rad)) is None
 
 
 def test_what_does_not_overlap_is_not_compared() -> None:

@@ -674,12 +674,12 @@ def _compiler_fact(problems: list[str]) -> str:
 def _compile_kernels(problems: list[str]) -> str:
     from armscan.kernels.arrays import COMPILED, load_kernels
 
-    names = [item.name for item in pkgutil.iter_modules(kernels.__path__)]
-    for name in names:
+    for item in pkgutil.iter_modules(kernels.__path__):
         try:
-            importlib.import_module(f"{kernels.__name__}.{name}")
-            load_kernels()
+            importlib.import_module(f"{kernels.__name__}.{item.name}")
         except Exception as error:
-            problems.append(f"kernel module {name} does not compile ({error})")
+            problems.append(f"kernel module {item.name} cannot be imported ({error})")
+    failures = load_kernels()
+    problems += [f"kernel {name} does not compile ({error})" for name, error in failures.items()]
     seconds = sum(COMPILED.values())
     return f"{len(COMPILED)} compiled now ({seconds:.1f} s), the others kept from before"

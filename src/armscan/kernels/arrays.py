@@ -120,10 +120,18 @@ _WAITING: dict[str, Callable[[], Any]] = {}
 """What loads each kernel that was imported and is not loaded yet."""
 
 
-def load_kernels() -> None:
-    """Load, or compile, all kernels imported so far, for work that must not wait for them later."""
-    for load in list(_WAITING.values()):
-        load()
+def load_kernels() -> dict[str, Exception]:
+    """Load, or compile, all kernels imported so far, for work that must not wait for them later.
+
+    Returns why a kernel failed, by its name; it fails again when it is called.
+    """
+    failures = {}
+    for name, load in list(_WAITING.items()):
+        try:
+            load()
+        except Exception as error:
+            failures[name] = error
+    return failures
 
 
 def _on_first_use(kernel: Any, signature: Any) -> Any:

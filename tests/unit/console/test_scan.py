@@ -92,6 +92,35 @@ def test_a_pass_taken_back_is_in_neither_cloud_nor_recording(tmp_path: Path) -> 
     assert [row.trigger_id for row in rows][: len(before)] == list(range(len(before)))
 
 
+def test_a_pass_of_which_nothing_is_shown_yet_is_taken_back_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = DrawnBench(30, rate_hz=20.0)
+    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01.mcap", scanner())
+    told: list[str] = []
+    live.session.add_listener(lambda event: told.append(event.text))
+    live.undo_pass()
+    assert told[-1] == "there is no pass to take back"
+    live.start()
+    waited(lambda: sum(live.snapshot.counts.values()) >= 5)
+    live.pause()
+    n_counted = -1
+    while n_counted != (n_counted := sum(live.snapshot.counts.values())):
+        time.sleep(0.5)
+    n_first, shown = live.n_recorded, live.session.cloud().exposure.tolist()
+    put = live.session._place
+    monkeypatch.setattr(live.session, "_place", lambda *one: time.sleep(0.5) or put(*one))
+    live.start()
+    waited(lambda: live.n_recorded >= n_first + 3)
+    live.pause()
+    live.undo_pass()
+    assert live.session.cloud().exposure.tolist() == shown
+    assert n_first - 1 <= live.n_recorded <= n_first + 1
+    live.undo_pass()
+    assert live.snapshot.n_passes == 0 and live.n_recorded <= 1
+    live.stop()
+
+
 def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> list[int]:
     """A disk with room for so many bytes; what is in the list is room that came later."""
     left, write = [room], mcap_file._write_some

@@ -174,7 +174,7 @@ def test_a_board_in_the_wrong_place_hardly_moves_the_sheet_and_does_not_discredi
         one, other = fit.sheets[0], left_out.sheets[0]
         assert one.calibration.n_boards == other.calibration.n_boards + 1
         assert not any("times as much as their targets" in warning for warning in fit.warnings)
-        told = [w for w in fit.warnings if "lies elsewhere than its target says" in w]
+        told = [w for w in fit.warnings if "lie elsewhere than their targets say" in w]
         assert len(told) == 1 and boards[1].profile.source in told[0]
         apart_mm = (other.sheet.origin_mm - one.sheet.origin_mm) @ one.sheet.axes[2]
         turned = one.sheet.axes[:2] @ other.sheet.axes[2]

@@ -328,9 +328,9 @@ class _Case:
             strays = self._strays(model)
             if strays:
                 warnings.append(
-                    f"sheet {name}: {', '.join(strays)}: the board lies elsewhere than its target "
-                    "says, far beyond the others' scatter, and counts for little: was it found "
-                    "rightly, and is it flat? leave it out if not"
+                    f"sheet {name}: boards that lie elsewhere than their targets say, far beyond "
+                    f"the others' scatter, and count for little: {', '.join(strays)}; were they "
+                    "found rightly, and are they flat? leave them out if not"
                 )
         if not self.cameras.has_covariance:
             warnings.append(

@@ -281,6 +281,9 @@ class LiveSession:
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
         self._next_pass: int | None = 0
         """Number of the instant with which a pass begins; those before belong to the last one."""
+        self._begun = self._scanned = 0
+        """Numbers of the instant with which scanning was begun last, and behind the last one that
+        was to be placed."""
         self._taken_back = 0
         """Instants before this number that still wait to be measured are not placed any more."""
         self._told = ""
@@ -324,8 +327,9 @@ class LiveSession:
         """
         if self._state != "closed":
             raise DeviceError("a session is opened once", remedy="make a new one")
-        # no exposure waits for a loop to be loaded or compiled
-        load_kernels()
+        if self._labeller is not None:
+            # no exposure waits for a loop to be loaded or compiled
+            load_kernels()
         try:
             for control, camera in zip(self._controls, self._rig.cameras, strict=True):
                 with told_as_fault_of(camera.name):
@@ -356,7 +360,7 @@ class LiveSession:
         if self._state in ("closed", "stopped"):
             fact = "is over" if self._state == "stopped" else "is not open"
             raise DeviceError(f"the session {fact}", remedy="open a new one")
-        self._next_pass = self._n_instants
+        self._next_pass = self._begun = self._n_instants
         self._acquisition.recorder = self._recorder
         self._change("scanning")
 
@@ -376,17 +380,23 @@ class LiveSession:
     def undo_pass(self) -> range:
         """Take the last pass out of the live cloud; the recorder has and keeps all of it.
 
+        The last pass is what came since scanning was begun, if that is still to be placed.
+
         Returns the numbers of the instants since the pass began, also of those that were not
         placed; none if there was no pass.
         """
         self._acquisition.wait_until_kept()
         with self._lock:
             end = self._n_instants
-            start = self._passes.pop().start if self._passes else end
-            self._next_pass = self._taken_back = end
-            self._version += 1
-        self._tell(LiveEvent("pass", "the last pass was taken back"))
-        return range(start, end)
+            start, stop = max(self._begun, self._taken_back), self._scanned
+            if self._passes and (self._passes[-1].start >= self._begun or start >= stop):
+                start, stop = self._passes.pop().start, end
+            if start < stop:
+                self._next_pass = self._taken_back = end
+                self._version += 1
+        told = "the last pass was taken back" if start < stop else "there is no pass to take back"
+        self._tell(LiveEvent("pass", told))
+        return range(start, max(start, stop))
 
     def clear(self) -> range:
         """Empty the live cloud, which the recorder keeps; returns the numbers of all instants."""
@@ -523,12 +533,16 @@ class LiveSession:
             self._latest = instant.pose
             number = instant.number
             self._n_instants = number + 1
-            if self._state != "scanning" or self._labeller is None:
+            if self._state != "scanning":
+                return
+            if self._labeller is None:
+                self._scanned = number + 1
                 return
             status = self._fault(instant) or self._moved(instant, number)
             if status is not None:
                 self._counts[status] += 1
                 return
+            self._scanned = number + 1
         now_ns = time.monotonic_ns()
         if self._acquisition.is_behind and now_ns - self._waits_since_ns < SELDOM_NS:
             self._count(LiveStatus.NOT_SHOWN)

@@ -256,8 +256,7 @@ def straighten(course: Polyline, fits: ProfileFits) -> Polyline:
     sigma_along = fits.values[:, SIGMA]
     by_bend = fits.values[:, BEND_GAIN] * (1.0 - n * n) * sigma_along**2 / (2.0 * n)
     sharpest = np.maximum(BEND_MARGIN * seen_bend(course), SHARPEST_BEND)
-    with np.errstate(invalid="ignore"):  # fits that failed
-        matters = np.abs(by_bend) * sharpest > LEAST_PULL * course.sigma
+    matters = np.abs(by_bend) * sharpest > LEAST_PULL * course.sigma
     bend = curvature(course, matters)
     corrected = course.points.copy()
     corrected[rows, along] -= bend * by_bend

@@ -30,6 +30,8 @@ StripeMethod = Literal["fit", "threshold", "centroid", "template", "hessian"]
 MaskImage: TypeAlias = NDArray[np.uint8]
 
 SIGMA_RANGE_PX = (0.6, 10.0)
+MOST_SMOOTHING_PX = 100.0
+"""The pass that smooths holds 112 points to either side of a point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,7 @@ class StripeOptions:
         Least height of a line above its background in grey levels, or None to set it from the
         image's noise.
     smoothing_px
-        Largest half window of the smoothing along the line; 0 switches it off.
+        Largest half window of the smoothing along the line, to 100 px; 0 switches it off.
     on_print
         The lines lie on matt print, which the laser lights up as the room's light does: of ``fit``,
         the view without laser then tells how bright the ground is under the line.
@@ -81,8 +83,10 @@ class StripeOptions:
             raise OptionError(
                 f"threshold is {self.threshold}", remedy="give a positive count of grey levels"
             )
-        if not 0.0 <= self.smoothing_px < math.inf:
-            raise OptionError(f"smoothing_px is {self.smoothing_px}", remedy="give 0 or up")
+        if not 0.0 <= self.smoothing_px <= MOST_SMOOTHING_PX:
+            raise OptionError(
+                f"smoothing_px is {self.smoothing_px}", remedy=f"give 0 to {MOST_SMOOTHING_PX:g} px"
+            )
 
 
 ROUNDS = 4

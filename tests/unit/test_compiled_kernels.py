@@ -10,11 +10,13 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from armscan.cli.run import VARIABLE, give_kernels_a_folder
+from armscan.kernels import arrays
 from armscan.kernels.arrays import load_kernels
 
 
@@ -142,17 +144,23 @@ def unused(values: Floats) -> float:
 """
 
 
+def imported(source: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A module of kernels, of which none is compiled."""
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(folder / "cache"))
+    place = folder / "kernels_of_a_test.py"
+    place.write_text(source)
+    spec = importlib.util.spec_from_file_location("kernels_of_a_test", place)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def test_a_kernel_is_loaded_when_it_is_first_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By Python, or by a kernel that is compiled; of other numbers it is refused at once."""
-    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
-    source = tmp_path / "kernels_of_a_test.py"
-    source.write_text(SOURCE)
-    spec = importlib.util.spec_from_file_location("kernels_of_a_test", source)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = imported(SOURCE, tmp_path, monkeypatch)
     kernels = (module.total, module.mean, module.unused)
     assert [len(one.overloads) for one in kernels] == [0, 0, 0]
     with pytest.raises(TypeError, match="total takes no"):
@@ -165,5 +173,17 @@ def test_a_kernel_is_loaded_when_it_is_first_asked_for(
     assert [len(one.overloads) for one in kernels] == [1, 1, 0]
     with pytest.raises(TypeError):
         module.mean(np.zeros((2, 2)))
-    load_kernels()
+    assert load_kernels() == {}
     assert len(module.unused.overloads) == 1
+
+
+def test_a_kernel_that_fails_is_named_and_the_others_are_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = "@compiled()\ndef broken(values: Floats) -> float:\n    return values.no_such_thing\n"
+    module = imported(SOURCE + broken, tmp_path, monkeypatch)
+    try:
+        assert list(load_kernels()) == ["kernels_of_a_test.broken"]
+        assert len(module.mean.overloads) == 1
+    finally:
+        arrays._WAITING.pop("kernels_of_a_test.broken")

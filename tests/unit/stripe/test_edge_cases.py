@@ -69,6 +69,7 @@ def test_background_of_another_size_is_refused() -> None:
         {"line_sigma_px": 0.1},
         {"threshold": -1.0},
         {"smoothing_px": -2.0},
+        {"smoothing_px": 101.0},
     ],
 )
 def test_wrong_options_are_named(wrong: dict[str, object]) -> None:

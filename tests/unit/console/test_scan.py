@@ -34,9 +34,12 @@ from armscan.console.work import recover_scans
 from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import Frame, LaserEvent
 from armscan.errors import InputError, OutputError
+from armscan.pipeline.live.acquire import WaitingInstant
 from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription
+from armscan.pipeline.measure import MeasuredInstant
 from armscan.pipeline.scan import ScanOptions, measure_scan
+from armscan.reconstruction.place import BaseTransform
 from armscan.reconstruction.sync import PoseStatus
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.storage.recording import read_recording
@@ -108,8 +111,13 @@ def test_a_pass_of_which_nothing_is_shown_yet_is_taken_back_alone(
     while n_counted != (n_counted := sum(live.snapshot.counts.values())):
         time.sleep(0.5)
     n_first, shown = live.n_recorded, live.session.cloud().exposure.tolist()
-    put = live.session._place
-    monkeypatch.setattr(live.session, "_place", lambda *one: time.sleep(0.5) or put(*one))
+    place = live.session._place
+
+    def place_late(one: MeasuredInstant, waiting: WaitingInstant, transform: BaseTransform) -> None:
+        time.sleep(0.5)
+        place(one, waiting, transform)
+
+    monkeypatch.setattr(live.session, "_place", place_late)
     live.start()
     waited(lambda: live.n_recorded >= n_first + 3)
     live.pause()

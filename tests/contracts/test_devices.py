@@ -36,7 +36,8 @@ def small_twin(place: str = TWIN) -> Camera:
 
 
 def test_twin() -> None:
-    check_camera(small_twin)
+    # rendering is compiled first where nothing is yet
+    check_camera(small_twin, timeout_s=60.0)
     check_arm(lambda: open_device("arm", TWIN))
     check_lasers(lambda: open_device("lasers", TWIN))
 

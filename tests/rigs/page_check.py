@@ -11,6 +11,7 @@ from __future__ import annotations
 import base64
 import json
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -129,14 +130,12 @@ def page_faults(driver: Any, page: Path, pictures: Path | None = None) -> list[s
         driver.get(page.as_uri())
         # folded parts are read too
         driver.execute_script("document.querySelectorAll('details').forEach(d => d.open = true)")
-        driver.execute_async_script(SETTLED)
-        found += [f"{width} px: {text}" for text in driver.execute_script(FAULTS, True)]
+        found += [f"{width} px: {text}" for text in _that_stay(driver, may_scroll=True)]
         if pictures is not None:
             _save(driver, pictures / f"{page.stem}-{width}.png", width)
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
     _set_width(driver, PAPER_PX)
-    driver.execute_async_script(SETTLED)
-    found += [f"paper: {text}" for text in driver.execute_script(FAULTS, False)]
+    found += [f"paper: {text}" for text in _that_stay(driver, may_scroll=False)]
     if pictures is not None:
         printed = driver.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})
         (pictures / f"{page.stem}.pdf").write_bytes(base64.b64decode(printed["data"]))
@@ -148,6 +147,17 @@ def page_faults(driver: Any, page: Path, pictures: Path | None = None) -> list[s
             if not url.startswith(("data:", "chrome")) and url != page.as_uri():
                 found.append(f"asks for {url}")
     found += [entry["message"] for entry in driver.get_log("browser")]
+    return found
+
+
+def _that_stay(driver: Any, may_scroll: bool) -> list[str]:
+    """Faults that are there at each of three looks: a busy browser may still be laying out."""
+    for pause_s in (0.0, 1.0, 3.0):
+        time.sleep(pause_s)
+        driver.execute_async_script(SETTLED)
+        found: list[str] = driver.execute_script(FAULTS, may_scroll)
+        if not found:
+            break
     return found
 
 

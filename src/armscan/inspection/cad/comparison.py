@@ -281,8 +281,7 @@ def compare_with_part(
     rows = np.flatnonzero(near)
     if len(rows) == 0 or len(rows) < (1.0 - MOST_BEYOND) * len(cloud):
         # rounded down: half of the points would not be refused
-        permille = 1000 * len(rows) // len(cloud)
-        share = f"only {permille / 10:g} % of the" if len(rows) else "no"
+        share = f"only {1000 * len(rows) // len(cloud) / 10:g} % of the" if len(rows) else "no"
         lead = "leave --align none out, " if alignment.method == "none" else ""
         return FitFailure(
             f"the cloud does not lie on the model: {share} points come within "

@@ -436,7 +436,7 @@ def advise(
     warnings = [
         *_about_convergence(fit, is_converged=is_converged),
         *_about_views(fit, repeats),
-        *_about_coverage(fit),
+        *about_coverage(fit.coverage),
         *_about_pixels(fit),
         *_about_model(fit),
         *_about_residuals(fit),
@@ -487,9 +487,9 @@ def _about_repeats(repeats: Sequence[tuple[str, str]]) -> list[str]:
     return [f"{fact}: {', '.join(named)}{more}"]
 
 
-def _about_coverage(fit: CameraFit) -> list[str]:
+def about_coverage(coverage: Coverage) -> list[str]:
+    """What the views do not reach, in words: regions of the image, tilts of the board."""
     warnings = []
-    coverage = fit.coverage
     if coverage.empty:
         warnings.append(f"no target points in the {', '.join(coverage.empty)} of the image")
     elif coverage.fraction < THIN_COVERAGE:

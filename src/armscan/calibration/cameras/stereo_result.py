@@ -20,11 +20,10 @@ from armscan.calibration.cameras.pairs import (
 from armscan.calibration.cameras.result import (
     ALIKE,
     FEW_VIEWS,
-    SMALL_TILT_DEG,
-    THIN_COVERAGE,
     UNSEEN_WORSE,
     Coverage,
     CrossValidation,
+    about_coverage,
     focal_reasons,
     rms_reasons,
 )
@@ -370,7 +369,7 @@ def _about_cameras(fit: StereoFit) -> list[str]:
     warnings = []
     cameras = (fit.views.left, fit.views.right)
     for word, side, camera in zip(SIDES, fit.sides, cameras, strict=True):
-        warnings += [f"{word} camera: {text}" for text in _about_coverage(side)]
+        warnings += [f"{word} camera: {text}" for text in about_coverage(side.coverage)]
         if side.single.given_level > ODD_GIVEN_LEVEL:
             warnings.append(
                 f"{word} camera: the given calibration lies {np.sqrt(side.single.given_level):.0f} "
@@ -385,21 +384,6 @@ def _about_cameras(fit: StereoFit) -> list[str]:
                 f"{word} camera: the distortion has no inverse at the image's border: do not "
                 "measure outside the covered part"
             )
-    return warnings
-
-
-def _about_coverage(side: SideFit) -> list[str]:
-    warnings = []
-    coverage = side.coverage
-    if coverage.empty:
-        warnings.append(f"no target points in the {', '.join(coverage.empty)} of the image")
-    elif coverage.fraction < THIN_COVERAGE:
-        warnings.append(f"target points in only {100 * coverage.fraction:.0f} % of the image")
-    if float(coverage.tilts_deg.max()) < SMALL_TILT_DEG:
-        warnings.append(
-            f"the board is tilted by at most {coverage.tilts_deg.max():.0f} degrees: "
-            "tilt it by 20 to 45"
-        )
     return warnings
 
 

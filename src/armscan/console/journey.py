@@ -126,9 +126,10 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.HAND_EYE,
         "Hand-eye",
-        "Point the head at the plate that you touched, as drawn, with the laser line on the plate "
-        "from end to end. Hold the arm still and take. The plate and the arm's base must not move "
-        "from the first touch to the last take.",
+        "Point the head at the plate that you touched, roughly as drawn: what counts is that the "
+        "postures differ as much. All of the laser line that the camera sees must lie on the "
+        "plate. Hold the arm still and take. The plate and the arm's base must not move from the "
+        "first touch to the last take.",
         "placements",
         HAND_EYE,
         least=6,
@@ -296,7 +297,7 @@ class StepState:
     result
         The latest result, also an old one.
     why
-        What it waits for, or why it is old.
+        What it waits for, why it is old, or what is wrong with a step before it.
     """
 
     status: Status
@@ -424,18 +425,40 @@ class Journey:
         """Where a step stands; of scan and inspection for one scan."""
         known, n_taken = BY_NAME[step], self.n_taken(step, scan)
         result = self.result(step, scan)
-        for needed in known.needs:
-            if not self._document(needed, scan).is_file():
-                what = f"'{BY_NAME[needed].title}' comes first"
-                return StepState("waiting", n_taken, result, what)
+        if missing := self._missing(step, scan):
+            what = f"'{BY_NAME[missing].title}' comes first"
+            return StepState("waiting", n_taken, result, what)
+        doubt, is_old = self._doubt_before(step, scan)
         if result is not None:
             changed = self._changed(result)
-            if not changed:
-                return StepState(result.verdict, n_taken, result)
-            return StepState("old", n_taken, result, f"{changed} has changed since")
+            if changed:
+                why = f"{changed} has changed since: calculate again"
+                return StepState("old", n_taken, result, why)
+            return StepState("old" if is_old else result.verdict, n_taken, result, doubt)
         if known.filling == "nothing" or n_taken >= known.least:
-            return StepState("ready", n_taken)
-        return StepState("open", n_taken)
+            return StepState("ready", n_taken, why=doubt)
+        return StepState("open", n_taken, why=doubt)
+
+    def _missing(self, step: StepName, scan: str) -> StepName | None:
+        """The first step whose document is missing; None if all that is needed is there."""
+        for needed in BY_NAME[step].needs:
+            if not self._document(needed, scan).is_file():
+                return self._missing(needed, scan) or needed
+        return None
+
+    def _doubt_before(self, step: StepName, scan: str) -> tuple[str, bool]:
+        """What is wrong with a step before this one, and whether this one is old by it."""
+        for needed in BY_NAME[step].needs:
+            of_scan = scan if needed in OF_A_SCAN else ""
+            doubt, is_old = self._doubt_before(needed, of_scan)
+            if doubt:
+                return doubt, is_old
+            result, title = self.result(needed, of_scan), BY_NAME[needed].title
+            if result is not None and self._changed(result):
+                return f"'{title}' is out of date: calculate it again, then this", True
+            if result is not None and result.verdict == "not good":
+                return f"'{title}' is not good: what it gave before is used", False
+        return "", False
 
     def result(self, step: StepName, scan: str = "") -> StepResult | None:
         """What was found last; None where nothing was, or the file is not to be read."""
@@ -494,11 +517,20 @@ class Journey:
         return names[step]
 
     def _changed(self, result: StepResult) -> str:
-        """Name of the first input that is not what the result rests on; empty if none is."""
+        """The first input that is not what the result rests on, in words; empty if none is."""
         for name, digest in (result.rests_on or {}).items():
             if digest_of(self.folder / name) != digest:
-                return name
+                return self._words(name)
         return ""
+
+    def _words(self, name: str) -> str:
+        """A file of the session as the person knows it."""
+        if name.startswith(f"{RECORDINGS}/"):
+            return "what was taken"
+        for step in CALIBRATED:
+            if self._document(step, "").name == name:
+                return f"the result of '{BY_NAME[step].title}'"
+        return name
 
 
 def result_key(step: StepName, scan: str) -> str:
@@ -507,6 +539,8 @@ def result_key(step: StepName, scan: str) -> str:
 
 
 OF_A_SCAN = (StepName.SCAN, StepName.INSPECT)
+CALIBRATED = tuple(StepName)[:5]
+"""Steps with a document that later ones rest on."""
 
 
 def digest_of(path: Path) -> str:

@@ -49,16 +49,17 @@ from armscan.console.placements import Placement, drawing
 from armscan.console.quality import ModelWatch
 from armscan.console.rig import open_bench, take_back
 from armscan.console.scan import Bench, LiveScan
-from armscan.console.scene import SceneView, ShownPoints, paragraph, shown_points
+from armscan.console.scene import SceneView, ShownPoints, depths_mm, paragraph, shown_points
 from armscan.console.server import LOOPBACK, PAGES, close_server, open_server
 from armscan.console.work import Worker, recover_scans, run_step, seen_in_take
 from armscan.errors import ArmscanError, OutputError
 from armscan.pipeline.progress import ProgressEvent
 from armscan.records.exposure import Exposure
 from armscan.report.drawing import ACCENT, ALERT, INK, MUTED
+from armscan.report.quantity import sentence
 from armscan.storage.arm import PROBE_FILE
 from armscan.storage.clouds import read_cloud
-from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.documents import read_scanner_calibration, read_sensor_calibration
 from armscan.storage.files import read_bytes
 from armscan.storage.formats.ply import parse_ply
 
@@ -95,7 +96,8 @@ class ConsolePage:
         # real lasers are on only when somebody asked for it
         self._is_viewing = bench is not None and bench.has_operator
         self._held = ExitStack()
-        self._lock = threading.RLock()
+        self._lock, self._showing = threading.RLock(), threading.RLock()
+        self._is_cancelled = False
         self.journey = self._opened(folder)
         self.step = self.journey.next_step()
         self.scan = self.journey.scans[-1] if self.journey.scans else ""
@@ -167,33 +169,31 @@ class ConsolePage:
         self._view = self.controls.button(
             "Camera view", self.view, "V", "Show what the camera sees, lasers on where needed"
         )
-        self._take = self.controls.button(
+        self._take = self.controls.taking_button(
             "Take", self.take_one, "T", "Record this placement", "teal"
         )
-        self._take_all = self.controls.button(
+        self._take_all = self.controls.taking_button(
             "Take all that is left (simulated)", self.take_all, "", "The twin shows them all"
         )
-        self._take_back = self.controls.button(
+        self._take_back = self.controls.taking_button(
             "Take back", self.take_back, "B", "Remove what was taken last"
         )
-        self._start_over = self.controls.button(
-            "Start over", self.start_over, "", "Remove what was taken"
+        self._start_over = self.controls.removing_button(
+            "Start over", self.start_over, "Remove what was taken", self._what_goes
         )
         self.scanning.build(self.start_or_pause)
         self._inspecting()
-        self.seeing.build(has_exposure=self.bench is not None and not self.bench.has_operator)
         self.scanning.build_pictures()
         self._calculate = self.controls.button(
             "Calculate", self.calculate, "K", "Run this step's job", "teal"
         )
         self._working = gui.add_html("", visible=False)
         self._bar = gui.add_progress_bar(0.0, visible=False)
-        self._cancel = self.controls.button(
-            "Cancel", self.worker.cancel, "", "End the calculation", "red"
-        )
+        self._cancel = self.controls.button("Cancel", self.cancel, "", "End what runs", "red")
         self._cancel.visible = False
         self._note = gui.add_html("")
         self._next = self.controls.button("Go on", self.go_on, "N", "To the next step", "teal")
+        self.seeing.build(has_exposure=self.bench is not None and not self.bench.has_operator)
         self.points.build(gui)
         with gui.add_folder("Sessions", expand_by_default=False):
             self._session_list = gui.add_dropdown("Session", (self._name(),))
@@ -243,6 +243,7 @@ class ConsolePage:
             self.refresh()
             return
         self.step, self._seen, self._said = step, None, ()
+        self.controls.forget_question()
         self._rest()
         self.refresh()
         self._show_stored()
@@ -277,10 +278,20 @@ class ConsolePage:
         if self.bench is not None:
             self.bench.rest()
 
-    def take(self) -> None:
-        """Record the placement or touch that is drawn."""
+    def cancel(self) -> None:
+        """End the calculation, or taking all that is left."""
+        self._is_cancelled = True
+        self.worker.cancel()
+
+    def _what_goes(self) -> str:
+        n, step = self.journey.n_taken(self.step), BY_NAME[self.step]
+        kind = "touch" if step.filling == "touches" else "placement"
+        return f"Remove {n} {kind}{'' if n == 1 else 'es' if kind == 'touch' else 's'}? Press again"
+
+    def take(self, step: StepName | None = None) -> None:
+        """Record the placement or touch that is drawn, of the step that is shown or another."""
         with self._lock:
-            bench, step = self._bench(), self.step
+            bench, step = self._bench(), step or self.step
             k, place = self.journey.n_taken(step), self.journey.recording(step)
             if BY_NAME[step].filling == "touches":
                 bench.touch(place, k)
@@ -300,11 +311,16 @@ class ConsolePage:
 
     def take_all(self) -> None:
         """Record all that is left, as the twin shows it."""
-        self._seen = None
-        with self._lock:
-            while self.journey.n_taken(self.step) < self._n_wanted():
-                self.take()
+        self._seen, self._is_cancelled = None, False
+        step, n_wanted = self.step, self._n_wanted()
+        self._busy("Taking all that is left ...")
+        try:
+            while self.journey.n_taken(step) < n_wanted and not self._is_cancelled:
+                put(self._bar, 100.0 * self.journey.n_taken(step) / n_wanted)
+                self.take(step)
                 self.refresh()
+        finally:
+            self._busy("")
 
     def take_back(self) -> None:
         """Remove the placement or touch that was taken last."""
@@ -427,9 +443,10 @@ class ConsolePage:
 
     def refresh(self) -> None:
         """Show what lies on disk now."""
-        step = BY_NAME[self.step]
-        state = self.journey.state(self.step, self._scan_of(self.step))
-        with self.server.atomic():
+        # one after the other: a state that was read earlier must not be shown later
+        with self._showing, self.server.atomic():
+            step = BY_NAME[self.step]
+            state = self.journey.state(self.step, self._scan_of(self.step))
             self._head.content = padded(self._overview())
             if self._choice.value != step.title:
                 put(self._choice, step.title)
@@ -445,9 +462,11 @@ class ConsolePage:
         is_taken = step.filling in ("placements", "touches")
         has_rig, is_motion = self.bench is not None, step.filling == "motion"
         is_blocked = state.status == "waiting"
-        is_full = is_taken and state.n_taken >= self._n_wanted()
-        self._take.visible = is_taken and has_rig and not is_full and not is_blocked
         is_twin = self.bench is not None and self.bench.has_operator
+        # a person may take more than the list asks for
+        is_full = is_taken and state.n_taken >= self._n_wanted()
+        self._take.visible = is_taken and has_rig and not is_blocked and not (is_full and is_twin)
+        self._take.color = "gray" if is_full else "teal"
         is_view = self._take.visible and step.filling == "placements" and not is_twin
         self._view.visible = is_view
         self._view.label = "End the camera view (V)" if self._is_viewing else "Camera view (V)"
@@ -547,8 +566,15 @@ class ConsolePage:
         body = paragraph(step.to_do)
         if self.step is StepName.CAMERA and self.journey.settings.n_cameras > 1:
             body += paragraph("Both cameras must see all of it: look at both images.")
+        if self.step is StepName.HAND_EYE:
+            with suppress(ArmscanError):
+                sensor = read_sensor_calibration(self.journey.folder / "sensor.json")
+                low, high = depths_mm(sensor)
+                body += paragraph(f"Near and far stay within {low:.0f} to {high:.0f} mm.")
+        if state.why and state.result is None:
+            body += paragraph(sentence(state.why), ALERT)
         if state.status == "waiting":
-            return body + paragraph(f"{state.why}.", ALERT)
+            return body
         if step.filling not in ("placements", "touches"):
             return body
         body += paragraph(self._lacking(), ALERT)
@@ -556,11 +582,13 @@ class ConsolePage:
             body += paragraph(self._seen[1], GOOD if self._seen[0] else WRONG)
         wanted = self._n_wanted()
         n, kind = state.n_taken, "Touch" if step.filling == "touches" else "Placement"
+        is_twin = self.bench is not None and self.bench.has_operator
         if n >= wanted:
-            return body + paragraph(f"All {wanted} are taken: calculate.", GOOD)
+            more = "" if is_twin else " More may be taken, each unlike those before."
+            now = "" if state.status in ("good", "doubtful") else ": calculate"
+            return body + paragraph(f"All {wanted} are taken{now}.{more}", GOOD)
         shown = self._placement(n)
         enough = f" At least {step.least} are needed." if n < step.least else ""
-        is_twin = self.bench is not None and self.bench.has_operator
         own = "The simulated operator follows a list of its own." if is_twin else ""
         return (
             body + f'<p style="margin:6px 0 2px;font-size:14px;color:{INK}"><b>{kind} {n + 1} of '

@@ -83,6 +83,9 @@ class Controls:
         self.gui = server.gui
         self.refresh = refresh
         self.problem = ""
+        self._hand = threading.Lock()
+        self._kept_out: list[viser.GuiButtonHandle] = []
+        self._asked: tuple[viser.GuiButtonHandle, str] | None = None
 
     def button(
         self,
@@ -101,10 +104,64 @@ class Controls:
             command.on_trigger(lambda _: self.tried(work) if _is_usable(button) else None)
         return button
 
-    def tried(self, work: Callable[[], object]) -> None:
-        """Do what a button asks for."""
+    def taking_button(
+        self,
+        label: str,
+        work: Callable[[], object],
+        key: str,
+        hint: str,
+        colour: Literal["teal", "gray", "red"] = "gray",
+    ) -> viser.GuiButtonHandle:
+        """A button that fills or empties a recording: a press meanwhile is passed over.
+
+        Presses that waited would record the same posture twice.
+        """
+        button = self.button(label, lambda: self._alone(work), key, hint, colour)
+        self._kept_out.append(button)
+        return button
+
+    def removing_button(
+        self, label: str, work: Callable[[], object], hint: str, question: Callable[[], str]
+    ) -> viser.GuiButtonHandle:
+        """A `taking_button` that asks what it would remove, and does so when pressed again."""
+
+        def ask_first() -> None:
+            if self._asked is None:
+                self._asked = button, label
+                button.label, button.color = question(), "red"
+            else:
+                self.forget_question()
+                self._alone(work)
+
+        button = self.gui.add_button(label, hint=hint, color="gray")
+        button.on_click(lambda _: self.tried(ask_first, is_answer=True))
+        self._kept_out.append(button)
+        return button
+
+    def forget_question(self) -> None:
+        """Take a question back that was not answered."""
+        if self._asked is not None:
+            (button, label), self._asked = self._asked, None
+            button.label, button.color = label, "gray"
+
+    def _alone(self, work: Callable[[], object]) -> None:
+        if not self._hand.acquire(blocking=False):
+            return
+        try:
+            for button in self._kept_out:
+                button.disabled = True
+            work()
+        finally:
+            for button in self._kept_out:
+                button.disabled = False
+            self._hand.release()
+
+    def tried(self, work: Callable[[], object], *, is_answer: bool = False) -> None:
+        """Do what a button asks for; `is_answer` if it may be the answer to a question."""
         try:
             self.problem = ""
+            if not is_answer:
+                self.forget_question()
             work()
         except Exception as error:  # every failure ends as a sentence on the page
             self.problem = told(error)
@@ -580,15 +637,18 @@ def result_card(state: StepState, link: str) -> str:
         for label, text in result.values
     )
     reasons = "".join(paragraph(text, INK, 13) for text in result.reasons)
-    old = paragraph(f"{state.why}: calculate again.", ALERT, 13) if state.status == "old" else ""
+    old = state.status == "old"
+    why = paragraph(sentence(state.why), ALERT, 13) if state.why else ""
+    figures = (
+        f'<details open><summary style="cursor:pointer;color:{MUTED}">Figures</summary>'
+        f'<table style="font-size:12px;border-collapse:collapse">{rows}</table></details>'
+    )
     return (
         f'<div style="border:1px solid {LINE};border-left:5px solid {tint};border-radius:4px;'
         f'padding:8px 10px;margin:6px 0;color:{INK};font-size:13px">'
         f'<div style="font-size:15px;font-weight:700;color:{tint}">{title.capitalize()}</div>'
-        f"{old}{reasons}{paragraph('' if old else result.next_step, INK, 13)}"
-        f'<details open><summary style="cursor:pointer;color:{MUTED}">Figures</summary>'
-        f'<table style="font-size:12px;border-collapse:collapse">{rows}</table></details>'
-        f"{link}</div>"
+        f"{why}{reasons}{paragraph('' if old else result.next_step, INK, 13)}"
+        f"{figures if rows else ''}{link}</div>"
     )
 
 

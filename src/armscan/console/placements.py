@@ -162,12 +162,14 @@ HAND_EYE = tuple(_posture(*row) for row in _POSTURES)
 
 
 def _touches() -> tuple[Placement, ...]:
-    """Twenty around the edge and over the middle."""
-    rim = [(x, y) for x in (0.1, 0.3, 0.5, 0.7, 0.9) for y in (0.1, 0.9)]
-    rim += [(x, y) for x in (0.1, 0.9) for y in (0.37, 0.63)]
-    middle = [(0.35, 0.35), (0.65, 0.35), (0.35, 0.65), (0.65, 0.65), (0.5, 0.4), (0.5, 0.6)]
+    """Twenty around the edge and over the middle; the first few are spread already."""
+    corners = [(0.1, 0.1), (0.9, 0.9), (0.9, 0.1), (0.1, 0.9)]
+    middle = [(0.35, 0.35), (0.65, 0.65), (0.65, 0.35), (0.35, 0.65), (0.5, 0.4), (0.5, 0.6)]
+    rim = [(x, y) for x in (0.5, 0.3, 0.7) for y in (0.1, 0.9)]
+    rim += [(x, y) for y in (0.37, 0.63) for x in (0.1, 0.9)]
     words = "Touch from above"
-    return tuple(Placement("touch", words, across=x, down=y) for x, y in (*rim, *middle))
+    places = (*corners, *middle, *rim)
+    return tuple(Placement("touch", words, across=x, down=y) for x, y in places)
 
 
 TOUCHES = _touches()
@@ -177,7 +179,7 @@ def drawing(placement: Placement) -> str:
     """SVG of a placement, from this program only, so that a page may show it as it is."""
     if placement.kind == "plate":
         body = _head_over_plate(placement)
-        caption = "the head over the plate, seen from the front"
+        caption = "from the front; dark: the side of camera and laser"
     elif placement.kind == "touch":
         body, caption = _touch(placement), "the plate from above"
     else:
@@ -292,12 +294,14 @@ def _head_over_plate(placement: Placement) -> str:
 
 
 def _touch(placement: Placement) -> str:
-    """The plate from above with the place to touch, and those of the list."""
+    """The plate from above with the place to touch, those before it full, those after it empty."""
     x, y, w, h = 40.0, 22.0, WIDTH - 80.0, HEIGHT - 44.0
     rect = f'<rect x="{x}" y="{y}" width="{w}" height="{h}" fill="#e3e7ea" stroke="{MUTED}"/>'
+    n_before = TOUCHES.index(placement) if placement in TOUCHES else 0
     dots = "".join(
-        f'<circle cx="{x + w * one.across:.1f}" cy="{y + h * one.down:.1f}" r="3" fill="{LINE}"/>'
-        for one in TOUCHES
+        f'<circle cx="{x + w * one.across:.1f}" cy="{y + h * one.down:.1f}" r="3.5" '
+        f'fill="{ACCENT if k < n_before else "none"}" stroke="{ACCENT}"/>'
+        for k, one in enumerate(TOUCHES)
     )
     u, v = x + w * placement.across, y + h * placement.down
     here = f'<circle cx="{u:.1f}" cy="{v:.1f}" r="7" fill="{ALERT}"/>'

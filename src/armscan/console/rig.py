@@ -86,6 +86,8 @@ class _Hand:
     _sample: int = 0
     _ready: dict[int, Frame] = field(default_factory=dict)
     """Of the other cameras, taken at the same moment."""
+    exposing: threading.Lock = field(default_factory=threading.Lock)
+    """Held while images are rendered: the arm's sample of that moment is there afterwards."""
 
     @property
     def is_over(self) -> bool:
@@ -108,6 +110,11 @@ class _Hand:
         if rows[first].camera != camera or self._ready:
             time.sleep(0.002)
             return None
+        with self.exposing:
+            return None if self.is_held else self._exposed(camera, first)
+
+    def _exposed(self, camera: int, first: int) -> Frame:
+        rows = self.source.rows
         last = first + 1
         while last < len(rows) and rows[last].t_ns == rows[first].t_ns:
             last += 1
@@ -177,7 +184,9 @@ class _HandCamera:
         return self.hand.frame(self.camera, timeout_s)
 
     def stop(self) -> None:
-        """Deliver no more."""
+        """Deliver no more than what is being rendered now."""
+        with self.hand.exposing:
+            """That is out."""
 
     def close(self) -> None:
         """Nothing to give back."""

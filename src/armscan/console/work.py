@@ -249,15 +249,16 @@ def run_step(
     try:
         result = _judged(step, _work(journey, step, scan, compare, progress))
     except ArmscanError as error:
-        result = StepResult("not good", (sentence(str(error)),))
+        result = StepResult("not good", (_reason(error),))
+        if isinstance(error, OptionError):
+            result = replace(result, next_step="Correct that above, and calculate again.")
         result = replace(result, written=_refusal(journey, step, scan))
     written = tuple(
         Path(name).relative_to(folder).as_posix() if Path(name).is_absolute() else name
         for name in result.written
     )
-    result = replace(
-        result, written=written, rests_on=rests_on, next_step=_advice(journey, step, result)
-    )
+    advice = result.next_step or _advice(journey, step, result)
+    result = replace(result, written=written, rests_on=rests_on, next_step=advice)
     place = folder / RESULTS / f"{result_key(step, scan)}.json"
     place.parent.mkdir(exist_ok=True)
     write_files({place: json.dumps(asdict(result), indent=1).encode()}, is_overwriting=True)
@@ -332,8 +333,9 @@ def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> t
         lacks += [reason for _, reason in found.not_found]
     if step in (StepName.LASER, StepName.HAND_EYE):
         n = [len(extract_stripes(one).points_px) for one in lit]
-        counts = [str(count) for count in n if count >= LEAST_LINE]
-        seen += [f"a laser line of {' and '.join(counts)} points"] if counts else []
+        counts = [count for count in n if count >= LEAST_LINE]
+        each = " in each image" if len(counts) > 1 else ""
+        seen += [f"a laser line of {min(counts)} points{each}"] if counts else []
         if not lit or min(n) < LEAST_LINE:
             lacks.append("no laser line is seen: look at laser, exposure and distance")
     if lacks:
@@ -438,18 +440,43 @@ def _refusal(journey: Journey, step: StepName, scan: str) -> tuple[str, ...]:
     return (page.as_posix(),) if page.is_file() else ()
 
 
+NOT_GOOD = {
+    StepName.CAMERA: "Look at 'Target' first, then at the photographs: take blurred ones again.",
+    StepName.LASER: "Is the laser on, and the target the camera's? Take again what is named above.",
+    StepName.PROBING: "Has the plate or the arm's base moved? Start over with firm touches.",
+    StepName.HAND_EYE: "If the plate or the arm's base may have moved since the first touch, start "
+    "over in 'Touch the plate', then here. If not, take again what is named above, or start over.",
+    StepName.CHECK: "Clean the ball and the lenses and scan it once more; then calibrate anew.",
+    StepName.INSPECT: "Open the report to see where.",
+}
+"""What most often helps where a step's job refuses or its verdict is bad."""
+
+
+def _reason(error: ArmscanError) -> str:
+    """A failure without what only a command line can do; the page is linked beside it."""
+    remedies = [
+        part
+        for part in error.remedy.split("; ")
+        if part and " --" not in f" {part}" and "shows what was found" not in part
+    ]
+    where = f"{error.where}: " if error.where and not error.where.startswith("--") else ""
+    return sentence("; ".join([f"{where}{error.what}", *remedies]))
+
+
 def _advice(journey: Journey, step: StepName, result: StepResult) -> str:
     if result.verdict == "not good":
-        if step is StepName.CHECK:
-            return "Clean the ball and the lenses and scan it once more; then calibrate anew."
-        if step is StepName.INSPECT:
-            return "Open the report to see where."
-        return "Take again what the sentence above names, or start over."
+        return NOT_GOOD.get(step, "Take again what the sentence above names, or start over.")
     order = [one.name for one in journey.steps]
     place = order.index(step) + 1
     following = f"Go on with '{BY_NAME[order[place]].title}'." if place < len(order) else ""
     if result.verdict == "doubtful":
         rest = f" If they do not matter: {following[0].lower()}{following[1:]}" if following else ""
+        left = len(BY_NAME[step].placements) - journey.n_taken(step)
+        if step is StepName.CHECK:
+            return f"Scan the ball once more, from more sides.{rest}"
+        if left > 0:
+            others = "the other one" if left == 1 else f"the other {left}"
+            return f"Take {others} and calculate again: few leave most remarks.{rest}"
         return f"Read the remarks above.{rest}"
     return following or "The report is ready."
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from armscan.console.journey import (
     Journey,
     SessionSettings,
     StepName,
+    digest_of,
     held_session,
     open_journey,
     sessions_in,
@@ -23,7 +25,13 @@ from armscan.console.journey import (
 from armscan.console.rig import open_bench, take_back
 from armscan.console.scan import GrowingRecording
 from armscan.console.work import run_step
-from armscan.errors import ArmscanError, FileFormatError, OptionError, OutputError
+from armscan.errors import (
+    ArmscanError,
+    EstimationError,
+    FileFormatError,
+    OptionError,
+    OutputError,
+)
 from armscan.geometry.poses import Pose
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
@@ -59,7 +67,7 @@ def test_an_empty_session_begins_with_the_camera_and_names_what_the_rest_waits_f
     states = {step.name: journey.state(step.name) for step in journey.steps}
     assert states[StepName.CAMERA].status == states[StepName.PROBING].status == "open"
     assert states[StepName.LASER].why == "'Camera' comes first"
-    assert states[StepName.HAND_EYE].why == "'Light sheets' comes first"
+    assert states[StepName.HAND_EYE].why == "'Camera' comes first"
     assert StepName.LATENCY not in states, "one trigger for camera and arm leaves no latency"
     assert sessions_in(tmp_path) == (tmp_path / "new",)
 
@@ -81,7 +89,10 @@ def test_a_plate_is_probed_and_the_result_grows_old_with_another_touch(tmp_path:
     journey.recording(StepName.PROBING).rmdir()
     touch_plate(journey, 13)
     state = again.state(StepName.PROBING)
-    assert (state.status, state.why) == ("old", "recordings/probing/arm.csv has changed since")
+    assert (state.status, state.why) == (
+        "old",
+        "what was taken has changed since: calculate again",
+    )
     assert "old" in (journey.folder / "report.html").read_text() or run_step(
         journey.folder, StepName.PROBING
     )
@@ -97,6 +108,57 @@ def test_the_last_touch_is_taken_back_and_at_last_the_first(tmp_path: Path) -> N
         if n:
             left = read_arm_track(journey.recording(StepName.PROBING))[0].translations_mm
             np.testing.assert_allclose(left, before[:n], atol=1e-12)
+
+
+def test_a_step_is_old_where_one_before_it_is_and_told_where_one_is_not_good(
+    tmp_path: Path,
+) -> None:
+    journey = open_journey(tmp_path / "s", SETTINGS)
+    touch_plate(journey, 12)
+    run_step(journey.folder, StepName.PROBING)
+    for name in ("camera.json", "sensor.json", "scanner.json"):
+        (journey.folder / name).write_text("{}")
+    of_hand_eye = journey.folder / "results" / "hand-eye.json"
+    rests_on = {"plate.csv": digest_of(journey.folder / "plate.csv")}
+    of_hand_eye.write_text(json.dumps({"verdict": "good", "rests_on": rests_on}))
+    states = {name: journey.state(name) for name in (StepName.HAND_EYE, StepName.SCAN)}
+    assert [(one.status, one.why) for one in states.values()] == [("good", ""), ("open", "")]
+    # another touch: the plate's document is as it was, and out of date
+    shutil.rmtree(journey.recording(StepName.PROBING))
+    touch_plate(journey, 13)
+    state = journey.state(StepName.HAND_EYE)
+    why = "'Touch the plate' is out of date: calculate it again, then this"
+    assert (state.status, state.why) == ("old", why)
+    assert journey.state(StepName.SCAN).why == why
+    run_step(journey.folder, StepName.PROBING)
+    state = journey.state(StepName.HAND_EYE)
+    why = "the result of 'Touch the plate' has changed since: calculate again"
+    assert (state.status, state.why) == ("old", why)
+    of_hand_eye.write_text(json.dumps({"verdict": "not good"}))
+    state = journey.state(StepName.SCAN)
+    assert (state.status, state.why) == (
+        "open",
+        "'Hand-eye' is not good: what it gave before is used",
+    )
+
+
+def test_what_to_do_after_a_refusal_can_be_done_on_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journey = open_journey(tmp_path / "s", SETTINGS)
+    touch_plate(journey, 12)
+
+    def refused(*_: object, **__: object) -> None:
+        raise EstimationError(
+            "the arm would have to scatter by 0.55 mm an axis",
+            remedy="check the plate; else say so with --arm-position-mm; "
+            "s/scanner.refused.html shows what was found",
+        )
+
+    monkeypatch.setattr("armscan.console.work.probe", refused)
+    result = run_step(journey.folder, StepName.PROBING)
+    assert result.reasons == ("The arm would have to scatter by 0.55 mm an axis; check the plate.",)
+    assert "Start over" in result.next_step
 
 
 def test_a_refusal_is_a_result_with_its_sentence(tmp_path: Path) -> None:

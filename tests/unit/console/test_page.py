@@ -7,12 +7,15 @@ import os
 import re
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from html import unescape
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("viser")
@@ -21,7 +24,7 @@ from armscan.console.journey import StepName
 from armscan.console.pages import ConsolePage
 from armscan.console.server import close_server, open_server
 from armscan.errors import DeviceError
-from armscan.storage.arm import read_probe_tip
+from armscan.storage.arm import PROBE_FILE, ProbeTip, probe_tip_toml, read_probe_tip
 from armscan.storage.recording import read_recording
 from rigs.console_rig import FailingArm, FailingBench, put_scanner, waited
 
@@ -165,6 +168,60 @@ def test_a_plate_is_touched_by_what_the_page_asks_for(tmp_path: Path) -> None:
         assert "Touch 2 of 20" in text_of(page)
         tip = read_probe_tip(page.journey.recording(StepName.PROBING) / "probe.toml")
         assert tip.centre_tool_mm.tolist() == [0.0, 0.0, 120.5] and tip.diameter_mm == 6.0
+
+
+def pressed(button: Any) -> None:
+    for answer in button._impl.update_cb:
+        answer(None)
+
+
+def test_start_over_asks_what_it_would_remove(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    with opened(tmp_path / "s", FailingBench()) as page:
+        (tmp_path / "s" / PROBE_FILE).write_bytes(probe_tip_toml(ProbeTip(np.zeros(3), 6.0)))
+        page.choose(StepName.PROBING)
+        for _ in range(3):
+            pressed(page._take)
+        pressed(page._start_over)
+        assert page._start_over.label == "Remove 3 touches? Press again"
+        assert page.journey.n_taken(StepName.PROBING) == 3
+        pressed(page._take_back)
+        assert page._start_over.label == "Start over", "another button is no answer"
+        pressed(page._start_over)
+        page.choose(StepName.SCAN)
+        page.choose(StepName.PROBING)
+        pressed(page._start_over)
+        assert page.journey.n_taken(StepName.PROBING) == 2
+        pressed(page._start_over)
+        assert page.journey.n_taken(StepName.PROBING) == 0
+        assert page._start_over.label == "Start over"
+
+
+def test_a_press_while_one_is_taken_takes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_scanner(tmp_path / "s")
+    bench = FailingBench()
+    begun, may_end, touch = threading.Event(), threading.Event(), bench.touch
+
+    def touch_slowly(folder: Path, k: int) -> None:
+        begun.set()
+        assert may_end.wait(30.0)
+        touch(folder, k)
+
+    monkeypatch.setattr(bench, "touch", touch_slowly)
+    with opened(tmp_path / "s", bench) as page:
+        (tmp_path / "s" / PROBE_FILE).write_bytes(probe_tip_toml(ProbeTip(np.zeros(3), 6.0)))
+        page.choose(StepName.PROBING)
+        first = threading.Thread(target=pressed, args=(page._take,))
+        first.start()
+        assert begun.wait(30.0) and page._take.disabled and page._take_back.disabled
+        for button in (page._take, page._take, page._take_back):
+            pressed(button)
+        may_end.set()
+        first.join()
+        assert page.journey.n_taken(StepName.PROBING) == 1
+        assert not page._take.disabled
 
 
 def test_what_was_taken_stays_where_a_new_take_does_not_begin(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import re
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -409,6 +410,30 @@ def test_a_simulated_hand_gives_both_cameras_images_at_one_moment() -> None:
         assert left.t_host_ns == right.t_host_ns
         assert (left.number, right.number, left.trigger_id, right.trigger_id) == (k, k, k, k)
     assert hand.is_over and hand.frame(0, 0.01) is None
+
+
+def test_an_image_that_is_rendered_when_the_scan_ends_has_its_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, begun = DrawnBench(30, rate_hz=20.0), threading.Event()
+    render = type(bench.hand.source).exposure
+
+    def render_slowly(source: object, k: int) -> Exposure:
+        if k == 3:
+            begun.set()
+            time.sleep(0.5)
+        return render(bench.hand.source, k)
+
+    monkeypatch.setattr(type(bench.hand.source), "exposure", render_slowly)
+    live = LiveScan(bench, StepName.SCAN, tmp_path / "scan-01.mcap", scanner())
+    live.start()
+    assert begun.wait(30.0)
+    live.stop()
+    source = read_recording(tmp_path / "scan-01.mcap")
+    assert source.arm is not None and source.arm.trigger_ids is not None
+    known = set(source.arm.trigger_ids.tolist())
+    assert [row.index for row in source.rows] == [0, 1, 2, 3]
+    assert all(row.trigger_id in known for row in source.rows)
 
 
 def test_both_cameras_of_an_instant_are_taken_back_together(tmp_path: Path) -> None:

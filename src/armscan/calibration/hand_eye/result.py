@@ -273,7 +273,7 @@ def plate_facts(checked: CheckedFit, plate: PlateSurface) -> tuple[tuple[str, st
         facts.append(("plane, checked", checked.plane_check))
     for component, sigma in zip(fit.components, fit.noise.sigmas, strict=True):
         unit = {"stripe": "times its own sigma"}.get(component.name, "mm")
-        if component.name.endswith("rotation"):
+        if "rotation" in component.name:
             unit = "rad"
         origin = "estimated" if component.is_estimated else "given"
         facts.append((f"scatter: {component.name}", f"{sigma:.3g} {unit} ({origin})"))

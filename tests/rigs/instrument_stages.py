@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 
@@ -311,7 +312,7 @@ def run_sheets(
         result = "rightly refused" if is_hopeless else "wrongly refused"
         return SheetResult(Outcome("sheet", result, reasons[0], seconds=seconds), None)
     outcome = judge_sheets(made, fit, information, seen, lines, n_cameras, seconds)
-    return SheetResult(outcome, fit, tuple(light_of(made, sheet, lines) for sheet in fit.sheets))
+    return SheetResult(outcome, fit, tuple(lights_of(made, fit, lines)))
 
 
 def _boards_of_lights(made: Instrument, lines: Sequence[SeenLine]) -> list[int]:
@@ -385,7 +386,7 @@ def judge_sheets(
 ) -> Outcome:
     """Each sheet by itself; the worst one is the instrument's result, and the mean its chi2."""
     n_shared = 9 if n_cameras == 1 else 24
-    names = [light_of(made, sheet, lines) for sheet in fit.sheets]
+    names = lights_of(made, fit, lines)
     bowed = [False] * len(made.lights)
     for sheet, name in zip(fit.sheets, names, strict=True):
         bowed[name] = sheet.sheet.is_bowed
@@ -499,8 +500,26 @@ def points_of_light(made: Instrument, lines: Sequence[SeenLine], k: int) -> Floa
     )
 
 
-def light_of(made: Instrument, sheet: SheetFit, lines: Sequence[SeenLine]) -> int:
-    """The true line to which a calibrated sheet is nearest."""
+def lights_of(made: Instrument, fit: LaserFit, lines: Sequence[SeenLine]) -> list[int]:
+    """The true line of each calibrated sheet: that of which most of its points are.
+
+    Where a fault was put into all points, the one nearest to the sheet. That is no rule for the
+    others: a camera whose centre errs turns all sheets, by more than lines may lie apart.
+    """
+    drew = {tuple(point): line.light for line in lines for point in line.pixels.tolist()}
+    found = []
+    for k, sheet in enumerate(fit.sheets):
+        of_sheet = Counter(
+            drew[tuple(point)]
+            for image in fit.images
+            for point in image.profile.points_px[image.sheet == k].tolist()
+            if tuple(point) in drew
+        )
+        found.append(of_sheet.most_common(1)[0][0] if of_sheet else _nearest(made, sheet, lines))
+    return found
+
+
+def _nearest(made: Instrument, sheet: SheetFit, lines: Sequence[SeenLine]) -> int:
     shown = [k for k, n in enumerate(_boards_of_lights(made, lines)) if n]
     miss = [
         float((sheet.sheet.height_with_jacobian(points_of_light(made, lines, k))[0] ** 2).mean())

@@ -135,7 +135,8 @@ class Print:
         """(N,) height of the board's surface at places (N, 2 or 3)."""
         half = 0.5 * np.ptp(self.stated[:, :2], axis=0)
         unit = (flat[:, :2] - self.stated[:, :2].mean(axis=0)) / half
-        return np.asarray((1.0 - unit**2) @ self.bow_mm)
+        # Rays along the board run out of it without end.
+        return np.asarray((1.0 - np.clip(unit, -9.0, 9.0) ** 2) @ self.bow_mm)
 
 
 @dataclass(frozen=True)

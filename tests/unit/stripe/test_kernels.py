@@ -497,7 +497,7 @@ def test_marks_follow_their_definitions() -> None:
     sides, side_sigma = rng.normal(0.0, 0.3, (n, 2)), rng.uniform(0.02, 0.2, n)
     neighbour = rng.uniform(0.0, 20.0, (n, 2))
     saturated = (rng.uniform(size=(40, 40)) > 0.93).astype(np.uint8)
-    marks, flags = np.zeros((n, 4)), np.zeros(n, np.int64)
+    marks, flags = np.zeros((n, 7)), np.zeros(n, np.int64)
     given = (points, fits, sides, side_sigma, neighbour, chain, saturated)
     mark_points(*given, np.array([1, 2, 4, 8]), marks, flags)
     across = np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
@@ -505,12 +505,16 @@ def test_marks_follow_their_definitions() -> None:
     centre += np.where(is_row[:, None], 0.0, np.stack([line, fits[:, 0]], 1))
     width = fits[:, 2] * across
     expected = np.stack([*centre.T, np.sqrt(fits[:, 3]) * across, width], axis=1)
-    assert marks == pytest.approx(expected, rel=1e-12)
+    assert marks[:, :4] == pytest.approx(expected, rel=1e-12)
     x, y = np.rint(centre).astype(int).T
     step = np.abs(np.diff(sides, axis=1)[:, 0])
     near = np.abs(np.arange(n)[:, None] - np.arange(n)) <= 4
     near &= chain[:, None] == chain
-    lean, norm = np.abs(near @ fits[:, 4]), near @ fits[:, 5]
+    lean, norm = near @ fits[:, 4], near @ fits[:, 5]
+    sine = np.minimum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
+    shape = np.stack([near @ width / near.sum(axis=1), lean / np.sqrt(norm), sine], axis=1)
+    assert marks[:, 4:] == pytest.approx(shape, rel=1e-9, abs=1e-7)
+    lean = np.abs(lean)
     definitions = (
         maximum_filter(saturated, 3, mode="nearest")[y, x] > 0,
         (step > 5.0 * side_sigma) & (step > 0.2 * fits[:, 1]),

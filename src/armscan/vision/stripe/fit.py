@@ -21,6 +21,7 @@ from armscan.kernels.profile_fit import (
     SIGMA,
     VARIANCE,
     average_sides,
+    begin_fits,
     fit_profiles,
     read_sides,
 )
@@ -180,9 +181,6 @@ SIDE_HALF = 8
 CLEAR_SIGMAS = 11.0
 """Another line within this many sigmas may light up the background beside a slanted line."""
 LEAST_REACH_PX = 6.0
-FOOT_SIGMAS = 3.2
-LEAST_REACH_SIGMAS = 1.4
-"""The window shrinks beside another line, so that its foot stays outside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,11 +214,6 @@ class ProfileFits:
         return np.asarray(np.where(is_column, self.section[0], self.section[2]))
 
 
-def axis_component(table: FloatArray) -> FloatArray:
-    """(N,) size of the normal's component along the fitted column or row."""
-    return np.abs(np.where(table[:, 5] == COLUMN, table[:, 3], table[:, 2]))
-
-
 def fit_ridge(
     plane: StripePlane,
     ridge: RidgePoints,
@@ -234,12 +227,9 @@ def fit_ridge(
     `SHORTEST_PX` are fitted, but do not count as lines beside others.
     """
     table = ridge.table
-    sigma = line_sigma_px / np.maximum(axis_component(table), 0.5)
-    neighbour = _neighbours(plane, ridge, line_sigma_px)
-    room = np.minimum(*neighbour.T) / line_sigma_px - FOOT_SIGMAS
-    reach = np.clip(room, LEAST_REACH_SIGMAS, REACH_SIGMAS)
-    beside = (ridge, sigma, neighbour, CLEAR_SIGMAS * line_sigma_px)
-    sides, side_sigma = _sides(plane, *beside)
+    start = _begin(plane, ridge, line_sigma_px)
+    sigma, reach, neighbour = start.sigma, start.reach, start.neighbour
+    sides, side_sigma = _sides(plane, table, start)
     guess = noise = start_noise(background_noise)
     bare, black = plane, 0.0
     section = np.zeros(4)
@@ -274,7 +264,7 @@ def fit_ridge(
         if plane.reflectance.size > 1:
             black += estimate_black(fitted.said(noise, section))
             plane = bare.with_black(black)
-            sides, side_sigma = _sides(plane, *beside)
+            sides, side_sigma = _sides(plane, table, start)
     values = np.zeros((len(table), FIT_COLUMNS))
     values[pick] = sample
     ground = plane.reflectance
@@ -350,36 +340,42 @@ def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatAr
     return np.stack([mean, spread / mean], axis=1)
 
 
-def _neighbours(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> FloatArray:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """Where fits begin: as for `begin_fits`.
+
+    ``clear_px``: Distance to other lines beyond which these do not light up what lies beside.
+    """
+
+    neighbour: FloatArray
+    sigma: FloatArray
+    reach: FloatArray
+    run: IntArray
+    clear_px: float
+
+
+def _begin(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> _Start:
     height, width = plane.image.shape
-    start, stop, length = chain_extents(ridge.table, ridge.chain)
-    distance = np.zeros((len(ridge), 2))
-    reach = max(CLEAR_SIGMAS * line_sigma_px, LEAST_REACH_PX)
+    first, stop, length = chain_extents(ridge.table, ridge.chain)
+    n, clear_px = len(ridge), CLEAR_SIGMAS * line_sigma_px
     is_line = (length >= SHORTEST_PX).astype(np.int64)
-    given = (ridge.table, ridge.chain, start, stop, is_line)
-    find_other_lines(*given, height, width, reach, distance)
-    return distance
+    given = (ridge.table, ridge.chain, first, stop, is_line)
+    start = _Start(
+        np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64), clear_px
+    )
+    find_other_lines(*given, height, width, max(clear_px, LEAST_REACH_PX), start.neighbour)
+    found = (start.neighbour, line_sigma_px, start.sigma, start.reach, start.run)
+    begin_fits(ridge.table, ridge.chain, *found)
+    return start
 
 
-def _sides(
-    plane: StripePlane,
-    ridge: RidgePoints,
-    sigma: FloatArray,
-    neighbour: FloatArray,
-    clear_px: float,
-) -> tuple[FloatArray, FloatArray]:
+def _sides(plane: StripePlane, points: FloatArray, start: _Start) -> tuple[FloatArray, FloatArray]:
     """Background (N, 2) of `average_sides`, and the sigma (N,) of its difference, in pixels'."""
-    raw, ground = np.zeros((len(ridge), 4)), np.ones((len(ridge), 4))
-    read_sides(plane.image, ridge.table, sigma, raw)
+    raw, ground = np.zeros((len(points), 4)), np.ones((len(points), 4))
+    read_sides(plane.image, points, start.sigma, raw)
     if plane.reflectance.size > 1:
-        read_sides(plane.reflectance, ridge.table, sigma, ground)
-    found = np.zeros((len(ridge), 3))
-    average_sides(raw, ground, neighbour, clear_px, _axis_runs(ridge), SIDE_HALF, found)
+        read_sides(plane.reflectance, points, start.sigma, ground)
+    found = np.zeros((len(points), 3))
+    given = (start.neighbour, start.clear_px, start.run, SIDE_HALF)
+    average_sides(raw, ground, *given, found)
     return np.ascontiguousarray(found[:, :2]), found[:, 2].copy()
-
-
-def _axis_runs(ridge: RidgePoints) -> IntArray:
-    """Number the stretches of a chain that keep the same axis, so that sides do not swap."""
-    axis = ridge.table[:, 5]
-    is_new = np.concatenate([[0], (np.diff(ridge.chain) != 0) | (np.diff(axis) != 0)])
-    return np.cumsum(is_new).astype(np.int64)

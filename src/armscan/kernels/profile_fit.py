@@ -230,7 +230,7 @@ PROFILE_ROWS = 4
 """Of each pixel: grey level less background, background, 1 where it counts, and reflectance."""
 
 
-@compiled(fastmath=True, error_model="numpy")
+@compiled(fastmath=True, error_model="numpy", is_inlined=True)
 def accumulate(pixels: Row, pixel: int, noise: Row, lanes: RowOut) -> None:
     """Add one pixel of each lane to the weighted sums of a Gauss-Newton step.
 

@@ -15,10 +15,12 @@ from numba.extending import intrinsic
 from armscan.kernels.arrays import (
     COLUMN,
     ROW,
+    Bytes,
     BytesOut,
     Floats,
     FloatsOut,
     Image,
+    ImageOut,
     Mask,
     Row,
     RowOut,
@@ -26,6 +28,30 @@ from armscan.kernels.arrays import (
     TableOut,
     compiled,
 )
+
+
+@compiled(fastmath=True)
+def scale_row(source: Bytes, factor: float, row: RowOut) -> None:
+    """Write grey levels times a factor to a row."""
+    share = np.float32(factor)
+    for k in range(source.shape[0]):
+        row[k] = np.float32(source[k]) * share
+
+
+@compiled()
+def copy_cells(source: Mask, is_copied: Mask, cell_px: int, factor: float, image: ImageOut) -> None:
+    """Copy the pixels of some cells of an image of eight bits.
+
+    ``source``: (H, W). ``is_copied``: (rows, columns) 0 for cells of ``cell_px`` pixels that stay
+    as they are. ``factor``: By which grey levels are multiplied. ``image``: (H, W) output.
+    """
+    height, width = source.shape
+    for y in range(height):
+        for column in range(is_copied.shape[1]):
+            if is_copied[y // cell_px, column] != 0:
+                low, high = column * cell_px, min((column + 1) * cell_px, width)
+                scale_row(source[y, low:high], factor, image[y, low:high])
+
 
 VALLEY_RATIO = 0.5
 """A dip below this share of the peak splits a run into two lines."""

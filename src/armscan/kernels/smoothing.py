@@ -425,7 +425,7 @@ LEAST_PULL = 0.03
 """Of a centre's sigma: where not even the sharpest bend pulls so much, none is looked for."""
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", is_inlined=True)
 def seen_bend(points: Table, normals: Table, chain: Ints, i: int) -> float:
     """Curvature in 1/px of the circle through a point and those `BEND_SPAN` to both sides.
 
@@ -490,12 +490,12 @@ def take_out_bends(result: Image, pull: Floats, ridge: Table, points: TableOut) 
         points[i, 1 if int(ridge[i, 5]) == COLUMN else 0] -= bend * pull[i]
 
 
-@compiled(fastmath=FUSED)
-def sum_products(values: Floats, weights: Floats) -> float:
-    """Sum of products of two rows, of which the second one is as long as counts."""
+@compiled(fastmath=FUSED, is_inlined=True)
+def sum_products(values: Floats, first: int, weights: Floats) -> float:
+    """Sum of products of weights and as many values from a place on."""
     total = 0.0
     for k in range(weights.shape[0]):
-        total += weights[k] * values[k]
+        total += weights[k] * values[first + k]
     return total
 
 
@@ -530,8 +530,8 @@ def filter_residuals(
         first, i = last - size + 1, last - half
         if first <= unused or chain[first] != chain[last]:
             continue
-        off_x = points[i, 0] - sum_products(x[first : last + 1], weights)
-        off_y = points[i, 1] - sum_products(y[first : last + 1], weights)
+        off_x = points[i, 0] - sum_products(x, first, weights)
+        off_y = points[i, 1] - sum_products(y, first, weights)
         residual[i] = (off_x * normals[i, 0] + off_y * normals[i, 1]) / sigma[i]
         told[count] = abs(residual[i])
         count += 1

@@ -19,6 +19,7 @@ from armscan.kernels.chains import (
     find_neighbours,
     measure_chains,
     place_points,
+    span_of,
     sum_windows,
     walk_chains,
 )
@@ -55,7 +56,7 @@ class ImageLevel:
     at a distance of `CLUTTER_LAG_PX`, where compression blocks, chroma subsampling and surface
     texture show; never less than ``noise``. ``rise``: Height above the background at which a line
     begins. ``lit``: (rows, columns) uint8, 1 for the cells that have a pixel so far above the
-    background.
+    background. ``brightest``: Level of the brightest pixel, as the image has it.
     """
 
     background: FloatImage
@@ -63,6 +64,7 @@ class ImageLevel:
     clutter: float
     rise: float
     lit: NDArray[np.uint8]
+    brightest: float
 
 
 def measure_level(
@@ -84,8 +86,9 @@ def measure_level(
         threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
     # between cells the background is linear: never below the least of them
     least = minimum_filter(background, 3, mode="nearest") + (threshold - ROUNDING)
-    lit = np.asarray(_cell_peaks(image) * factor > least).astype(np.uint8)
-    return ImageLevel(background, noise, clutter, threshold, lit)
+    peaks = _cell_peaks(image)
+    lit = np.asarray(peaks * factor > least).astype(np.uint8)
+    return ImageLevel(background, noise, clutter, threshold, lit, float(peaks.max()))
 
 
 BAND_PX, BAND_SIGMAS = 40, 8.0
@@ -382,29 +385,25 @@ def trace_ridges(
     found = np.zeros((max(len(runs), 1), 6))
     bend = least_bend(rise, line_sigma_px, scale)
     n = refine_candidates(image, runs, len(runs), gaussian_taps(scale), bend, found)
-    return link(found[:n], image.shape)
+    return link(found[:n])
 
 
-def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
-    """Order points (N, 6) along chains; points without a neighbour are dropped.
-
-    ``points``: Rows as in `RidgePoints.table`. ``shape``: Rows and columns of the image.
-    """
+def link(points: FloatArray) -> RidgePoints:
+    """Order points (N, 6), as in `RidgePoints.table`; those without a neighbour are dropped."""
     n = len(points)
     # a map of the part of the image that has points
-    placed, corner = points.copy(), np.floor(points[:, :2].min(axis=0, initial=max(shape)))
-    placed[:, :2] -= corner
-    columns, rows = placed[:, :2].max(axis=0, initial=0.0).astype(np.int64) + 2
+    span = np.zeros(4, np.int64)
+    span_of(points, span)
+    left, top, columns, rows = span.tolist()
     owner = np.zeros((rows, columns), np.int32)
-    is_kept = np.zeros(n, np.int64)
-    place_points(placed, owner, is_kept)
+    place_points(points, left, top, owner)
     ahead = np.full(n, -1, np.int64)
     behind = np.full(n, -1, np.int64)
-    find_neighbours(placed, owner, ahead, behind)
+    find_neighbours(points, left, top, owner, ahead, behind)
     order = np.zeros(n, np.int64)
     chain = np.zeros(n, np.int64)
     count = walk_chains(ahead, behind, order, chain)
-    return RidgePoints(points[order[:count]], chain[:count])
+    return RidgePoints(np.take(points, order[:count], axis=0), chain[:count])
 
 
 def is_bright(ridge: RidgePoints) -> NDArray[np.bool_]:

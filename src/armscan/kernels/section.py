@@ -343,18 +343,19 @@ CLIPPED_RESIDUAL = 3.5
 
 
 @compiled()
-def bin_residuals(pixels: Table, edges: Floats, bins: TableOut) -> None:
+def bin_residuals(pixels: Table, n: int, edges: Floats, bins: TableOut) -> None:
     """What the residuals are at each of the line's own grey levels.
 
-    ``pixels``: (3, M) of `weigh_section`. ``edges``: (B + 1,) increasing levels. ``bins``: (B, 4)
+    ``pixels``: (3, >= n) of `weigh_section`, ``n`` of which count. ``edges``: (B + 1,) increasing
+    levels. ``bins``: (B, 4)
     output: count, means of the level's square and of all light (not below 0), and mean square of
     the residuals, those beyond `CLIPPED_RESIDUAL` robust sigmas taken as so large.
     """
     n_bins = bins.shape[0]
     bins[:] = 0.0
     begin = np.zeros(n_bins + 1, np.int64)
-    place = np.full(pixels.shape[1], -1, np.int64)
-    for k in range(pixels.shape[1]):
+    place = np.full(n, -1, np.int64)
+    for k in range(n):
         if not edges[0] <= pixels[0, k] < edges[n_bins]:
             continue
         b = 0
@@ -369,22 +370,22 @@ def bin_residuals(pixels: Table, edges: Floats, bins: TableOut) -> None:
         begin[b + 1] += begin[b]
     size = np.zeros(begin[n_bins])
     stop = begin[:-1].copy()
-    for k in range(pixels.shape[1]):
+    for k in range(n):
         if place[k] >= 0:
             size[stop[place[k]]] = abs(pixels[2, k])
             stop[place[k]] += 1
     for b in range(n_bins):
-        n = int(bins[b, 0])
-        if n == 0:
+        count = int(bins[b, 0])
+        if count == 0:
             continue
         own = size[begin[b] : begin[b + 1]]
         limit = CLIPPED_RESIDUAL * MAD_TO_SIGMA * np.median(own)
         total = 0.0
-        for i in range(n):
+        for i in range(count):
             total += min(own[i], limit) ** 2
-        bins[b, 1] /= n
-        bins[b, 2] /= n
-        bins[b, 3] = total / n
+        bins[b, 1] /= count
+        bins[b, 2] /= count
+        bins[b, 3] = total / count
 
 
 @compiled()

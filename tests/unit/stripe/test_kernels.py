@@ -355,7 +355,7 @@ def test_residuals_are_binned_by_the_lines_own_level() -> None:
     pixels = np.stack([rng.uniform(-5, 130, 5000), rng.uniform(-20, 150, 5000), np.zeros(5000)])
     pixels[2] = rng.normal(0.0, 1.0, 5000) * (rng.uniform(size=5000) > 0.05) * 40.0
     edges, bins = np.array([0.0, 10.0, 40.0, 41.0, 120.0]), np.zeros((4, 4))
-    bin_residuals(pixels, edges, bins)
+    bin_residuals(pixels, pixels.shape[1], edges, bins)
     for b in range(4):
         own = pixels[:, (pixels[0] >= edges[b]) & (pixels[0] < edges[b + 1])]
         limit = 3.5 * 1.4826 * np.median(np.abs(own[2]))

@@ -60,17 +60,19 @@ def start_noise(background_noise: float) -> FloatArray:
     return np.array([START_CONTRAST2, START_PER_GAIN, max(background_noise**2, LEAST_VARIANCE)])
 
 
-def estimate_noise(pixels: FloatArray, peak: float, fallback: FloatArray) -> FloatArray:
+def estimate_noise(
+    pixels: FloatArray, n_pixels: int, peak: float, fallback: FloatArray
+) -> FloatArray:
     """Fit ``v = C^2 m^2 + (m + background) / gain + read^2`` to squared residuals.
 
     The residuals are binned by the line's own grey level ``m``; each bin gives a robust variance,
     and non-negative least squares gives the three terms.
 
-    ``pixels``: (3, N) of `kernels.section.weigh_section`. ``peak``: amplitude of the bright
-    ones. ``fallback``: (3,) what to return if there are too few residuals.
+    ``pixels``: (3, >= n) of `kernels.section.weigh_section`, ``n_pixels`` of which count. ``peak``:
+    amplitude of the bright ones. ``fallback``: (3,) what to return if there are too few residuals.
     """
     bins = np.zeros((len(BIN_EDGES) - 1, BIN_MEANS))
-    bin_residuals(np.ascontiguousarray(pixels), BIN_EDGES * peak, bins)
+    bin_residuals(pixels, n_pixels, BIN_EDGES * peak, bins)
     count, square, light, spread = bins[bins[:, 0] >= LEAST_PER_BIN].T
     if len(count) < 4:
         return fallback
@@ -256,7 +258,7 @@ def fit_ridge(
         at = pick[good]
         peak = float(np.quantile(sample[good, AMPLITUDE], 0.9))
         fitted = _Sample(plane, table[at], sides[at], sample[good])
-        noise = estimate_noise(fitted.left(section), peak, noise)
+        noise = estimate_noise(*fitted.left(section), peak, noise)
         said = fitted.said(noise, section)
         is_usable = (reach[at] >= REACH_SIGMAS) & (said[:, HAS_CORE] > 0.0)
         axis = table[at, 5].astype(np.int64)
@@ -297,11 +299,11 @@ class _Sample:
     sides: FloatArray
     fits: FloatArray
 
-    def left(self, section: FloatArray) -> FloatArray:
-        """(3, M) pixels of `weigh_section`."""
+    def left(self, section: FloatArray) -> tuple[FloatArray, int]:
+        """(3, >= n) pixels of `weigh_section`, and n."""
         pixels = np.zeros((3, len(self.fits) * (2 * self._reach() + 1)))
         n = self._weigh(np.zeros(3), section, np.zeros((0, SECTION_COLUMNS)), pixels)
-        return pixels[:, :n]
+        return pixels, n
 
     def said(self, noise: FloatArray, section: FloatArray) -> FloatArray:
         """(N, 8) of `weigh_section`."""

@@ -22,6 +22,7 @@ from armscan.vision.stripe.ridge import (
     SAMPLE_STEP_PX,
     FloatImage,
     ImageLevel,
+    is_of_bytes,
     mean_along,
     measure_level,
     strong_median,
@@ -271,12 +272,12 @@ def lit_plane(exposure: Exposure, threshold: float | None) -> tuple[StripePlane,
     level = measure_level(raw, threshold, scale)
     image = np.zeros(raw.shape, np.float32)
     near = maximum_filter(level.lit, 2 * FILLED_CELLS + 1, mode="constant")
-    if raw.dtype == np.uint8 and raw.flags.c_contiguous:
+    if is_of_bytes(raw):
         copy_cells(raw, near, CELL_PX, scale, image)
     else:
         _copy_deep_cells(raw, near, scale, image)
     is_clipped = level.brightest >= exposure.full_scale
-    clipped = _saturated(raw, exposure.full_scale) if is_clipped else NOWHERE
+    clipped = (raw >= exposure.full_scale).view(np.uint8) if is_clipped else NOWHERE
     units = exposure.full_scale / NORMAL_SCALE
     plane = StripePlane(image=image, clipped=clipped, saturated=clipped, grey_levels_per_unit=units)
     return plane, level

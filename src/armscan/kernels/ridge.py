@@ -42,14 +42,15 @@ def copy_cells(source: Mask, is_copied: Mask, cell_px: int, factor: float, image
     share = np.float32(factor)
     for y in range(height):
         cells = is_copied[y // cell_px]
-        own, row = source[y], image[y]
         first = 0
         while first < columns:
             stop = first
             while stop < columns and cells[stop] != 0:
                 stop += 1
-            for x in range(first * cell_px, min(stop * cell_px, width)):
-                row[x] = np.float32(own[x]) * share
+            span = slice(first * cell_px, min(stop * cell_px, width))
+            own, row = source[y, span], image[y, span]
+            for k in range(own.shape[0]):
+                row[k] = np.float32(own[k]) * share
             first = stop + 1
 
 

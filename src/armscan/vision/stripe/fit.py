@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -256,8 +257,8 @@ def fit_ridge(
         if good.sum() < LEAST_PER_BIN:
             continue
         at = pick[good]
-        peak = float(np.quantile(sample[good, AMPLITUDE], 0.9))
-        fitted = _Sample(plane, table[at], sides[at], sample[good])
+        fitted = _Sample.of(plane, table[at], sides[at], sample[good])
+        peak = _nearly_largest(fitted.fits[:, AMPLITUDE])
         noise = estimate_noise(*fitted.left(section), peak, noise)
         said = fitted.said(noise, section)
         is_usable = (reach[at] >= REACH_SIGMAS) & (said[:, HAS_CORE] > 0.0)
@@ -290,18 +291,41 @@ def fit_ridge(
     )
 
 
+def _nearly_largest(values: FloatArray) -> float:
+    """What nine tenths of some values stay below, between two of them as `numpy.quantile` has it.
+
+    In a fraction of the time that this takes.
+    """
+    place = 0.9 * (len(values) - 1)
+    low, high = int(place), min(int(place) + 1, len(values) - 1)
+    ordered = np.partition(values, (low, high))
+    return float(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
-    """Profiles that were fitted, of which noise and section are told; as for `fit_profiles`."""
+    """Profiles that were fitted, of which noise and section are told; as for `fit_profiles`.
+
+    ``reach``: Pixels that are looked at on both sides.
+    """
 
     plane: StripePlane
     points: FloatArray
     sides: FloatArray
     fits: FloatArray
+    reach: int
+
+    @classmethod
+    def of(
+        cls, plane: StripePlane, points: FloatArray, sides: FloatArray, fits: FloatArray
+    ) -> _Sample:
+        """The profiles, looked at as far as the background beside most of them is read."""
+        reach = math.ceil(_nearly_largest(fits[:, SIGMA]) * SIDE_SPAN / 2.0)
+        return cls(plane, points, sides, fits, reach)
 
     def left(self, section: FloatArray) -> tuple[FloatArray, int]:
         """(3, >= n) pixels of `weigh_section`, and n."""
-        pixels = np.zeros((3, len(self.fits) * (2 * self._reach() + 1)))
+        pixels = np.zeros((3, len(self.fits) * (2 * self.reach + 1)))
         n = self._weigh(np.zeros(3), section, np.zeros((0, SECTION_COLUMNS)), pixels)
         return pixels, n
 
@@ -311,15 +335,12 @@ class _Sample:
         self._weigh(noise, section, said, np.zeros((3, 0)))
         return said
 
-    def _reach(self) -> int:
-        return int(np.ceil(np.quantile(self.fits[:, SIGMA], 0.9) * SIDE_SPAN / 2.0))
-
     def _weigh(
         self, noise: FloatArray, section: FloatArray, said: FloatArray, pixels: FloatArray
     ) -> int:
         images = (self.plane.image, self.plane.clipped, self.plane.reflectance)
         fitted = (self.points, self.sides, self.fits)
-        return weigh_section(*images, *fitted, noise, section, self._reach(), said, pixels)
+        return weigh_section(*images, *fitted, noise, section, self.reach, said, pixels)
 
 
 def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatArray:

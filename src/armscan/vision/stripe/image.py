@@ -270,8 +270,8 @@ def lit_plane(exposure: Exposure, threshold: float | None) -> tuple[StripePlane,
     scale = NORMAL_SCALE / exposure.full_scale
     raw = exposure.image
     level = measure_level(raw, threshold, scale)
-    image = np.zeros(raw.shape, np.float32)
     near = maximum_filter(level.lit, 2 * FILLED_CELLS + 1, mode="constant")
+    image = np.zeros(raw.shape, np.float32)
     if is_of_bytes(raw):
         copy_cells(raw, near, CELL_PX, scale, image)
     else:

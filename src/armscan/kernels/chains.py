@@ -29,20 +29,35 @@ NONE = -1
 
 
 @compiled()
-def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
+def span_of(points: Table, span: IntsOut) -> None:
+    """Least x and y of points (N, >= 2), and columns and rows from there on: ``span`` (4,)."""
+    low_x = low_y = np.inf
+    high_x = high_y = 0.0
+    for i in range(points.shape[0]):
+        low_x, high_x = min(low_x, points[i, 0]), max(high_x, points[i, 0])
+        low_y, high_y = min(low_y, points[i, 1]), max(high_y, points[i, 1])
+    is_any = points.shape[0] > 0
+    span[0] = math.floor(low_x) if is_any else 0
+    span[1] = math.floor(low_y) if is_any else 0
+    span[2] = int(high_x) - span[0] + 2
+    span[3] = int(high_y) - span[1] + 2
+
+
+@compiled()
+def place_points(points: Table, left: int, top: int, owner: MapOut) -> None:
     """Enter points into a map of pixels, dropping row points that repeat a column point.
 
-    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) int32 zeros; receives one
-    more than the index of the point in each pixel. ``is_kept``: (N,) output, 1 or 0.
+    ``points``: (N, 6) from `refine_candidates`. ``left``, ``top``: Pixel of the map's corner.
+    ``owner``: (H, W) int32 zeros; receives one more than the index of the point in each pixel.
     """
     height, width = owner.shape
     for side in range(2):
         for i in range(points.shape[0]):
             if int(points[i, 5]) != side:
                 continue
-            x = int(points[i, 0] + 0.5)
-            y = int(points[i, 1] + 0.5)
-            is_kept[i] = 1
+            x = int(points[i, 0] - left + 0.5)
+            y = int(points[i, 1] - top + 0.5)
+            is_kept = owner[y, x] == 0
             if side == ROW:
                 for v in range(max(y - 1, 0), min(y + 2, height)):
                     for u in range(max(x - 1, 0), min(x + 2, width)):
@@ -51,26 +66,25 @@ def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
                             distance = math.hypot(
                                 points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
                             )
-                            if distance < SAME_PX:
-                                is_kept[i] = 0
-            if is_kept[i] == 1 and owner[y, x] == 0:
+                            is_kept &= distance >= SAME_PX
+            if is_kept:
                 owner[y, x] = i + 1
-            else:
-                is_kept[i] = 0
 
 
 @compiled()
-def find_neighbours(points: Table, owner: MapOut, ahead: IntsOut, behind: IntsOut) -> None:
+def find_neighbours(
+    points: Table, left: int, top: int, owner: MapOut, ahead: IntsOut, behind: IntsOut
+) -> None:
     """Best continuation of each point to both sides along its tangent.
 
-    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) map from `place_points`.
+    ``points``: (N, 6) from `refine_candidates`. ``left``, ``top``, ``owner``: Of `place_points`.
     ``ahead``, ``behind``: (N,) output: index of the neighbour, or -1. The tangent is the normal
     turned by a quarter.
     """
     height, width = owner.shape
     for i in range(points.shape[0]):
-        x = int(points[i, 0] + 0.5)
-        y = int(points[i, 1] + 0.5)
+        x = int(points[i, 0] - left + 0.5)
+        y = int(points[i, 1] - top + 0.5)
         if owner[y, x] != i + 1:
             continue
         nx = points[i, 2]

@@ -13,6 +13,7 @@ from armscan.kernels.arrays import (
     FloatsOut,
     Image,
     Ints,
+    IntsOut,
     Mask,
     Row,
     RowOut,
@@ -32,6 +33,42 @@ LEAST_PIXELS = 5
 CENTRE, AMPLITUDE, SIGMA, VARIANCE, SKEW, SKEW_NORM, CLIPPED, BEND_GAIN = range(8)
 FIT_COLUMNS = 8
 """Columns of a fit result."""
+
+
+FOOT_SIGMAS = 3.2
+LEAST_REACH_SIGMAS = 1.4
+"""The window shrinks beside another line, so that its foot stays outside."""
+STEEPEST = 0.5
+"""Least of the normal's component along the column or row by which a line's sigma is divided."""
+
+
+@compiled(error_model="numpy")
+def begin_fits(
+    points: Table,
+    chain: Ints,
+    neighbour: Table,
+    line_sigma_px: float,
+    sigma_px: FloatsOut,
+    reach: FloatsOut,
+    run: IntsOut,
+) -> None:
+    """Where fits begin: the line's sigma along columns or rows, and the window that is free.
+
+    ``points``: (N, 6) from `refine_candidates`. ``chain``: (N,) numbers. ``neighbour``: (N, 2)
+    distance to other lines. ``line_sigma_px``: Typical sigma of lines. ``sigma_px``: (N,) output,
+    along the point's column or row. ``reach``: (N,) output: half width of the window in sigmas.
+    ``run``: (N,) output: number of the stretch of a chain that keeps the same axis, so that sides
+    do not swap.
+    """
+    number = 0
+    for i in range(points.shape[0]):
+        across = abs(points[i, 3] if int(points[i, 5]) == COLUMN else points[i, 2])
+        sigma_px[i] = line_sigma_px / max(across, STEEPEST)
+        room = min(neighbour[i, 0], neighbour[i, 1]) / line_sigma_px - FOOT_SIGMAS
+        reach[i] = min(max(room, LEAST_REACH_SIGMAS), REACH_SIGMAS)
+        if i > 0 and (chain[i] != chain[i - 1] or points[i, 5] != points[i - 1, 5]):
+            number += 1
+        run[i] = number
 
 
 @compiled()
@@ -139,10 +176,12 @@ EXPONENT_HALVINGS = 12
 @compiled()
 def exponential(x: float) -> float:
     """``exp(x)`` to 1e-12 of itself for -700 < x < 100: a series, squared, which is vectorised."""
-    y = x / 2**EXPONENT_HALVINGS
-    series = 1.0 + y / 8.0 * (1.0 + y / 9.0 * (1.0 + y / 10.0))
-    series = 1.0 + y / 5.0 * (1.0 + y / 6.0 * (1.0 + y / 7.0 * series))
-    series = 1.0 + y * (1.0 + y / 2.0 * (1.0 + y / 3.0 * (1.0 + y / 4.0 * series)))
+    y = x * (1.0 / 2**EXPONENT_HALVINGS)
+    # products with constants: nothing is divided in a loop over many
+    series = 1.0 + y * (1.0 / 8.0) * (1.0 + y * (1.0 / 9.0) * (1.0 + y * (1.0 / 10.0)))
+    series = 1.0 + y * (1.0 / 6.0) * (1.0 + y * (1.0 / 7.0) * series)
+    series = 1.0 + y * (1.0 / 4.0) * (1.0 + y * (1.0 / 5.0) * series)
+    series = 1.0 + y * (1.0 + y * (1.0 / 2.0) * (1.0 + y * (1.0 / 3.0) * series))
     power2 = series * series
     power4 = power2 * power2
     power8 = power4 * power4
@@ -191,7 +230,7 @@ PROFILE_ROWS = 4
 """Of each pixel: grey level less background, background, 1 where it counts, and reflectance."""
 
 
-@compiled(fastmath=True, error_model="numpy")
+@compiled(fastmath=True, error_model="numpy", is_inlined=True)
 def accumulate(pixels: Row, pixel: int, noise: Row, lanes: RowOut) -> None:
     """Add one pixel of each lane to the weighted sums of a Gauss-Newton step.
 

@@ -19,6 +19,8 @@ from armscan.kernels.arrays import (
     Floats,
     FloatsOut,
     Image,
+    ImageOut,
+    IntsOut,
     Mask,
     Row,
     RowOut,
@@ -26,6 +28,97 @@ from armscan.kernels.arrays import (
     TableOut,
     compiled,
 )
+
+
+@compiled()
+def copy_cells(source: Mask, is_copied: Mask, cell_px: int, factor: float, image: ImageOut) -> None:
+    """Copy the pixels of some cells of an image of eight bits.
+
+    ``source``: (H, W). ``is_copied``: (rows, columns) 0 for cells of ``cell_px`` pixels that stay
+    as they are. ``factor``: By which grey levels are multiplied. ``image``: (H, W) output.
+    """
+    height, width = source.shape
+    columns = is_copied.shape[1]
+    share = np.float32(factor)
+    for y in range(height):
+        cells = is_copied[y // cell_px]
+        first = 0
+        while first < columns:
+            stop = first
+            while stop < columns and cells[stop] != 0:
+                stop += 1
+            span = slice(first * cell_px, min(stop * cell_px, width))
+            own, row = source[y, span], image[y, span]
+            for k in range(own.shape[0]):
+                row[k] = np.float32(own[k]) * share
+            first = stop + 1
+
+
+@compiled()
+def rank_cells(image: Mask, cell_px: int, step_px: int, rank: int, levels: ImageOut) -> None:
+    """Grey level of a rank, from 0 on, among the sampled pixels of each cell.
+
+    ``image``: (H, W). ``cell_px``: Side of a cell. ``step_px``: Every so many rows and columns are
+    sampled; what a cell lacks at the border, the last of them stand for. ``levels``: (rows,
+    columns) output.
+    """
+    last_row, last_column = (image.shape[0] - 1) // step_px, (image.shape[1] - 1) // step_px
+    side = cell_px // step_px
+    counts = np.zeros(256, np.int64)
+    for r in range(levels.shape[0]):
+        for c in range(levels.shape[1]):
+            counts[:] = 0
+            for i in range(side):
+                row = image[min(r * side + i, last_row) * step_px]
+                for j in range(side):
+                    counts[row[min(c * side + j, last_column) * step_px]] += 1
+            level, total = 0, counts[0]
+            while total <= rank:
+                level += 1
+                total += counts[level]
+            levels[r, c] = np.float32(level)
+
+
+@compiled()
+def read_steps(
+    image: Mask, row_step: int, column_step: int, lag: int, steps: ImageOut, counts: IntsOut
+) -> None:
+    """How much pixels of an image (H, W) differ from those ``lag`` columns before them.
+
+    ``row_step``, ``column_step``: Every so many are sampled. ``steps``: (rows, columns) output.
+    ``counts``: (256,) output: how many there are of each.
+    """
+    counts[:] = 0
+    for i in range(steps.shape[0]):
+        row = image[i * row_step]
+        for k in range(steps.shape[1]):
+            # of bytes themselves, differences would have no sign
+            x = k * column_step
+            step = abs(np.int64(row[x + lag]) - np.int64(row[x]))
+            steps[i, k] = np.float32(step)
+            counts[step] += 1
+
+
+@compiled()
+def count_bright(
+    image: Mask, is_looked_at: Mask, cell_px: int, step_px: int, limit: int, counts: IntsOut
+) -> None:
+    """Count the grey levels above a limit of every so many pixels of some cells.
+
+    ``image``: (H, W). ``is_looked_at``: (rows, columns) 0 for cells that are passed over unread.
+    ``cell_px``: Side of a cell, a multiple of ``step_px``. ``counts``: (256,) output.
+    """
+    counts[:] = 0
+    width = image.shape[1]
+    for y in range(0, image.shape[0], step_px):
+        cells, row = is_looked_at[y // cell_px], image[y]
+        for c in range(cells.shape[0]):
+            if cells[c] == 0:
+                continue
+            for x in range(c * cell_px, min((c + 1) * cell_px, width), step_px):
+                if row[x] > limit:
+                    counts[row[x]] += 1
+
 
 VALLEY_RATIO = 0.5
 """A dip below this share of the peak splits a run into two lines."""

@@ -57,48 +57,48 @@ AT_CENTRE, STEP, AT_AMPLITUDE, THIRD, FOURTH, SUMS = range(6)
 LANE_ROWS = SUMS + N_SUMS
 NOT_SEEN = -1.0
 """Own grey level of pixels that tell nothing."""
+REACH2, FROM2, TO2, CORE2 = REACH_SIGMAS**2, SIDE_FROM**2, SIDE_TO**2, CORE_SIGMAS**2
 
 
 @compiled(fastmath=True, error_model="numpy")
-def leave_pixel(pixels: Floats, at: int, lanes: Floats, left: FloatsOut) -> None:
+def leave_pixel(pixels: Floats, pixel: int, lanes: Floats, left: FloatsOut) -> None:
     """What the fit leaves of one pixel of each lane.
 
-    ``pixels``, ``at``, ``lanes``: As for `add_pixel`. ``left``: (3 `LANES`,) output: the line's own
-    grey level, the same with the background, the residual.
+    ``pixels``, ``pixel``, ``lanes``: As for `add_pixel`. ``left``: (3 `LANES`,) output: the line's
+    own grey level, the same with the background, the residual.
     """
     for k in range(LANES):
-        u = (at - lanes[AT_CENTRE * LANES + k]) * lanes[STEP * LANES + k]
+        u = (pixel - lanes[AT_CENTRE * LANES + k]) * lanes[STEP * LANES + k]
         uu = u * u
-        is_seen = (uu < REACH_SIGMAS**2) | ((uu > SIDE_FROM**2) & (uu < SIDE_TO**2))
+        is_seen = (uu < REACH2) | ((uu > FROM2) & (uu < TO2))
         shape = 1.0 + lanes[THIRD * LANES + k] * (u * (uu - 3.0))
         shape += lanes[FOURTH * LANES + k] * (uu * (uu - 6.0) + 3.0)
-        bell = exponential(-0.5 * min(uu, FARTHEST_SQUARE)) * lanes[AT_AMPLITUDE * LANES + k]
-        m = bell * pixels[REFLECTANCE * LANES + k] * max(shape, 0.0)
+        m = exponential(-0.5 * min(uu, FARTHEST_SQUARE)) * lanes[AT_AMPLITUDE * LANES + k]
+        m *= pixels[REFLECTANCE * LANES + k] * max(shape, 0.0)
         left[k] = m if is_seen & (pixels[COUNTS * LANES + k] >= 0.0) else NOT_SEEN
         left[LANES + k] = m + pixels[GROUND_LEVEL * LANES + k]
         left[2 * LANES + k] = pixels[LEVEL * LANES + k] - m
 
 
 @compiled(fastmath=True, error_model="numpy")
-def add_pixel(pixels: Floats, at: int, noise: Floats, lanes: FloatsOut) -> None:
+def add_pixel(pixels: Floats, pixel: int, noise: Floats, lanes: FloatsOut) -> None:
     """Add one pixel of each lane to the sums over its profile.
 
     ``pixels``: (4 `LANES`,) grey level less background, background, 1 where the pixel is not
-    clipped (`NOT_SEEN` beyond the profile), and reflectance. ``at``: Its place in the profiles.
+    clipped (`NOT_SEEN` beyond the profile), and reflectance. ``pixel``: Its place in the profiles.
     ``noise``: (3,). ``lanes``: (31 `LANES`,) centre, 1 over sigma, amplitude and section of each
     lane, then sums: weighted products of the derivatives by centre, amplitude and width (00 01 02
     11 12 22), of each with the terms of third (6 7 8) and fourth order (9 10 11), of these terms
-    (12 13 14), of the residual with all five (15 to 19), count of clipped pixels beyond the core,
-    and of the light that too large a reflectance would add the products with the three (21 22 23),
-    itself and the residual.
+    (12 13 14), of the residual with all five (15 to 19), and count of clipped pixels beyond the
+    core.
     """
     square, linear, constant = noise[0], noise[1], noise[2]
     for k in range(LANES):
         c3, c4 = lanes[THIRD * LANES + k], lanes[FOURTH * LANES + k]
         counts = pixels[COUNTS * LANES + k]
-        u = (at - lanes[AT_CENTRE * LANES + k]) * lanes[STEP * LANES + k]
+        u = (pixel - lanes[AT_CENTRE * LANES + k]) * lanes[STEP * LANES + k]
         uu = u * u
-        is_line = (uu < REACH_SIGMAS**2) & (counts >= 0.0)
+        is_line = (uu < REACH2) & (counts >= 0.0)
         bell = exponential(-0.5 * min(uu, FARTHEST_SQUARE)) * pixels[REFLECTANCE * LANES + k]
         bell *= lanes[AT_AMPLITUDE * LANES + k]
         third = u * (uu - 3.0)
@@ -113,7 +113,6 @@ def add_pixel(pixels: Floats, at: int, noise: Floats, lanes: FloatsOut) -> None:
         j2 = j0 * u
         third *= bell
         fourth *= bell
-        light = -m / max(pixels[REFLECTANCE * LANES + k], LEAST_GROUND)
         w0, w1, w2, w3, w4, wr = w * j0, w * m, w * j2, w * third, w * fourth, w * r
         lanes[SUMS * LANES + k] += w0 * j0
         lanes[(SUMS + 1) * LANES + k] += w0 * m
@@ -135,13 +134,39 @@ def add_pixel(pixels: Floats, at: int, noise: Floats, lanes: FloatsOut) -> None:
         lanes[(SUMS + 17) * LANES + k] += wr * j2
         lanes[(SUMS + 18) * LANES + k] += wr * third
         lanes[(SUMS + 19) * LANES + k] += wr * fourth
-        is_cut = is_line & (counts == 0.0) & (uu > CORE_SIGMAS**2)
+        is_cut = is_line & (counts == 0.0) & (uu > CORE2)
         lanes[(SUMS + 20) * LANES + k] += 1.0 if is_cut else 0.0
-        lanes[(SUMS + 21) * LANES + k] += w0 * light
-        lanes[(SUMS + 22) * LANES + k] += w1 * light
-        lanes[(SUMS + 23) * LANES + k] += w2 * light
-        lanes[(SUMS + 24) * LANES + k] += w * light * light
-        lanes[(SUMS + 25) * LANES + k] += wr * light
+
+
+@compiled(fastmath=True, error_model="numpy")
+def add_black(pixels: Floats, pixel: int, noise: Floats, lanes: FloatsOut) -> None:
+    """Add one pixel of each lane to what tells whether the reflectance is too large everywhere.
+
+    As for `add_pixel`; of the light that would add: sums 21 to 25, its products with the
+    derivatives by centre, amplitude and width, with itself and with the residual.
+    """
+    square, linear, constant = noise[0], noise[1], noise[2]
+    for k in range(LANES):
+        c3, c4 = lanes[THIRD * LANES + k], lanes[FOURTH * LANES + k]
+        u = (pixel - lanes[AT_CENTRE * LANES + k]) * lanes[STEP * LANES + k]
+        uu = u * u
+        is_line = (uu < REACH2) & (pixels[COUNTS * LANES + k] > 0.0)
+        bell = exponential(-0.5 * min(uu, FARTHEST_SQUARE)) * pixels[REFLECTANCE * LANES + k]
+        bell *= lanes[AT_AMPLITUDE * LANES + k]
+        third = u * (uu - 3.0)
+        shape = 1.0 + c3 * third + c4 * (uu * (uu - 6.0) + 3.0)
+        m = bell * max(shape, 0.0)
+        r = pixels[LEVEL * LANES + k] - m
+        light = max(m + pixels[GROUND_LEVEL * LANES + k], 0.0)
+        w = 1.0 / (square * m * m + linear * light + constant)
+        w = w if is_line else 0.0
+        j0 = bell * (u * shape - 3.0 * c3 * (uu - 1.0) - 4.0 * c4 * third)
+        more = -m / max(pixels[REFLECTANCE * LANES + k], LEAST_GROUND)
+        lanes[(SUMS + 21) * LANES + k] += w * j0 * more
+        lanes[(SUMS + 22) * LANES + k] += w * m * more
+        lanes[(SUMS + 23) * LANES + k] += w * j0 * u * more
+        lanes[(SUMS + 24) * LANES + k] += w * more * more
+        lanes[(SUMS + 25) * LANES + k] += w * r * more
 
 
 @compiled()
@@ -271,6 +296,7 @@ def weigh_section(
     seen = np.zeros(size * PROFILE_ROWS * LANES)
     left = np.zeros(size * 3 * LANES)
     lanes = np.zeros(LANE_ROWS * LANES)
+    has_ground = reflectance.size > 1
     sums = np.zeros(N_SUMS)
     count = 0
     for block in range(0, points.shape[0], LANES):
@@ -297,6 +323,8 @@ def weigh_section(
             own = seen[at * PROFILE_ROWS * LANES : (at + 1) * PROFILE_ROWS * LANES]
             if said.shape[0] > 0 and low <= at <= high:
                 add_pixel(own, at, noise, lanes)
+                if has_ground:
+                    add_black(own, at, noise, lanes)
             if pixels.shape[1] > 0:
                 leave_pixel(own, at, lanes, left[3 * at * LANES : 3 * (at + 1) * LANES])
         for k in range(n_lanes):
@@ -315,18 +343,19 @@ CLIPPED_RESIDUAL = 3.5
 
 
 @compiled()
-def bin_residuals(pixels: Table, edges: Floats, bins: TableOut) -> None:
+def bin_residuals(pixels: Table, n: int, edges: Floats, bins: TableOut) -> None:
     """What the residuals are at each of the line's own grey levels.
 
-    ``pixels``: (3, M) of `weigh_section`. ``edges``: (B + 1,) increasing levels. ``bins``: (B, 4)
+    ``pixels``: (3, >= n) of `weigh_section`, ``n`` of which count. ``edges``: (B + 1,) increasing
+    levels. ``bins``: (B, 4)
     output: count, means of the level's square and of all light (not below 0), and mean square of
     the residuals, those beyond `CLIPPED_RESIDUAL` robust sigmas taken as so large.
     """
     n_bins = bins.shape[0]
     bins[:] = 0.0
     begin = np.zeros(n_bins + 1, np.int64)
-    place = np.full(pixels.shape[1], -1, np.int64)
-    for k in range(pixels.shape[1]):
+    place = np.full(n, -1, np.int64)
+    for k in range(n):
         if not edges[0] <= pixels[0, k] < edges[n_bins]:
             continue
         b = 0
@@ -341,22 +370,22 @@ def bin_residuals(pixels: Table, edges: Floats, bins: TableOut) -> None:
         begin[b + 1] += begin[b]
     size = np.zeros(begin[n_bins])
     stop = begin[:-1].copy()
-    for k in range(pixels.shape[1]):
+    for k in range(n):
         if place[k] >= 0:
             size[stop[place[k]]] = abs(pixels[2, k])
             stop[place[k]] += 1
     for b in range(n_bins):
-        n = int(bins[b, 0])
-        if n == 0:
+        count = int(bins[b, 0])
+        if count == 0:
             continue
         own = size[begin[b] : begin[b + 1]]
         limit = CLIPPED_RESIDUAL * MAD_TO_SIGMA * np.median(own)
         total = 0.0
-        for i in range(n):
+        for i in range(count):
             total += min(own[i], limit) ** 2
-        bins[b, 1] /= n
-        bins[b, 2] /= n
-        bins[b, 3] = total / n
+        bins[b, 1] /= count
+        bins[b, 2] /= count
+        bins[b, 3] = total / count
 
 
 @compiled()
@@ -400,13 +429,14 @@ BACKGROUND_STEP = 0.2
 """Smallest step that matters, as a share of the line's amplitude."""
 NEIGHBOUR_SIGMAS = 4.5
 """Another line within this many sigmas pulls the centre."""
-SKEW_HALF = 4
+SHAPE_HALF = 4
+"""Neighbours over which the profile's shape is averaged."""
 LEAST_SKEW = 0.1
 """Smallest third-order part of a profile that counts as leaning."""
 SKEW_PX = 0.3
 """The part in px that counts on narrow lines, which few pixels describe."""
-MARK_X, MARK_Y, MARK_SIGMA, MARK_WIDTH = range(4)
-MARK_COLUMNS = 4
+MARK_X, MARK_Y, MARK_SIGMA, MARK_WIDTH, MARK_MEAN_WIDTH, MARK_LEAN, MARK_SINE = range(7)
+MARK_COLUMNS = 7
 
 
 @compiled()
@@ -418,6 +448,22 @@ def is_any_set(mask: Mask, x: int, y: int) -> bool:
             if mask[min(max(v, 0), height - 1), min(max(u, 0), width - 1)] > 0:
                 return True
     return False
+
+
+@compiled(error_model="numpy")
+def place_centres(points: Table, fits: Table, marks: TableOut) -> None:
+    """Fitted centre x, y, its sigma along the normal, sigma of the line, and sine of the slant.
+
+    As for `mark_points`; the slant is the angle between the fitted column or row and the normal.
+    """
+    for i in range(points.shape[0]):
+        is_column = int(points[i, 5]) == COLUMN
+        across = abs(points[i, 3] if is_column else points[i, 2])
+        marks[i, MARK_X] = points[i, 0] if is_column else fits[i, CENTRE]
+        marks[i, MARK_Y] = fits[i, CENTRE] if is_column else points[i, 1]
+        marks[i, MARK_SIGMA] = math.sqrt(fits[i, VARIANCE]) * across
+        marks[i, MARK_WIDTH] = fits[i, SIGMA] * across
+        marks[i, MARK_SINE] = math.sqrt(max(1.0 - across * across, 0.0))
 
 
 @compiled(error_model="numpy")
@@ -443,38 +489,71 @@ def mark_points(
     ``neighbour``: (N, 2) distance to other lines. ``chain``: (N,) numbers. ``saturated``: (H, W) 1
     where the laser's channel is; (1, 1) zero if it is nowhere. ``bits``: (4,) that of a
     clipped centre, of a step of the background, of a profile that leans, of a line beside it.
-    ``marks``: (N, 4) output: fitted centre x, y, sigma along the normal, sigma of the line.
+    ``marks``: (N, 7) output: fitted centre x, y, sigma along the normal, sigma of the line, its
+    mean over the neighbours, how surely the profiles lean there, and sine of the slant.
     ``flags``: (N,) output, in which the bits are set.
     """
     n = points.shape[0]
     has_saturated = saturated.size > 1
+    place_centres(points, fits, marks)
     first = stop = 0
     for i in range(n):
         if i == stop:
             first = i
             while stop < n and chain[stop] == chain[first]:
                 stop += 1
-        is_column = int(points[i, 5]) == COLUMN
-        across = abs(points[i, 3] if is_column else points[i, 2])
-        x = points[i, 0] if is_column else fits[i, CENTRE]
-        y = fits[i, CENTRE] if is_column else points[i, 1]
-        width = fits[i, SIGMA] * across
-        marks[i, MARK_X] = x
-        marks[i, MARK_Y] = y
-        marks[i, MARK_SIGMA] = math.sqrt(fits[i, VARIANCE]) * across
-        marks[i, MARK_WIDTH] = width
+        x, y, width = marks[i, MARK_X], marks[i, MARK_Y], marks[i, MARK_WIDTH]
         if has_saturated and is_any_set(saturated, int(np.rint(x)), int(np.rint(y))):
             flags[i] |= bits[0]
         step = abs(sides[i, 1] - sides[i, 0])
         if step > SIGNIFICANT * side_sigma[i] and step > BACKGROUND_STEP * fits[i, AMPLITUDE]:
             flags[i] |= bits[1]
-        lean = norm = 0.0
-        for k in range(max(i - SKEW_HALF, first), min(i + SKEW_HALF + 1, stop)):
+        lean = norm = mean = 0.0
+        low, high = max(i - SHAPE_HALF, first), min(i + SHAPE_HALF + 1, stop)
+        for k in range(low, high):
             lean += fits[k, SKEW]
             norm += fits[k, SKEW_NORM]
+            mean += marks[k, MARK_WIDTH]
         norm = max(norm, 1e-12)
+        marks[i, MARK_MEAN_WIDTH] = mean / (high - low)
+        marks[i, MARK_LEAN] = lean / math.sqrt(norm)
         is_certain = abs(lean) > SIGNIFICANT * math.sqrt(norm)
         if is_certain and abs(lean) > max(LEAST_SKEW, SKEW_PX / width) * norm:
             flags[i] |= bits[2]
         if min(neighbour[i, 0], neighbour[i, 1]) < NEIGHBOUR_SIGMAS * width:
             flags[i] |= bits[3]
+
+
+FLANKS_PER_LEAN = 1.0
+"""Sigmas of the line by which the flanks of a saturated one lie beside the centre, for each unit of
+its section's third-order term: what sections leave that are no Gram-Charlier series."""
+EDGE_BLUR_PX2 = 1.0
+"""Over the line's sigma, what an edge of the ground under the line leaves at its worst place: the
+lens blurs what the ground reflects, not the light on it alone. Of a blur of 1 px."""
+MOST_PULL = 0.5
+"""Of the line's sigma: an edge under a line takes up to half of its light."""
+
+
+@compiled(error_model="numpy")
+def widen_sigmas(
+    points: Table,
+    section: Floats,
+    width: Floats,
+    ground: Table,
+    on_flanks: Ints,
+    sigma: FloatsOut,
+) -> None:
+    """Add to sigmas what lies beside the centre: of flanks that lean, of edges of the ground.
+
+    ``points``: (N, 6) ridge points. ``section``: (4,) as for `fit_profiles`. ``width``: (N,) sigma
+    of the line. ``ground``: (N, 2) mean reflectance under the line, and how much it differs there.
+    ``on_flanks``: (N,) not 0 where the profile was fitted on its flanks. ``sigma``: (N,) of the
+    centre, input and output.
+    """
+    for i in range(points.shape[0]):
+        lean = section[0] if int(points[i, 5]) == COLUMN else section[2]
+        by_section = FLANKS_PER_LEAN * abs(lean) * width[i]
+        edge = EDGE_BLUR_PX2 / width[i]
+        by_edge = min(math.sqrt(by_section * by_section + edge * edge), MOST_PULL * width[i])
+        beside = max(by_section if on_flanks[i] != 0 else 0.0, by_edge * ground[i, 1])
+        sigma[i] = math.sqrt(sigma[i] * sigma[i] + beside * beside)

@@ -12,14 +12,22 @@ import math
 import numpy as np
 
 from armscan.kernels.arrays import (
+    COLUMN,
+    FUSED,
+    Bytes,
+    BytesOut,
     Floats,
+    FloatsOut,
+    Image,
     ImageOut,
     Ints,
     Row,
     RowOut,
     Table,
+    TableOut,
     compiled,
 )
+from armscan.kernels.profile_fit import BEND_GAIN, SIGMA
 
 SHIFT, SLOPE, BEND, BEND_SIGMA, SMOOTH_SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(8)
 SMOOTH_ROWS = 8
@@ -46,6 +54,34 @@ NEIGHBOURS_PER_PX = 3.0
 """More than points of a chain lie within a pixel along it."""
 REACHED, ALONG, ACROSS = (WEIGHT + k for k in range(3))
 LANE_ROWS = ACROSS + 1
+
+
+@compiled(error_model="numpy")
+def lay_course(
+    points: Table,
+    normals: Table,
+    sigma: Floats,
+    chain: Ints,
+    is_used: Bytes,
+    unit: float,
+    course: TableOut,
+) -> None:
+    """Lay points out for `smooth_lanes`.
+
+    ``points``, ``normals``: (N, 2). ``sigma``: (N,) along the normal. ``chain``: (N,) numbers.
+    ``is_used``: (N,) 0 for points that tell the others nothing. ``unit``: Variance of weight 1.
+    ``course``: (6, P) output.
+    """
+    n = points.shape[0]
+    course[CHAIN, :] = NOWHERE
+    for i in range(n):
+        at = LANES + i
+        course[X, at] = points[i, 0]
+        course[Y, at] = points[i, 1]
+        course[NORMAL_X, at] = normals[i, 0]
+        course[NORMAL_Y, at] = normals[i, 1]
+        course[CHAIN, at] = chain[i]
+        course[WEIGHT, at] = unit / (sigma[i] * sigma[i]) if is_used[i] != 0 else 0.0
 
 
 @compiled()
@@ -333,3 +369,187 @@ def smooth_lanes(
         for row in range(SMOOTH_ROWS):
             at = (MOMENTS + row) * LANES
             result[row, first : first + last] = state[at : at + last]
+
+
+@compiled(error_model="numpy")
+def score_predictions(result: Image, sigma: Floats, score: FloatsOut) -> None:
+    """How many sigmas (N,) points lie off what their neighbours alone say; 0 where these are few.
+
+    ``result``: (8, N) of `smooth_lanes`. ``sigma``: (N,) of the points.
+    """
+    for i in range(sigma.shape[0]):
+        own = float(result[PREDICTED_SIGMA, i])
+        off = abs(float(result[PREDICTED, i]))
+        score[i] = off / math.sqrt(own * own + sigma[i] * sigma[i]) if own > 0.0 else 0.0
+
+
+@compiled(error_model="numpy")
+def shift_points(
+    points: Table,
+    normals: Table,
+    is_used: Bytes,
+    result: Image,
+    moved: TableOut,
+    turned: TableOut,
+    sigma: FloatsOut,
+) -> None:
+    """Move points to where their neighbourhoods say, and turn their normals.
+
+    ``points``, ``normals``: (N, 2). ``is_used``: (N,) 0 for points that stay as they are.
+    ``result``: (8, N) of `smooth_lanes`. ``moved``, ``turned``: (N, 2) output. ``sigma``: (N,) of
+    points; output of those that are moved.
+    """
+    for i in range(points.shape[0]):
+        nx, ny = normals[i, 0], normals[i, 1]
+        shift = slope = 0.0
+        if is_used[i] != 0:
+            shift, slope = float(result[SHIFT, i]), float(result[SLOPE, i])
+            sigma[i] = float(result[SMOOTH_SIGMA, i])
+        moved[i, 0] = points[i, 0] + shift * nx
+        moved[i, 1] = points[i, 1] + shift * ny
+        x, y = nx + slope * ny, ny - slope * nx
+        length = math.sqrt(x * x + y * y)
+        turned[i, 0] = x / length
+        turned[i, 1] = y / length
+
+
+BEND_SPAN = 12
+"""Points to both sides by which a sharper bend is seen, 0.001 to 0.002 of noise beside it."""
+SHARPEST_BEND = 0.01
+"""In 1/px: a line across a bump of 100 px."""
+BEND_MARGIN = 3.0
+"""Times what is seen of a bend, for it is seen roughly."""
+BEYOND_BENDS = 1e9
+"""In 1/px, where the bend is not seen."""
+LEAST_PULL = 0.03
+"""Of a centre's sigma: where not even the sharpest bend pulls so much, none is looked for."""
+
+
+@compiled(error_model="numpy", is_inlined=True)
+def seen_bend(points: Table, normals: Table, chain: Ints, i: int) -> float:
+    """Curvature in 1/px of the circle through a point and those `BEND_SPAN` to both sides.
+
+    `BEYOND_BENDS` where the chain ends so near. The others: As for `find_pulls`.
+    """
+    low, high = i - BEND_SPAN, i + BEND_SPAN
+    if low < 0 or high >= points.shape[0] or chain[low] != chain[high]:
+        return BEYOND_BENDS
+    across, square = 0.0, 1e-12
+    for k in range(2):
+        across += (points[low, k] + points[high, k] - 2.0 * points[i, k]) * normals[i, k]
+        square += (points[high, k] - points[low, k]) ** 2
+    return 4.0 * abs(across) / square
+
+
+@compiled(error_model="numpy")
+def find_pulls(
+    ridge: Table,
+    fits: Table,
+    points: Table,
+    normals: Table,
+    sigma: Floats,
+    chain: Ints,
+    pull: FloatsOut,
+    matters: BytesOut,
+) -> int:
+    """By how much a bend moves the centre of a column or row that cuts the line at a slant.
+
+    With curvature k, and n and t the components of the normal and the tangent along the column, a
+    pixel d from the centre lies ``n d - k t^2 d^2 / 2`` from the line. To first order this adds the
+    term ``k t^2 s / (2 n) u^3`` to the relative profile in ``u = d / s``.
+
+    ``ridge``: (N, 6) ridge points. ``fits``: (N, 8) of `fit_profiles`. ``points``, ``normals``: (N,
+    2). ``sigma``: (N,) of the points. ``chain``: (N,) numbers. ``pull``: (N,) output, for a
+    curvature of 1. ``matters``: (N,) output, 1 where bends as sharp as there may be move more than
+    `LEAST_PULL`. Returns how many of these there are.
+    """
+    count = 0
+    for i in range(points.shape[0]):
+        n = normals[i, 1] if int(ridge[i, 5]) == COLUMN else normals[i, 0]
+        square = fits[i, SIGMA] * fits[i, SIGMA]
+        pull[i] = fits[i, BEND_GAIN] * (1.0 - n * n) * square / (2.0 * n)
+        bend = max(BEND_MARGIN * seen_bend(points, normals, chain, i), SHARPEST_BEND)
+        matters[i] = abs(pull[i]) * bend > LEAST_PULL * sigma[i]
+        count += matters[i]
+    return count
+
+
+@compiled(error_model="numpy")
+def take_out_bends(result: Image, pull: Floats, ridge: Table, points: TableOut) -> None:
+    """Move centres back by what bends pulled them.
+
+    Bends are shrunk towards zero by their own noise, so that straight lines are not disturbed.
+
+    ``result``: (8, N) of `smooth_lanes`. ``pull``, ``ridge``: (N,), (N, 6) of `find_pulls`.
+    ``points``: (N, 2) input and output.
+    """
+    for i in range(points.shape[0]):
+        bend, sigma = float(result[BEND, i]), float(result[BEND_SIGMA, i])
+        square = bend * bend
+        bend *= max(1.0 - sigma * sigma / max(square, 1e-30), 0.0)
+        points[i, 1 if int(ridge[i, 5]) == COLUMN else 0] -= bend * pull[i]
+
+
+@compiled(fastmath=FUSED, is_inlined=True)
+def sum_products(values: Floats, first: int, weights: Floats) -> float:
+    """Sum of products of weights and as many values from a place on."""
+    total = 0.0
+    for k in range(weights.shape[0]):
+        total += weights[k] * values[first + k]
+    return total
+
+
+@compiled(error_model="numpy")
+def filter_residuals(
+    points: Table,
+    normals: Table,
+    sigma: Floats,
+    chain: Ints,
+    is_used: Bytes,
+    weights: Floats,
+    residual: FloatsOut,
+    told: FloatsOut,
+) -> int:
+    """Distances from a filtered course over sigma; NaN where not all of the window can be used.
+
+    ``points``, ``normals``: (N, 2). ``sigma``: (N,). ``chain``: (N,) numbers. ``is_used``: (N,) 0
+    for points that do not count. ``weights``: (2 half + 1,) of the filter. ``residual``: (N,)
+    output. ``told``: (N,) output: sizes of those that are told.
+
+    Returns how many are told.
+    """
+    n, size = points.shape[0], weights.shape[0]
+    half = size // 2
+    x, y = points[:, 0].copy(), points[:, 1].copy()
+    residual[:] = np.nan
+    unused = -1
+    count = 0
+    for last in range(n):
+        if is_used[last] == 0:
+            unused = last
+        first, i = last - size + 1, last - half
+        if first <= unused or chain[first] != chain[last]:
+            continue
+        off_x = points[i, 0] - sum_products(x, first, weights)
+        off_y = points[i, 1] - sum_products(y, first, weights)
+        residual[i] = (off_x * normals[i, 0] + off_y * normals[i, 1]) / sigma[i]
+        told[count] = abs(residual[i])
+        count += 1
+    return count
+
+
+@compiled(fastmath=FUSED)
+def multiply_lagged(residual: Floats, chain: Ints, lag: int, total: FloatsOut) -> None:
+    """Sum of products of residuals (N,) at a distance on the same chain, and how many there are.
+
+    ``residual``: (N,) NaN where there is none. ``total``: (2,) output.
+    """
+    products = count = 0.0
+    later, numbers = residual[lag:], chain[lag:]
+    for i in range(later.shape[0]):
+        a, b = residual[i], later[i]
+        is_one = (abs(a) < np.inf) & (abs(b) < np.inf) & (chain[i] == numbers[i])
+        products += a * b if is_one else 0.0
+        count += 1.0 if is_one else 0.0
+    total[0] = products
+    total[1] = count

@@ -25,7 +25,17 @@ from armscan.kernels.ridge import (
     sample_across,
     sum_at_border,
 )
-from armscan.kernels.section import bin_residuals, common_terms, mark_points, weigh_section
+from armscan.kernels.section import (
+    bin_residuals,
+    common_terms,
+    mark_points,
+    weigh_section,
+    widen_sigmas,
+)
+from armscan.kernels.smoothing import filter_residuals, multiply_lagged
+from armscan.records.exposure import Exposure
+from armscan.vision.stripe.image import lit_plane
+from armscan.vision.stripe.ridge import measure_level
 
 FLOAT32 = 3e-5
 """Rounding of 32-bit sums over a few hundred pixels of grey level 255, relative to 1."""
@@ -355,7 +365,7 @@ def test_residuals_are_binned_by_the_lines_own_level() -> None:
     pixels = np.stack([rng.uniform(-5, 130, 5000), rng.uniform(-20, 150, 5000), np.zeros(5000)])
     pixels[2] = rng.normal(0.0, 1.0, 5000) * (rng.uniform(size=5000) > 0.05) * 40.0
     edges, bins = np.array([0.0, 10.0, 40.0, 41.0, 120.0]), np.zeros((4, 4))
-    bin_residuals(pixels, edges, bins)
+    bin_residuals(pixels, pixels.shape[1], edges, bins)
     for b in range(4):
         own = pixels[:, (pixels[0] >= edges[b]) & (pixels[0] < edges[b + 1])]
         limit = 3.5 * 1.4826 * np.median(np.abs(own[2]))
@@ -497,7 +507,7 @@ def test_marks_follow_their_definitions() -> None:
     sides, side_sigma = rng.normal(0.0, 0.3, (n, 2)), rng.uniform(0.02, 0.2, n)
     neighbour = rng.uniform(0.0, 20.0, (n, 2))
     saturated = (rng.uniform(size=(40, 40)) > 0.93).astype(np.uint8)
-    marks, flags = np.zeros((n, 4)), np.zeros(n, np.int64)
+    marks, flags = np.zeros((n, 7)), np.zeros(n, np.int64)
     given = (points, fits, sides, side_sigma, neighbour, chain, saturated)
     mark_points(*given, np.array([1, 2, 4, 8]), marks, flags)
     across = np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
@@ -505,12 +515,16 @@ def test_marks_follow_their_definitions() -> None:
     centre += np.where(is_row[:, None], 0.0, np.stack([line, fits[:, 0]], 1))
     width = fits[:, 2] * across
     expected = np.stack([*centre.T, np.sqrt(fits[:, 3]) * across, width], axis=1)
-    assert marks == pytest.approx(expected, rel=1e-12)
+    assert marks[:, :4] == pytest.approx(expected, rel=1e-12)
     x, y = np.rint(centre).astype(int).T
     step = np.abs(np.diff(sides, axis=1)[:, 0])
     near = np.abs(np.arange(n)[:, None] - np.arange(n)) <= 4
     near &= chain[:, None] == chain
-    lean, norm = np.abs(near @ fits[:, 4]), near @ fits[:, 5]
+    lean, norm = near @ fits[:, 4], near @ fits[:, 5]
+    sine = np.minimum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
+    shape = np.stack([near @ width / near.sum(axis=1), lean / np.sqrt(norm), sine], axis=1)
+    assert marks[:, 4:] == pytest.approx(shape, rel=1e-9, abs=1e-7)
+    lean = np.abs(lean)
     definitions = (
         maximum_filter(saturated, 3, mode="nearest")[y, x] > 0,
         (step > 5.0 * side_sigma) & (step > 0.2 * fits[:, 1]),
@@ -566,3 +580,73 @@ def test_other_lines_match_brute_force() -> None:
     gap[chain[:, None] == chain] = np.inf
     nearest = np.where(gap.min(axis=1) <= 8.0, gap.min(axis=1), np.inf)
     assert found.min(axis=1).tolist() == pytest.approx(nearest.tolist())
+
+
+@pytest.mark.parametrize("shape", [(200, 333), (128, 192), (70, 40), (20, 9)])
+def test_levels_of_bytes_are_those_of_the_same_numbers(shape: tuple[int, int]) -> None:
+    # bytes are counted, other numbers sorted
+    rng = np.random.default_rng(shape[0])
+    image = np.clip(rng.normal(20.0, 4.0, shape), 0, 255).astype(np.uint8)
+    image[shape[0] // 2 : shape[0] // 2 + 5] = 251
+    counted = measure_level(image, None, 255.0 / 251.0)
+    ordered = measure_level(image.astype(np.float32), None, 255.0 / 251.0)
+    assert (counted.background == ordered.background).all()
+    assert (counted.lit == ordered.lit).all()
+    for name in ("noise", "clutter", "rise", "brightest"):
+        assert getattr(counted, name) == pytest.approx(getattr(ordered, name), rel=1e-6)
+    assert counted.brightest == 251.0
+
+
+def test_cells_of_bytes_are_copied_as_those_of_deeper_images() -> None:
+    rng = np.random.default_rng(9)
+    image = rng.integers(0, 20, (500, 700)).astype(np.uint8)
+    image[340:346, 100:250] = 127
+    flat = Exposure(image=image, source="bytes", bits_used=7)
+    deep = Exposure(image=image.astype(np.uint16), source="words", bits_used=7)
+    (plane, _), (other, _) = lit_plane(flat, None), lit_plane(deep, None)
+    assert (plane.image == other.image).all()
+    assert (plane.clipped == (image == 127)).all()
+    assert plane.image[343, 120] == pytest.approx(255.0)
+    # far from the line nothing is copied, near it all is
+    assert not plane.image[:100].any()
+    assert plane.image[330:360, 90:260] == pytest.approx(image[330:360, 90:260] * (255.0 / 127.0))
+
+
+def test_residuals_are_those_of_a_convolution() -> None:
+    rng = np.random.default_rng(4)
+    n, half = 300, 6
+    chain = np.repeat([0, 3], [180, 120])
+    points = np.stack([np.arange(n) + rng.normal(0, 0.1, n), rng.normal(0, 1, n)], axis=1)
+    turn = rng.uniform(0, 6, n)
+    normals = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    sigma, is_used = rng.uniform(0.5, 2, n), np.ones(n, np.uint8)
+    is_used[[50, 200]] = 0
+    weights = rng.uniform(0, 1, 2 * half + 1)
+    residual, told = np.zeros(n), np.zeros(n)
+    given = (points, normals, sigma, chain, is_used, weights)
+    count = filter_residuals(*given, residual, told)
+    filtered = np.stack([np.correlate(p, weights, "same") for p in points.T], axis=1)
+    expected = ((points - filtered) * normals).sum(axis=1) / sigma
+    near = np.abs(np.arange(n)[:, None] - np.arange(n)) <= half
+    is_whole = (near & (chain[:, None] == chain) & (is_used > 0)).sum(axis=1) == 2 * half + 1
+    assert (np.isfinite(residual) == is_whole).all()
+    assert residual[is_whole] == pytest.approx(expected[is_whole], rel=1e-9, abs=1e-9)
+    assert told[:count] == pytest.approx(np.abs(expected[is_whole]), rel=1e-9, abs=1e-9)
+    total = np.zeros(2)
+    for lag in (0, 3):
+        multiply_lagged(residual, chain, lag, total)
+        product = residual[: n - lag] * residual[lag:]
+        own = np.isfinite(product) & (chain[: n - lag] == chain[lag:])
+        assert total == pytest.approx([product[own].sum(), own.sum()], rel=1e-12)
+
+
+def test_what_lies_beside_a_centre_widens_its_sigma() -> None:
+    ridge = np.zeros((4, 6))
+    ridge[2:, 5] = 1.0
+    section, width = np.array([0.1, 0.0, -0.02, 0.0]), np.array([3.0, 3.0, 2.0, 0.5])
+    ground = np.array([[1.0, 0.0], [1.0, 0.0], [0.9, 0.5], [0.9, 0.5]])
+    sigma = np.full(4, 0.04)
+    widen_sigmas(ridge, section, width, ground, np.array([1, 0, 0, 1]), sigma)
+    # flanks: lean times width; edges: the blur's share, at most half of the width, times contrast
+    beside = np.array([0.3, 0.0, 0.5 * np.hypot(0.04, 0.5), 0.5 * 0.25])
+    assert sigma == pytest.approx(np.hypot(0.04, beside), rel=1e-12)

@@ -7,9 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray
-from armscan.kernels.profile_fit import AMPLITUDE, BEND_GAIN, SIGMA
-from armscan.kernels.section import MARK_SIGMA, MARK_WIDTH
+from armscan.kernels.profile_fit import AMPLITUDE
+from armscan.kernels.section import (
+    EDGE_BLUR_PX2,
+    MARK_SIGMA,
+    MARK_WIDTH,
+    MOST_PULL,
+    widen_sigmas,
+)
+from armscan.kernels.smoothing import find_pulls, take_out_bends
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.stripe.fit import ProfileFits, fit_ridge
@@ -43,33 +49,14 @@ from armscan.vision.stripe.ridge import (
     measure_level,
     trace_ridges,
 )
-from armscan.vision.stripe.smooth import UNKNOWN_SCATTER_PX, Polyline, curvature, scatter, smooth
+from armscan.vision.stripe.smooth import UNKNOWN_SCATTER_PX, Polyline, bends, scatter, smooth
 from armscan.vision.stripe.thesis import THESIS_METHODS, link_centres
 
 LEAST_SIGMA_PX = 0.002
 """What pixel locking and the shape of the profile leave without any noise."""
-FLANKS_PER_LEAN = 1.0
-"""Sigmas of the line by which the flanks of a saturated one lie beside the centre, for each unit of
-its section's third-order term: what sections leave that are no Gram-Charlier series."""
-EDGE_BLUR_PX2 = 1.0
-"""Over the line's sigma, what an edge of the ground under the line leaves at its worst place: the
-lens blurs what the ground reflects, not the light on it alone. Of a blur of 1 px."""
-MOST_PULL = 0.5
-"""Of the line's sigma: an edge under a line takes up to half of its light."""
 MOST_LEFT = 0.2
 """Of an edge's pull: the blur leaves more of it on lines of sigma below 3.2 px. Edges lie beside
 only a part of such lines, and the points there are better left out."""
-
-SHARPEST_BEND = 0.01
-"""In 1/px: a line across a bump of 100 px."""
-BEND_SPAN = 12
-"""Points to both sides by which a sharper bend is seen, 0.001 to 0.002 of noise beside it."""
-BEND_MARGIN = 3.0
-"""Times what is seen of a bend, for it is seen roughly."""
-BEYOND_BENDS = 1e9
-"""In 1/px, where the bend is not seen."""
-LEAST_PULL = 0.03
-"""Of a centre's sigma: where not even the sharpest bend pulls so much, none is looked for."""
 
 
 def extract_stripes(
@@ -212,7 +199,7 @@ def to_profile(
         flags[near] |= int(StripeFlag.NEIGHBOUR)
     if plane.reflectance.size > 1:
         flags |= int(StripeFlag.GROUND_KNOWN)
-    flags[is_cut_off(fits, points, width, plane.image.shape)] |= int(StripeFlag.END)
+    flags[is_cut_off(marks, chain, plane.image.shape)] |= int(StripeFlag.END)
     flags[is_short(points, chain)] |= int(StripeFlag.SHORT_SEGMENT)
     usable = (flags & int(REJECTING)) == 0
     # beyond a crossing a chain may follow the other line: nothing is averaged across it
@@ -221,62 +208,33 @@ def to_profile(
     course = straighten(Polyline(points, normals, sigma, stretch, usable), fits)
     smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
-    is_on_flanks = (flags & int(StripeFlag.SATURATED)) != 0
-    by_section = FLANKS_PER_LEAN * np.abs(fits.lean) * width
-    by_edge = np.minimum(np.hypot(by_section, EDGE_BLUR_PX2 / width), MOST_PULL * width)
-    beside = np.maximum(by_section * is_on_flanks, by_edge * fits.ground[:, 1])
     if fits.is_noise_assumed and not smoothed.is_noise_measured:
         flags |= int(StripeFlag.NOISE_ASSUMED)
     binning = exposure.window.binning
     sigma = np.maximum(smoothed.sigma, LEAST_SIGMA_PX)
+    noise_length = np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0)
+    on_flanks = flags & int(StripeFlag.SATURATED)
+    widen_sigmas(fits.ridge.table, fits.section, width, fits.ground, on_flanks, sigma)
     return Profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(smoothed.points),
         normals_px=smoothed.normals,
-        sigma_px=np.hypot(sigma, beside) * binning,
+        sigma_px=sigma * binning,
         width_px=width * binning,
         intensity=fits.values[:, AMPLITUDE] * fits.ground[:, 0] * plane.grey_levels_per_unit,
         flags=flags,
         segment=np.cumsum(np.diff(chain, prepend=chain[:1]) != 0),
-        noise_length=np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0),
+        noise_length=noise_length,
     )
 
 
 def straighten(course: Polyline, fits: ProfileFits) -> Polyline:
-    """Take out the bias of a column or row that cuts a bent line at a slant.
-
-    With curvature k, and n and t the components of the normal and the tangent along the column, a
-    pixel d from the centre lies ``n d - k t^2 d^2 / 2`` from the line. To first order this adds the
-    term ``k t^2 s / (2 n) u^3`` to the relative profile in ``u = d / s``.
-    """
-    table = fits.ridge.table
-    rows = np.arange(len(table))
-    along = 1 - table[:, 5].astype(np.int64)
-    n = course.normals[rows, along]
-    sigma_along = fits.values[:, SIGMA]
-    by_bend = fits.values[:, BEND_GAIN] * (1.0 - n * n) * sigma_along**2 / (2.0 * n)
-    sharpest = np.maximum(BEND_MARGIN * seen_bend(course), SHARPEST_BEND)
-    matters = np.abs(by_bend) * sharpest > LEAST_PULL * course.sigma
-    bend = curvature(course, matters)
-    corrected = course.points.copy()
-    corrected[rows, along] -= bend * by_bend
+    """Take out the bias of a column or row that cuts a bent line at a slant: `find_pulls`."""
+    points, normals, sigma, chain, _ = course.rows
+    pull, matters = np.zeros(len(course)), np.zeros(len(course), dtype=np.bool_)
+    given = (fits.ridge.table, fits.values, points, normals, sigma, chain)
+    if not find_pulls(*given, pull, matters.view(np.uint8)):
+        return course
+    corrected = points.copy()
+    take_out_bends(bends(course, matters), pull, fits.ridge.table, corrected)
     return replace(course, points=corrected)
-
-
-def seen_bend(course: Polyline) -> FloatArray:
-    """Curvature (N,) in 1/px of the circle through a point and those `BEND_SPAN` to both sides.
-
-    `BEYOND_BENDS` where the chain ends so near.
-    """
-    bend = np.full(len(course), BEYOND_BENDS)
-    if len(course) <= 2 * BEND_SPAN:
-        return bend
-    before, own = slice(0, -2 * BEND_SPAN), slice(BEND_SPAN, len(course) - BEND_SPAN)
-    after = slice(2 * BEND_SPAN, None)
-    across, square = np.zeros(len(bend[own])), np.full(len(bend[own]), 1e-12)
-    for place, normal in zip(course.points.T, course.normals.T, strict=True):
-        across += (place[before] + place[after] - 2.0 * place[own]) * normal[own]
-        square += (place[after] - place[before]) ** 2
-    is_one = course.chain[before] == course.chain[after]
-    bend[own] = np.where(is_one, 4.0 * np.abs(across) / square, BEYOND_BENDS)
-    return bend

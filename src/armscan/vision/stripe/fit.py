@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ from armscan.kernels.profile_fit import (
     SIGMA,
     VARIANCE,
     average_sides,
+    begin_fits,
     fit_profiles,
     read_sides,
 )
@@ -59,17 +61,19 @@ def start_noise(background_noise: float) -> FloatArray:
     return np.array([START_CONTRAST2, START_PER_GAIN, max(background_noise**2, LEAST_VARIANCE)])
 
 
-def estimate_noise(pixels: FloatArray, peak: float, fallback: FloatArray) -> FloatArray:
+def estimate_noise(
+    pixels: FloatArray, n_pixels: int, peak: float, fallback: FloatArray
+) -> FloatArray:
     """Fit ``v = C^2 m^2 + (m + background) / gain + read^2`` to squared residuals.
 
     The residuals are binned by the line's own grey level ``m``; each bin gives a robust variance,
     and non-negative least squares gives the three terms.
 
-    ``pixels``: (3, N) of `kernels.section.weigh_section`. ``peak``: amplitude of the bright
-    ones. ``fallback``: (3,) what to return if there are too few residuals.
+    ``pixels``: (3, >= n) of `kernels.section.weigh_section`, ``n_pixels`` of which count. ``peak``:
+    amplitude of the bright ones. ``fallback``: (3,) what to return if there are too few residuals.
     """
     bins = np.zeros((len(BIN_EDGES) - 1, BIN_MEANS))
-    bin_residuals(np.ascontiguousarray(pixels), BIN_EDGES * peak, bins)
+    bin_residuals(pixels, n_pixels, BIN_EDGES * peak, bins)
     count, square, light, spread = bins[bins[:, 0] >= LEAST_PER_BIN].T
     if len(count) < 4:
         return fallback
@@ -180,9 +184,6 @@ SIDE_HALF = 8
 CLEAR_SIGMAS = 11.0
 """Another line within this many sigmas may light up the background beside a slanted line."""
 LEAST_REACH_PX = 6.0
-FOOT_SIGMAS = 3.2
-LEAST_REACH_SIGMAS = 1.4
-"""The window shrinks beside another line, so that its foot stays outside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,11 +217,6 @@ class ProfileFits:
         return np.asarray(np.where(is_column, self.section[0], self.section[2]))
 
 
-def axis_component(table: FloatArray) -> FloatArray:
-    """(N,) size of the normal's component along the fitted column or row."""
-    return np.abs(np.where(table[:, 5] == COLUMN, table[:, 3], table[:, 2]))
-
-
 def fit_ridge(
     plane: StripePlane,
     ridge: RidgePoints,
@@ -234,12 +230,9 @@ def fit_ridge(
     `SHORTEST_PX` are fitted, but do not count as lines beside others.
     """
     table = ridge.table
-    sigma = line_sigma_px / np.maximum(axis_component(table), 0.5)
-    neighbour = _neighbours(plane, ridge, line_sigma_px)
-    room = np.minimum(*neighbour.T) / line_sigma_px - FOOT_SIGMAS
-    reach = np.clip(room, LEAST_REACH_SIGMAS, REACH_SIGMAS)
-    beside = (ridge, sigma, neighbour, CLEAR_SIGMAS * line_sigma_px)
-    sides, side_sigma = _sides(plane, *beside)
+    start = _begin(plane, ridge, line_sigma_px)
+    sigma, reach, neighbour = start.sigma, start.reach, start.neighbour
+    sides, side_sigma = _sides(plane, table, start)
     guess = noise = start_noise(background_noise)
     bare, black = plane, 0.0
     section = np.zeros(4)
@@ -264,9 +257,9 @@ def fit_ridge(
         if good.sum() < LEAST_PER_BIN:
             continue
         at = pick[good]
-        peak = float(np.quantile(sample[good, AMPLITUDE], 0.9))
-        fitted = _Sample(plane, table[at], sides[at], sample[good])
-        noise = estimate_noise(fitted.left(section), peak, noise)
+        fitted = _Sample.of(plane, table[at], sides[at], sample[good])
+        peak = _nearly_largest(fitted.fits[:, AMPLITUDE])
+        noise = estimate_noise(*fitted.left(section), peak, noise)
         said = fitted.said(noise, section)
         is_usable = (reach[at] >= REACH_SIGMAS) & (said[:, HAS_CORE] > 0.0)
         axis = table[at, 5].astype(np.int64)
@@ -274,7 +267,7 @@ def fit_ridge(
         if plane.reflectance.size > 1:
             black += estimate_black(fitted.said(noise, section))
             plane = bare.with_black(black)
-            sides, side_sigma = _sides(plane, *beside)
+            sides, side_sigma = _sides(plane, table, start)
     values = np.zeros((len(table), FIT_COLUMNS))
     values[pick] = sample
     ground = plane.reflectance
@@ -298,20 +291,43 @@ def fit_ridge(
     )
 
 
+def _nearly_largest(values: FloatArray) -> float:
+    """What nine tenths of some values stay below, between two of them as `numpy.quantile` has it.
+
+    In a fraction of the time that this takes.
+    """
+    place = 0.9 * (len(values) - 1)
+    low, high = int(place), min(int(place) + 1, len(values) - 1)
+    ordered = np.partition(values, (low, high))
+    return float(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
-    """Profiles that were fitted, of which noise and section are told; as for `fit_profiles`."""
+    """Profiles that were fitted, of which noise and section are told; as for `fit_profiles`.
+
+    ``reach``: Pixels that are looked at on both sides.
+    """
 
     plane: StripePlane
     points: FloatArray
     sides: FloatArray
     fits: FloatArray
+    reach: int
 
-    def left(self, section: FloatArray) -> FloatArray:
-        """(3, M) pixels of `weigh_section`."""
-        pixels = np.zeros((3, len(self.fits) * (2 * self._reach() + 1)))
+    @classmethod
+    def of(
+        cls, plane: StripePlane, points: FloatArray, sides: FloatArray, fits: FloatArray
+    ) -> _Sample:
+        """The profiles, looked at as far as the background beside most of them is read."""
+        reach = math.ceil(_nearly_largest(fits[:, SIGMA]) * SIDE_SPAN / 2.0)
+        return cls(plane, points, sides, fits, reach)
+
+    def left(self, section: FloatArray) -> tuple[FloatArray, int]:
+        """(3, >= n) pixels of `weigh_section`, and n."""
+        pixels = np.zeros((3, len(self.fits) * (2 * self.reach + 1)))
         n = self._weigh(np.zeros(3), section, np.zeros((0, SECTION_COLUMNS)), pixels)
-        return pixels[:, :n]
+        return pixels, n
 
     def said(self, noise: FloatArray, section: FloatArray) -> FloatArray:
         """(N, 8) of `weigh_section`."""
@@ -319,15 +335,12 @@ class _Sample:
         self._weigh(noise, section, said, np.zeros((3, 0)))
         return said
 
-    def _reach(self) -> int:
-        return int(np.ceil(np.quantile(self.fits[:, SIGMA], 0.9) * SIDE_SPAN / 2.0))
-
     def _weigh(
         self, noise: FloatArray, section: FloatArray, said: FloatArray, pixels: FloatArray
     ) -> int:
         images = (self.plane.image, self.plane.clipped, self.plane.reflectance)
         fitted = (self.points, self.sides, self.fits)
-        return weigh_section(*images, *fitted, noise, section, self._reach(), said, pixels)
+        return weigh_section(*images, *fitted, noise, section, self.reach, said, pixels)
 
 
 def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatArray:
@@ -350,36 +363,42 @@ def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatAr
     return np.stack([mean, spread / mean], axis=1)
 
 
-def _neighbours(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> FloatArray:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """Where fits begin: as for `begin_fits`.
+
+    ``clear_px``: Distance to other lines beyond which these do not light up what lies beside.
+    """
+
+    neighbour: FloatArray
+    sigma: FloatArray
+    reach: FloatArray
+    run: IntArray
+    clear_px: float
+
+
+def _begin(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> _Start:
     height, width = plane.image.shape
-    start, stop, length = chain_extents(ridge.table, ridge.chain)
-    distance = np.zeros((len(ridge), 2))
-    reach = max(CLEAR_SIGMAS * line_sigma_px, LEAST_REACH_PX)
+    first, stop, length = chain_extents(ridge.table, ridge.chain)
+    n, clear_px = len(ridge), CLEAR_SIGMAS * line_sigma_px
     is_line = (length >= SHORTEST_PX).astype(np.int64)
-    given = (ridge.table, ridge.chain, start, stop, is_line)
-    find_other_lines(*given, height, width, reach, distance)
-    return distance
+    given = (ridge.table, ridge.chain, first, stop, is_line)
+    start = _Start(
+        np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64), clear_px
+    )
+    find_other_lines(*given, height, width, max(clear_px, LEAST_REACH_PX), start.neighbour)
+    found = (start.neighbour, line_sigma_px, start.sigma, start.reach, start.run)
+    begin_fits(ridge.table, ridge.chain, *found)
+    return start
 
 
-def _sides(
-    plane: StripePlane,
-    ridge: RidgePoints,
-    sigma: FloatArray,
-    neighbour: FloatArray,
-    clear_px: float,
-) -> tuple[FloatArray, FloatArray]:
+def _sides(plane: StripePlane, points: FloatArray, start: _Start) -> tuple[FloatArray, FloatArray]:
     """Background (N, 2) of `average_sides`, and the sigma (N,) of its difference, in pixels'."""
-    raw, ground = np.zeros((len(ridge), 4)), np.ones((len(ridge), 4))
-    read_sides(plane.image, ridge.table, sigma, raw)
+    raw, ground = np.zeros((len(points), 4)), np.ones((len(points), 4))
+    read_sides(plane.image, points, start.sigma, raw)
     if plane.reflectance.size > 1:
-        read_sides(plane.reflectance, ridge.table, sigma, ground)
-    found = np.zeros((len(ridge), 3))
-    average_sides(raw, ground, neighbour, clear_px, _axis_runs(ridge), SIDE_HALF, found)
+        read_sides(plane.reflectance, points, start.sigma, ground)
+    found = np.zeros((len(points), 3))
+    given = (start.neighbour, start.clear_px, start.run, SIDE_HALF)
+    average_sides(raw, ground, *given, found)
     return np.ascontiguousarray(found[:, :2]), found[:, 2].copy()
-
-
-def _axis_runs(ridge: RidgePoints) -> IntArray:
-    """Number the stretches of a chain that keep the same axis, so that sides do not swap."""
-    axis = ridge.table[:, 5]
-    is_new = np.concatenate([[0], (np.diff(ridge.chain) != 0) | (np.diff(axis) != 0)])
-    return np.cumsum(is_new).astype(np.int64)

@@ -3,25 +3,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX
-from armscan.kernels.profile_fit import REACH_SIGMAS, SKEW, SKEW_NORM
-from armscan.kernels.section import MARK_COLUMNS, mark_points
-from armscan.records.profile import StripeFlag
-from armscan.vision.stripe.fit import ProfileFits, axis_component
-from armscan.vision.stripe.ridge import (
-    SHORTEST_PX,
-    chain_bounds,
-    chain_extents,
-    mean_along,
-    sum_along,
+from armscan.kernels.profile_fit import REACH_SIGMAS
+from armscan.kernels.section import (
+    MARK_COLUMNS,
+    MARK_LEAN,
+    MARK_MEAN_WIDTH,
+    MARK_SINE,
+    MARK_WIDTH,
+    SHAPE_HALF,
+    mark_points,
 )
+from armscan.records.profile import StripeFlag
+from armscan.vision.stripe.fit import ProfileFits
+from armscan.vision.stripe.ridge import SHORTEST_PX, chain_bounds, chain_extents
 
 MERGED_SIGMAS = 20.0
 """Where two lines cross at a small angle they run as one over about this many sigmas."""
@@ -36,7 +36,7 @@ MARKS = (
 
 
 def mark(fits: ProfileFits, saturated: NDArray[np.uint8]) -> tuple[FloatArray, IntArray]:
-    """Fitted centres x, y, their sigma, the line's sigma (N, 4), and the flags (N,) of each alone.
+    """Fitted centres (N, 7) of `mark_points`, and the flags (N,) of each alone.
 
     ``saturated``: (H, W) 1 where the laser's channel is; (1, 1) zero if it is nowhere.
     """
@@ -79,8 +79,6 @@ def is_short(points: FloatArray, chain: IntArray) -> BoolArray:
     return np.asarray(chain_extents(points, chain)[2] < SHORTEST_PX)
 
 
-SHAPE_HALF = 4
-"""Neighbours over which the profile's shape is averaged."""
 LEAST_SINE = 0.25
 """Cuts at a smaller angle to the line are followed no farther than those of this sine."""
 STEEPEST_SINE = 0.87
@@ -99,23 +97,7 @@ BORDER_SIGMAS = 1.0
 BORDER_PX = 2.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Shape:
-    """What the profiles (N,) look like along the chains: width, and how surely they lean.
-
-    ``sine`` is that of the angle between the fitted column or row and the normal.
-    """
-
-    points: FloatArray
-    width: FloatArray
-    mean_width: FloatArray
-    lean: FloatArray
-    sine: FloatArray
-
-
-def is_cut_off(
-    fits: ProfileFits, points: FloatArray, width_px: FloatArray, shape: tuple[int, ...]
-) -> BoolArray:
+def is_cut_off(marks: FloatArray, chain: IntArray, shape: tuple[int, ...]) -> BoolArray:
     """(N,) True where a line's end inside the image truncates the fitted column or row.
 
     Where an edge cuts a slanted line, part of the profile lies beyond the cut: it is narrower than
@@ -124,38 +106,20 @@ def is_cut_off(
     times the slant's tangent) and at most as far as one along the rows or columns. Ends at the
     image's border and closed loops have none.
 
-    ``fits``: Fitted profiles. ``points``: (N, 2) fitted centres, image pixels. ``width_px``: (N,)
-    sigma of the line. ``shape``: Rows and columns of the image.
+    ``marks``: (N, 7) of `mark`. ``chain``: (N,) numbers. ``shape``: Rows and columns of the image.
     """
-    chain = fits.ridge.chain
     found = np.zeros(len(chain), dtype=np.bool_)
-    seen = _shapes(fits, points, width_px)
     starts = np.flatnonzero(np.concatenate([[True], np.diff(chain) != 0]))
     for first, stop in zip(starts, np.append(starts[1:], len(chain)), strict=True):
-        order = np.arange(first, stop)
-        sigma = float(np.median(width_px[first:stop]))
-        gap = float(np.hypot(*(points[first] - points[stop - 1])))
-        if len(order) > 2 * LEAST_REFERENCE and gap <= REACH_PX:
+        own, cut = marks[first:stop], found[first:stop]
+        sigma = float(np.median(own[:, MARK_WIDTH]))
+        gap = float(np.hypot(*(own[0, :2] - own[-1, :2])))
+        if len(own) > 2 * LEAST_REFERENCE and gap <= REACH_PX:
             continue
-        for inwards in (order, order[::-1]):
-            if not _is_at_border(points[inwards[0]], sigma, shape):
-                found[inwards[: _count_cut(seen, inwards, sigma)]] = True
+        for inwards, is_cut in ((own, cut), (own[::-1], cut[::-1])):
+            if not _is_at_border(inwards[0], sigma, shape):
+                is_cut[: _count_cut(inwards, sigma)] = True
     return found
-
-
-def _shapes(fits: ProfileFits, points: FloatArray, width_px: FloatArray) -> _Shape:
-    table, values, chain = fits.ridge.table, fits.values, fits.ridge.chain
-    lean = sum_along(values[:, SKEW], chain, SHAPE_HALF)
-    norm = sum_along(values[:, SKEW_NORM], chain, SHAPE_HALF)
-    across = axis_component(table)
-    ones = np.ones(len(table))
-    return _Shape(
-        points,
-        width_px,
-        mean_along(width_px, ones, chain, SHAPE_HALF),
-        lean / np.sqrt(np.maximum(norm, 1e-12)),
-        np.sqrt(np.maximum(1.0 - across**2, 0.0)),
-    )
 
 
 def _is_at_border(point: FloatArray, sigma_px: float, shape: tuple[int, ...]) -> bool:
@@ -163,27 +127,31 @@ def _is_at_border(point: FloatArray, sigma_px: float, shape: tuple[int, ...]) ->
     return bool(room < BORDER_SIGMAS * sigma_px + BORDER_PX)
 
 
-def _count_cut(seen: _Shape, inwards: IntArray, sigma_px: float) -> int:
-    """How many points from the end, in the order ``inwards``, have a truncated profile."""
-    points = seen.points[inwards]
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+def _count_cut(inwards: FloatArray, sigma_px: float) -> int:
+    """How many points from the end, of marks (N, 7) from there on, have a truncated profile."""
+    step_x, step_y = np.diff(inwards[:, 0]), np.diff(inwards[:, 1])
+    arc = np.concatenate([[0.0], np.cumsum(np.sqrt(step_x**2 + step_y**2))])
+    width, mean_width = inwards[:, MARK_WIDTH], inwards[:, MARK_MEAN_WIDTH]
+    leans, sines = inwards[:, MARK_LEAN], inwards[:, MARK_SINE]
     reach = REACH_SIGMAS * sigma_px
     is_near = arc <= 2.0 * reach / LEAST_SINE
-    sine = max(float(np.median(seen.sine[inwards[is_near]])), LEAST_SINE)
+    sine = max(float(np.median(sines[is_near])), LEAST_SINE)
     farthest = min(2.0 * reach / (sine * np.sqrt(1.0 - sine**2)), 0.5 * float(arc[-1]))
     beyond = (arc >= farthest) & (arc <= farthest + REFERENCE_SIGMAS * sigma_px)
-    chosen = inwards[beyond] if beyond.sum() >= LEAST_REFERENCE else inwards
-    slant = min(float(np.median(seen.sine[chosen])), STEEPEST_SINE)
+    chosen = np.flatnonzero(beyond)
+    if len(chosen) < LEAST_REFERENCE:
+        chosen = np.arange(len(arc))
+    slant = min(float(np.median(sines[chosen])), STEEPEST_SINE)
     last = (reach + BLUR_PX) * slant / np.sqrt(1.0 - slant**2)
-    width = float(np.median(seen.width[chosen]))
+    typical = float(np.median(width[chosen]))
     scatter = max(
-        _robust_std(seen.width[chosen]) / np.sqrt(2 * SHAPE_HALF + 1),
-        _robust_std(seen.mean_width[chosen]),
+        _robust_std(width[chosen]) / np.sqrt(2 * SHAPE_HALF + 1),
+        _robust_std(mean_width[chosen]),
     )
-    narrow = width - max(LEAST_SHRINKING * width, SCATTERS * scatter)
-    lean = np.abs(seen.lean[inwards] - np.median(seen.lean[chosen]))
-    leaning = SKEW_SCORE * max(1.0, _robust_std(seen.lean[chosen]))
-    is_cut = (seen.mean_width[inwards] < narrow) | (lean > leaning)
+    narrow = typical - max(LEAST_SHRINKING * typical, SCATTERS * scatter)
+    lean = np.abs(leans - np.median(leans[chosen]))
+    leaning = SKEW_SCORE * max(1.0, _robust_std(leans[chosen]))
+    is_cut = (mean_width < narrow) | (lean > leaning)
     for at in arc[is_cut & (arc < farthest)]:
         if at - last > GAP_SIGMAS * sigma_px + REACH_PX:
             break

@@ -14,6 +14,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
+from armscan.kernels.ridge import copy_cells
 from armscan.models.calibration import LaserColour
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.ridge import (
@@ -21,6 +22,7 @@ from armscan.vision.stripe.ridge import (
     SAMPLE_STEP_PX,
     FloatImage,
     ImageLevel,
+    is_of_bytes,
     mean_along,
     measure_level,
     strong_median,
@@ -255,6 +257,7 @@ def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
     )
 
 
+NOWHERE = np.zeros((1, 1), np.uint8)
 FILLED_CELLS = 2
 """Around lit cells, copied too: as far as a filter, a fit and the background beside it look."""
 
@@ -267,17 +270,28 @@ def lit_plane(exposure: Exposure, threshold: float | None) -> tuple[StripePlane,
     scale = NORMAL_SCALE / exposure.full_scale
     raw = exposure.image
     level = measure_level(raw, threshold, scale)
-    image = np.zeros(raw.shape, np.float32)
     near = maximum_filter(level.lit, 2 * FILLED_CELLS + 1, mode="constant")
+    image = np.zeros(raw.shape, np.float32)
+    if is_of_bytes(raw):
+        copy_cells(raw, near, CELL_PX, scale, image)
+    else:
+        _copy_deep_cells(raw, near, scale, image)
+    is_clipped = level.brightest >= exposure.full_scale
+    clipped = (raw >= exposure.full_scale).view(np.uint8) if is_clipped else NOWHERE
+    units = exposure.full_scale / NORMAL_SCALE
+    plane = StripePlane(image=image, clipped=clipped, saturated=clipped, grey_levels_per_unit=units)
+    return plane, level
+
+
+def _copy_deep_cells(
+    raw: ImageArray, near: NDArray[np.uint8], scale: float, image: FloatImage
+) -> None:
+    """As `copy_cells`, of images of more than eight bits."""
     for row, cells in enumerate(near):
         edges = np.flatnonzero(np.diff(cells, prepend=0, append=0)) * CELL_PX
         for left, right in zip(edges[::2], edges[1::2], strict=True):
             own = np.s_[row * CELL_PX : (row + 1) * CELL_PX, left:right]
             np.multiply(raw[own], np.float32(scale), out=image[own], casting="unsafe")
-    clipped = _saturated(raw, exposure.full_scale)
-    units = exposure.full_scale / NORMAL_SCALE
-    plane = StripePlane(image=image, clipped=clipped, saturated=clipped, grey_levels_per_unit=units)
-    return plane, level
 
 
 CHANNELS = ("red", "green", "blue")
@@ -291,7 +305,6 @@ SATURATED_SHARE = 0.12
 LEAST_CORE_HEIGHT = 8.0
 """A channel shows the core if it rises by this much above its surroundings there."""
 LINE_SHARE = 0.4
-NOWHERE = np.zeros((1, 1), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

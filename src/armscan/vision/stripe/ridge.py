@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, TypeGuard
 
 import cv2
 import numpy as np
@@ -13,19 +13,23 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
-from armscan.geometry.least_squares import robust_sigma
+from armscan.geometry.least_squares import MAD_TO_SIGMA, robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
 from armscan.kernels.chains import (
     find_neighbours,
     measure_chains,
     place_points,
+    span_of,
     sum_windows,
     walk_chains,
 )
 from armscan.kernels.ridge import (
     ROUNDING,
+    count_bright,
     find_runs,
     gaussian_taps,
+    rank_cells,
+    read_steps,
     refine_candidates,
     sample_across,
 )
@@ -55,7 +59,7 @@ class ImageLevel:
     at a distance of `CLUTTER_LAG_PX`, where compression blocks, chroma subsampling and surface
     texture show; never less than ``noise``. ``rise``: Height above the background at which a line
     begins. ``lit``: (rows, columns) uint8, 1 for the cells that have a pixel so far above the
-    background.
+    background. ``brightest``: Level of the brightest pixel, as the image has it.
     """
 
     background: FloatImage
@@ -63,6 +67,7 @@ class ImageLevel:
     clutter: float
     rise: float
     lit: NDArray[np.uint8]
+    brightest: float
 
 
 def measure_level(
@@ -76,16 +81,16 @@ def measure_level(
     """
     factor = np.float32(scale)
     background = np.asarray(_cell_quantiles(image) * factor, dtype=np.float32)
-    rows = image[:: 2 * SAMPLE_STEP_PX].astype(np.float32) * factor
-    noise = _noise(rows, 1)
-    clutter = max(_noise(rows, CLUTTER_LAG_PX), noise)
+    noise = _noise(image, 1, factor)
+    clutter = max(_noise(image, CLUTTER_LAG_PX, factor), noise)
+    peaks = _cell_peaks(image)
     if threshold is None:
-        peak = _brightest(image[::2, ::2].copy(), factor) - float(np.median(background))
+        peak = _brightest(image, peaks, factor) - float(np.median(background))
         threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
     # between cells the background is linear: never below the least of them
     least = minimum_filter(background, 3, mode="nearest") + (threshold - ROUNDING)
-    lit = np.asarray(_cell_peaks(image) * factor > least).astype(np.uint8)
-    return ImageLevel(background, noise, clutter, threshold, lit)
+    lit = np.asarray(peaks * factor > least).astype(np.uint8)
+    return ImageLevel(background, noise, clutter, threshold, lit, float(peaks.max()))
 
 
 BAND_PX, BAND_SIGMAS = 40, 8.0
@@ -126,10 +131,20 @@ def _cell_peaks(image: FloatImage | ImageArray) -> FloatImage:
     return np.maximum.reduceat(bands, np.arange(0, width, CELL_PX), axis=1).astype(np.float32)
 
 
+def is_of_bytes(image: FloatImage | ImageArray) -> TypeGuard[NDArray[np.uint8]]:
+    """True for images of eight bits, which are counted rather than sorted."""
+    return image.dtype == np.uint8 and image.flags.c_contiguous
+
+
 def _cell_quantiles(image: FloatImage | ImageArray) -> FloatImage:
     height, width = image.shape
     rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
     steps = CELL_PX // SAMPLE_STEP_PX
+    k = int(BACKGROUND_QUANTILE * steps * steps)
+    if is_of_bytes(image):
+        levels = np.zeros((rows, columns), np.float32)
+        rank_cells(image, CELL_PX, SAMPLE_STEP_PX, k, levels)
+        return levels
     # of single precision: smaller numbers are sorted more slowly
     sample = image[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].astype(np.float32)
     missing = (rows * steps - sample.shape[0], columns * steps - sample.shape[1])
@@ -137,29 +152,69 @@ def _cell_quantiles(image: FloatImage | ImageArray) -> FloatImage:
         np.pad(sample, ((0, missing[0]), (0, missing[1])), mode="edge") if any(missing) else sample
     )
     cells = filled.reshape(rows, steps, columns, steps).swapaxes(1, 2)
-    k = int(BACKGROUND_QUANTILE * steps * steps)
     ordered = np.partition(cells.reshape(rows, columns, steps * steps), k, axis=2)
     return np.ascontiguousarray(ordered[:, :, k])
 
 
-def _brightest(sample: FloatImage | ImageArray, factor: np.float32) -> float:
-    """The level that a share of `PEAK_QUANTILE` of the pixels stays below, times a factor."""
-    few = np.sort(sample[::8, ::8], axis=None)
+PEAK_STEP_PX = 2
+
+
+def _brightest(image: FloatImage | ImageArray, peaks: FloatImage, factor: np.float32) -> float:
+    """The level that a share of `PEAK_QUANTILE` of the pixels stays below, times a factor.
+
+    ``peaks``: (rows, columns) of `_cell_peaks`.
+    """
+    sample = image[::PEAK_STEP_PX, ::PEAK_STEP_PX]
+    few = sample[::8, ::8].astype(np.float32).ravel()
     # nearly all pixels are dark: the bright ones are sorted alone
-    bright = sample[sample > few[int(0.98 * (len(few) - 1))]].astype(np.float32) * factor
+    k = int(0.98 * (len(few) - 1))
+    limit = float(np.partition(few, k)[k])
     n_above = (1.0 - PEAK_QUANTILE) * (sample.size - 1)
-    if len(bright) - 1 <= n_above:
-        return float(np.quantile(sample.astype(np.float32) * factor, PEAK_QUANTILE))
-    return float(np.quantile(bright, 1.0 - n_above / (len(bright) - 1)))
+    if is_of_bytes(image):
+        counts = np.zeros(256, np.int64)
+        is_bright_cell = (peaks > limit).view(np.uint8)
+        count_bright(image, is_bright_cell, CELL_PX, PEAK_STEP_PX, int(limit), counts)
+        n_bright = int(counts.sum())
+        if n_bright - 1 > n_above:
+            place = n_bright - 1 - n_above
+            low, high = _level_at(counts, int(place)), _level_at(counts, int(place) + 1)
+            return float(factor) * (low + (place - int(place)) * (high - low))
+    else:
+        bright = sample[sample > limit].astype(np.float32) * factor
+        if len(bright) - 1 > n_above:
+            return float(np.quantile(bright, 1.0 - n_above / (len(bright) - 1)))
+    return float(np.quantile(sample.astype(np.float32) * factor, PEAK_QUANTILE))
 
 
-def _noise(rows: FloatImage, lag: int) -> float:
-    """Standard deviation of pixels against others of their row (K, W) at a distance."""
-    if rows.shape[1] <= lag:
+def _level_at(counts: IntArray, place: int) -> int:
+    """Level at a place, from 0 on, in the order of levels of which there are so many."""
+    return int(np.searchsorted(np.cumsum(counts), place, side="right"))
+
+
+NOISE_STEP_PX, NOISE_ROW_STEP_PX = 3, 2 * SAMPLE_STEP_PX
+
+
+def _noise(image: FloatImage | ImageArray, lag: int, factor: np.float32) -> float:
+    """Standard deviation of pixels against others of their row at a distance."""
+    if image.shape[1] <= lag:
         return LEAST_NOISE
-    step = np.abs(rows[:, lag::3] - rows[:, : rows.shape[1] - lag : 3])
-    typical = robust_sigma(step)
-    trimmed = float(np.minimum(step, max(2.5 * typical, 2.0)).mean()) * math.sqrt(math.pi / 2.0)
+    if is_of_bytes(image):
+        height, width = image.shape
+        rows, columns = -(-height // NOISE_ROW_STEP_PX), -(-(width - lag) // NOISE_STEP_PX)
+        step, counts = np.zeros((rows, columns), np.float32), np.zeros(256, np.int64)
+        read_steps(image, NOISE_ROW_STEP_PX, NOISE_STEP_PX, lag, step, counts)
+        if factor != 1.0:
+            step *= factor
+        middle = _level_at(counts, step.size // 2) + _level_at(counts, (step.size - 1) // 2)
+        typical = MAD_TO_SIGMA * 0.5 * middle * float(factor)
+    else:
+        levels = image[::NOISE_ROW_STEP_PX].astype(np.float32) * factor
+        step = np.abs(
+            levels[:, lag::NOISE_STEP_PX] - levels[:, : levels.shape[1] - lag : NOISE_STEP_PX]
+        )
+        typical = robust_sigma(step)
+    mean = float(np.minimum(step, max(2.5 * typical, 2.0)).mean())
+    trimmed = mean * math.sqrt(math.pi / 2.0)
     return max(typical, trimmed, LEAST_NOISE * SQRT2) / SQRT2
 
 
@@ -382,29 +437,25 @@ def trace_ridges(
     found = np.zeros((max(len(runs), 1), 6))
     bend = least_bend(rise, line_sigma_px, scale)
     n = refine_candidates(image, runs, len(runs), gaussian_taps(scale), bend, found)
-    return link(found[:n], image.shape)
+    return link(found[:n])
 
 
-def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
-    """Order points (N, 6) along chains; points without a neighbour are dropped.
-
-    ``points``: Rows as in `RidgePoints.table`. ``shape``: Rows and columns of the image.
-    """
+def link(points: FloatArray) -> RidgePoints:
+    """Order points (N, 6), as in `RidgePoints.table`; those without a neighbour are dropped."""
     n = len(points)
     # a map of the part of the image that has points
-    placed, corner = points.copy(), np.floor(points[:, :2].min(axis=0, initial=max(shape)))
-    placed[:, :2] -= corner
-    columns, rows = placed[:, :2].max(axis=0, initial=0.0).astype(np.int64) + 2
+    span = np.zeros(4, np.int64)
+    span_of(points, span)
+    left, top, columns, rows = span.tolist()
     owner = np.zeros((rows, columns), np.int32)
-    is_kept = np.zeros(n, np.int64)
-    place_points(placed, owner, is_kept)
+    place_points(points, left, top, owner)
     ahead = np.full(n, -1, np.int64)
     behind = np.full(n, -1, np.int64)
-    find_neighbours(placed, owner, ahead, behind)
+    find_neighbours(points, left, top, owner, ahead, behind)
     order = np.zeros(n, np.int64)
     chain = np.zeros(n, np.int64)
     count = walk_chains(ahead, behind, order, chain)
-    return RidgePoints(points[order[:count]], chain[:count])
+    return RidgePoints(np.take(points, order[:count], axis=0), chain[:count])
 
 
 def is_bright(ridge: RidgePoints) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,23 +13,15 @@ from scipy.optimize import nnls
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA
 from armscan.kernels.smoothing import (
-    BEND,
-    BEND_SIGMA,
-    CHAIN,
     COURSE_ROWS,
     LANES,
-    NORMAL_X,
-    NORMAL_Y,
-    NOWHERE,
-    PREDICTED,
-    PREDICTED_SIGMA,
-    SHIFT,
-    SLOPE,
     SMOOTH_ROWS,
-    SMOOTH_SIGMA,
     WEIGHT,
-    X,
-    Y,
+    filter_residuals,
+    lay_course,
+    multiply_lagged,
+    score_predictions,
+    shift_points,
     smooth_lanes,
 )
 
@@ -71,9 +64,10 @@ class Polyline:
         return len(self.points)
 
     @property
-    def weight(self) -> FloatArray:
-        """(N,) by which the points count for their neighbours."""
-        return np.where(self.is_used, self.sigma**-2.0, 0.0)
+    def rows(self) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, NDArray[np.uint8]]:
+        """All of it, as kernels take it."""
+        points, normals = (np.ascontiguousarray(one) for one in (self.points, self.normals))
+        return points, normals, self.sigma, self.chain, self.is_used.view(np.uint8)
 
 
 class Neighbourhoods:
@@ -90,15 +84,10 @@ class Neighbourhoods:
         n = len(course)
         self._windows = windows_px.astype(np.float32)
         n_blocks = -(-n // LANES) + 2
-        own = slice(LANES, LANES + n)
         self._laid = np.zeros((COURSE_ROWS, n_blocks * LANES))
-        self._laid[CHAIN] = NOWHERE
-        self._laid[X : Y + 1, own] = course.points.T
-        self._laid[NORMAL_X : NORMAL_Y + 1, own] = course.normals.T
-        self._laid[CHAIN, own] = course.chain
         # weights up to 1, so that their products stay within single precision
         self._unit = float(course.sigma.min(initial=1.0)) ** 2
-        self._laid[WEIGHT, own] = course.weight * self._unit
+        lay_course(*course.rows, self._unit, self._laid)
         self._asked = np.ones(n_blocks, np.int64)
         if asked is not None:
             self._asked[:] = 0
@@ -160,11 +149,13 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
     around = Neighbourhoods(course, half)
     rough = around.fit_parabolas(np.ones(len(half)), course.sigma)
-    score = np.abs(rough[PREDICTED]) / np.hypot(rough[PREDICTED_SIGMA], course.sigma)
+    score = np.zeros(len(course))
+    score_predictions(rough, course.sigma, score)
     scale = max(1.0, float(np.median(score)) / 0.6745) if len(score) else 1.0
-    is_outlier = (rough[PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * scale)
+    is_outlier = score > OUTLIER_SIGMAS * scale
     dropped = np.flatnonzero(is_outlier & course.is_used)
-    course = replace(course, is_used=course.is_used & ~is_outlier)
+    if len(dropped):
+        course = replace(course, is_used=course.is_used & ~is_outlier)
     found = noise_correlation(course, half[-1])
     is_measured = found is not None
     correlation = WHITE if found is None else found
@@ -179,42 +170,29 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
         around.leave_out(dropped)
     inflation = np.array([_inflation(correlation, h) for h in half])
     result = around.fit_parabolas(inflation, course.sigma, float(correlation[0]))
-    used, normals = course.is_used, course.normals
-    shift = np.where(used, result[SHIFT], 0.0)
-    slope = np.where(used, result[SLOPE], 0.0)
-    tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
-    turned = normals - slope[:, None] * tangents
-    length = np.sqrt(turned[:, 0] ** 2 + turned[:, 1] ** 2)
-    return SmoothedCentres(
-        course.points + shift[:, None] * normals,
-        turned / length[:, None],
-        np.where(used, result[SMOOTH_SIGMA], course.sigma),
-        sigma_sum,
-        is_outlier,
-        is_measured,
-    )
+    points, normals, sigma, _, is_used = course.rows
+    moved, turned = np.zeros(points.shape), np.zeros(points.shape)
+    shift_points(points, normals, is_used, result, moved, turned, sigma)
+    return SmoothedCentres(moved, turned, sigma, sigma_sum, is_outlier, is_measured)
 
 
-def curvature(course: Polyline, asked: BoolArray) -> FloatArray:
-    """Curvature (N,) of the chains in 1/px, positive where they bend towards their normals.
+def bends(course: Polyline, asked: BoolArray) -> NDArray[np.float32]:
+    """Result (8, N) of `smooth_lanes` in windows as curvature needs them.
 
-    Shrunk towards zero by its own noise, so that straight lines are not disturbed. ``asked``: (N,)
-    points where it matters; elsewhere it may be 0.
+    ``asked``: (N,) points where it matters; elsewhere it may be 0.
     """
-    if not asked.any():
-        return np.zeros(len(course))
     around = Neighbourhoods(course, BEND_WINDOWS_PX, asked)
-    result = around.fit_parabolas(np.ones(len(BEND_WINDOWS_PX)), course.sigma)
-    square = result[BEND] ** 2
-    noise = result[BEND_SIGMA] ** 2
-    return np.asarray(result[BEND] * np.maximum(1.0 - noise / np.maximum(square, 1e-30), 0.0))
+    return around.fit_parabolas(np.ones(len(BEND_WINDOWS_PX)), course.sigma)
 
 
+@cache
 def _weights(half: int) -> FloatArray:
     """Weights (2 half + 1,) of a uniform local quadratic at its centre."""
     k = np.arange(-half, half + 1, dtype=np.float64)
     design = np.stack([np.ones_like(k), k, k * k], axis=1)
-    return np.asarray(np.linalg.pinv(design)[0])
+    weights = np.ascontiguousarray(np.linalg.pinv(design)[0])
+    weights.flags.writeable = False
+    return weights
 
 
 def _inflation(correlation: FloatArray, half_px: float) -> float:
@@ -259,6 +237,20 @@ def noise_correlation(course: Polyline, half_px: float) -> FloatArray | None:
         measured = _lag_products(residual, course.chain)
     if measured is None:
         return None
+    mixture = _mixture(half)
+    scale = max(measured[0] / mixture[0, 0], 0.05)
+    surplus = measured[1:] - scale * mixture[1:, 0]
+    limit = SIGNIFICANT_CORRELATION * scale / np.sqrt(np.isfinite(residual).sum())
+    if (surplus[:2] < limit).all():
+        return np.asarray(scale * WHITE)
+    solved, _ = nnls(mixture, measured)
+    solved[0] = max(solved[0], 0.05)
+    return np.asarray(solved)
+
+
+@cache
+def _mixture(half: int) -> FloatArray:
+    """(LAGS, LAGS) by which covariances of residuals are mixed of those of the noise."""
     kernel = -_weights(half)
     kernel[half] += 1.0
     autocorrelation = np.correlate(kernel, kernel, "full")
@@ -270,46 +262,25 @@ def noise_correlation(course: Polyline, half_px: float) -> FloatArray | None:
                 at = middle + lag - signed
                 if 0 <= at < len(autocorrelation):
                     mixture[lag, m] += autocorrelation[at]
-    scale = max(measured[0] / mixture[0, 0], 0.05)
-    surplus = measured[1:] - scale * mixture[1:, 0]
-    limit = SIGNIFICANT_CORRELATION * scale / np.sqrt(np.isfinite(residual).sum())
-    if (surplus[:2] < limit).all():
-        return np.asarray(scale * WHITE)
-    solved, _ = nnls(mixture, measured)
-    solved[0] = max(solved[0], 0.05)
-    return np.asarray(solved)
+    mixture.flags.writeable = False
+    return mixture
 
 
 def _lag_products(residual: FloatArray, chain: IntArray) -> FloatArray | None:
     """Mean product (LAGS,) of residuals at each distance; None where there are too few pairs."""
-    measured = np.zeros(LAGS)
+    measured, total = np.zeros(LAGS), np.zeros(2)
     for lag in range(LAGS):
-        a, b = residual[: len(residual) - lag], residual[lag:]
-        same = np.isfinite(a) & np.isfinite(b) & (chain[: len(chain) - lag] == chain[lag:])
-        if same.sum() < LEAST_PAIRS:
+        multiply_lagged(residual, chain, min(lag, len(residual)), total)
+        if total[1] < LEAST_PAIRS:
             return None
-        measured[lag] = (a[same] * b[same]).mean()
+        measured[lag] = total[0] / total[1]
     return measured
 
 
 def _filter_residuals(course: Polyline, half: int) -> FloatArray:
     """Residuals over sigma from a uniform quadratic over 2 half + 1 places; NaN near ends."""
-    points, normals, chain = course.points, course.normals, course.chain
-    n = len(points)
-    size = 2 * half + 1
-    if n < size:
-        return np.full(n, np.nan)
-    n_used = np.concatenate([[0], np.cumsum(course.is_used)])
-    inside = (chain[: n - size + 1] == chain[size - 1 :]) & (n_used[size:] - n_used[:-size] == size)
-    weights = _weights(half)
-    smooth_x = np.convolve(points[:, 0], weights, "valid")
-    smooth_y = np.convolve(points[:, 1], weights, "valid")
-    middle = slice(half, n - half)
-    offset = (points[middle, 0] - smooth_x) * normals[middle, 0]
-    offset += (points[middle, 1] - smooth_y) * normals[middle, 1]
-    residual = np.full(n, np.nan)
-    residual[middle] = np.where(inside, offset / course.sigma[middle], np.nan)
-    told = np.abs(residual[middle][inside])
-    limit = 5.0 * max(float(np.median(told)), 0.3) if len(told) else 0.0
+    residual, told = np.zeros(len(course)), np.zeros(len(course))
+    count = filter_residuals(*course.rows, _weights(half), residual, told)
+    limit = 5.0 * max(float(np.median(told[:count])), 0.3) if count else 0.0
     residual[np.abs(residual) > limit * MAD_TO_SIGMA] = np.nan
     return residual

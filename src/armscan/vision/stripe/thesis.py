@@ -211,4 +211,4 @@ def link_centres(centres: FloatArray, image: FloatImage) -> RidgePoints:
     table[:, 2:4] = centres[:, 2:]
     x, y = np.rint(table[:, :2]).astype(np.int64).T
     table[:, 4] = image[y, x]
-    return link(table, image.shape)
+    return link(table)

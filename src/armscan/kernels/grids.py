@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measured points on grids: what a voxel adds up (weighted places, covariances, normals, counts),
-sums over cells that are numbered by one integer and found by hashing, and the heights of nodes.
+sums over cells that are numbered by one integer and found by hashing, tangent planes of the cells
+near a point, and the heights of nodes.
 """
 
 from __future__ import annotations
@@ -9,7 +10,16 @@ import math
 
 import numpy as np
 
-from armscan.kernels.arrays import Floats, FloatsOut, Ints, IntsOut, Table, TableOut, compiled
+from armscan.kernels.arrays import (
+    FUSED,
+    Floats,
+    FloatsOut,
+    Ints,
+    IntsOut,
+    Table,
+    TableOut,
+    compiled,
+)
 
 N_VALUES = 28
 """Weight; weighted offset from the voxel's centre (3), covariance (6), covariance of the noise
@@ -24,6 +34,16 @@ SPREAD = 0x2545F4914F6CDD1D
 """Odd multiplier of a linear congruential step (L'Ecuyer 1999): neighbouring numbers land apart."""
 JACOBI_SWEEPS = 6
 """Sweeps of a symmetric 3 x 3 matrix; three leave nothing but rounding (Golub and Van Loan 8.5)."""
+BIN_BITS = 21
+"""Of the number of a bin along an axis, counted from 1 so that a neighbour has one as well."""
+CELLS_A_BIN = 4
+"""Along an axis: a bin is as wide as the radius about a point, a cell a quarter of it."""
+MOST_NEAR = 1024
+"""Means within the radius of a cell: those of 9 x 9 x 9 cells at most."""
+HALVINGS = 60
+"""Steps that seek a bound between two squares of distances; many more than are taken."""
+X, Y, Z, SQUARE = (row * MOST_NEAR for row in range(4))
+"""Where the coordinates of the means near a cell begin, and the squares of their distances."""
 
 
 @compiled()
@@ -214,6 +234,272 @@ def add_to_cells(
         for k in range(values.shape[1]):
             sums[row, k] += values[n, k]
     return len(keys)
+
+
+@compiled()
+def sort_into_bins(
+    cells: Table,
+    low: Floats,
+    size: float,
+    slots: IntsOut,
+    bin_keys: IntsOut,
+    starts: IntsOut,
+    ordered: TableOut,
+) -> None:
+    """Put means of cells bin by bin, in their order within each bin.
+
+    Parameters
+    ----------
+    cells
+        (M, 3) means.
+    low, size
+        (3,) lowest corner of all, and the width of a bin.
+    slots
+        (S,) of -1, becomes the hash table: row of the bin, S a power of two of at least 2 M.
+    bin_keys, starts
+        (M,) number of each bin, and (M + 1,) first of its means; the bins that there are.
+    ordered
+        (M, 3) the means.
+    """
+    mask = len(slots) - 1
+    member = np.zeros(len(cells), np.int64)
+    count = 0
+    for m in range(len(cells)):
+        key = 0
+        for k in range(3):
+            key = key << BIN_BITS | int((cells[m, k] - low[k]) / size) + 1
+        slot = _slot_of(key, slots, bin_keys, mask)
+        if slots[slot] < 0:
+            slots[slot] = count
+            bin_keys[count] = key
+            starts[count] = 0
+            count += 1
+        member[m] = slots[slot]
+        starts[slots[slot]] += 1
+    first = 0
+    for b in range(count):
+        size_of_bin = starts[b]
+        starts[b] = first
+        first += size_of_bin
+    for m in range(len(cells)):
+        row = starts[member[m]]
+        starts[member[m]] += 1
+        for k in range(3):
+            ordered[row, k] = cells[m, k]
+    for b in range(count, 0, -1):
+        starts[b] = starts[b - 1]
+    starts[0] = 0
+
+
+@compiled(is_inlined=True)
+def _slot_of(key: int, slots: Ints, keys: Ints, mask: int) -> int:
+    """Place of a number in a hash table, or the free one where it would go."""
+    mixed = key * SPREAD
+    slot = (mixed ^ (mixed >> 29)) & mask
+    while slots[slot] >= 0 and keys[slots[slot]] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@compiled()
+def tangent_normals(
+    points: Table,
+    towards: Table,
+    low: Floats,
+    radius: float,
+    slots: Ints,
+    bin_keys: Ints,
+    starts: Ints,
+    cells: Table,
+    limits: Floats,
+    normals: TableOut,
+) -> None:
+    """Normal of the plane of the nearest means about each point.
+
+    Means are gathered once for consecutive points of one cell.
+
+    Parameters
+    ----------
+    points, towards
+        (N, 3), and (N, 3) the places to whose side the normals point.
+    low
+        (3,) as of `sort_into_bins`; no point lies below it.
+    radius
+        Of the means that count, and the width of a bin.
+    slots, bin_keys, starts, cells
+        What `sort_into_bins` made.
+    limits
+        Fewest and most means, the least width over the radius, the largest thickness over width.
+    normals
+        (N, 3) unit; zero where there is none.
+    """
+    near = np.zeros(4 * MOST_NEAR)
+    found = np.zeros(3)
+    size = radius / CELLS_A_BIN
+    last_x, last_y, last_z, count = -1, -1, -1, 0
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        cell_x = int((x - low[0]) / size)
+        cell_y = int((y - low[1]) / size)
+        cell_z = int((z - low[2]) / size)
+        if cell_x != last_x or cell_y != last_y or cell_z != last_z:
+            last_x, last_y, last_z = cell_x, cell_y, cell_z
+            count = _gather(
+                low[0] + (cell_x + 0.5) * size,
+                low[1] + (cell_y + 0.5) * size,
+                low[2] + (cell_z + 0.5) * size,
+                low, radius, slots, bin_keys, starts, cells, near,
+            )  # fmt: skip
+        _least_direction(x, y, z, count, radius, limits, near, found)
+        side = 0.0
+        for k in range(3):
+            side += found[k] * (towards[n, k] - points[n, k])
+        for k in range(3):
+            normals[n, k] = -found[k] if side < 0.0 else found[k]
+
+
+@compiled()
+def _gather(
+    x: float,
+    y: float,
+    z: float,
+    low: Floats,
+    radius: float,
+    slots: Ints,
+    bin_keys: Ints,
+    starts: Ints,
+    cells: Table,
+    near: FloatsOut,
+) -> int:
+    """Count of the means within the radius of the cell about (x, y, z), put into ``near``."""
+    mask = len(slots) - 1
+    half = 0.5 * radius / CELLS_A_BIN
+    bin_x = int((x - low[0]) / radius) + 1
+    bin_y = int((y - low[1]) / radius) + 1
+    bin_z = int((z - low[2]) / radius) + 1
+    count = 0
+    for i in range(bin_x - 1, bin_x + 2):
+        for j in range(bin_y - 1, bin_y + 2):
+            for k in range(bin_z - 1, bin_z + 2):
+                key = (i << BIN_BITS | j) << BIN_BITS | k
+                row = slots[_slot_of(key, slots, bin_keys, mask)]
+                if row < 0:
+                    continue
+                for m in range(starts[row], starts[row + 1]):
+                    dx = max(abs(cells[m, 0] - x) - half, 0.0)
+                    dy = max(abs(cells[m, 1] - y) - half, 0.0)
+                    dz = max(abs(cells[m, 2] - z) - half, 0.0)
+                    if dx * dx + dy * dy + dz * dz < radius * radius and count < MOST_NEAR:
+                        near[X + count] = cells[m, 0]
+                        near[Y + count] = cells[m, 1]
+                        near[Z + count] = cells[m, 2]
+                        count += 1
+    return count
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def _least_direction(
+    x: float,
+    y: float,
+    z: float,
+    count: int,
+    radius: float,
+    limits: Floats,
+    near: FloatsOut,
+    found: FloatsOut,
+) -> None:
+    """Least principal axis (3,) of the nearest means about a point; zero if they are no plane.
+
+    Eigenvalues by their cosines (Smith, Communications of the ACM 4, 1961); where they tell a
+    plane, the least one is a single root, and the rounding of the others is that of the axis.
+    """
+    found[0] = found[1] = found[2] = 0.0
+    bound = _bound(x, y, z, count, radius * radius, limits[1], near)
+    n = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+    for c in range(count):
+        if near[SQUARE + c] < bound:
+            dx, dy, dz = near[X + c] - x, near[Y + c] - y, near[Z + c] - z
+            n += 1.0
+            sx += dx
+            sy += dy
+            sz += dz
+            xx += dx * dx
+            xy += dx * dy
+            xz += dx * dz
+            yy += dy * dy
+            yz += dy * dz
+            zz += dz * dz
+    if n < limits[0]:
+        return
+    sx, sy, sz = sx / n, sy / n, sz / n
+    xx, xy, xz = xx / n - sx * sx, xy / n - sx * sy, xz / n - sx * sz
+    yy, yz, zz = yy / n - sy * sy, yz / n - sy * sz, zz / n - sz * sz
+    mean = (xx + yy + zz) / 3.0
+    a, b, c_ = xx - mean, yy - mean, zz - mean
+    spread = math.sqrt((a * a + b * b + c_ * c_ + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    if not spread > 0.0:
+        return
+    det = a * (b * c_ - yz * yz) - xy * (xy * c_ - yz * xz) + xz * (xy * yz - b * xz)
+    cosine = min(max(0.5 * det / (spread * spread * spread), -1.0), 1.0)
+    angle = math.acos(cosine) / 3.0
+    least = mean + 2.0 * spread * math.cos(angle + 2.0 * math.pi / 3.0)
+    middle = 3.0 * mean - least - (mean + 2.0 * spread * math.cos(angle))
+    width = math.sqrt(max(middle, 0.0))
+    thickness = math.sqrt(max(least, 0.0))
+    if width < limits[2] * radius or thickness > limits[3] * width:
+        return
+    a, b, c_ = xx - least, yy - least, zz - least
+    longest = 0.0
+    for k in range(3):
+        if k == 0:
+            ux, uy, uz = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
+        elif k == 1:
+            ux, uy, uz = xy * c_ - xz * yz, xz * xz - a * c_, a * yz - xy * xz
+        else:
+            ux, uy, uz = b * c_ - yz * yz, yz * xz - xy * c_, xy * yz - b * xz
+        length = ux * ux + uy * uy + uz * uz
+        if length > longest:
+            longest = length
+            found[0], found[1], found[2] = ux, uy, uz
+    if longest > 0.0:
+        scale = 1.0 / math.sqrt(longest)
+        for k in range(3):
+            found[k] *= scale
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def _bound(
+    x: float, y: float, z: float, count: int, square: float, most: float, near: FloatsOut
+) -> float:
+    """Square below which no more than ``most`` of the means lie; all of equal distance count.
+
+    Writes the squares of their distances from the point.
+    """
+    inside = 0.0
+    for c in range(count):
+        dx, dy, dz = near[X + c] - x, near[Y + c] - y, near[Z + c] - z
+        distance = dx * dx + dy * dy + dz * dz
+        near[SQUARE + c] = distance
+        inside += 1.0 if distance < square else 0.0
+    if inside <= most:
+        return square
+    # a surface holds as many more as the square grows
+    low, high, guess = 0.0, square, square * (most + 0.5) / inside
+    for _ in range(HALVINGS):
+        inside = 0.0
+        for c in range(count):
+            inside += 1.0 if near[SQUARE + c] < guess else 0.0
+        if inside == most:
+            return guess
+        if inside < most:
+            low = guess
+        else:
+            high = guess
+        wanted = guess * (most + 0.5) / max(inside, 1.0)
+        middle = 0.5 * (low + high)
+        step = 0.25 * (high - low)
+        guess = min(max(wanted, middle - step), middle + step)
+    return high
 
 
 @compiled()

@@ -16,7 +16,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.shapes import fit_plane
-from armscan.kernels.grids import sort_into_bins, tangent_normals
+from armscan.kernels.faces import sort_into_bins, tangent_normals
 from armscan.kernels.placing import carry_stripe, propagate_points
 from armscan.models.calibration import ArmNoise, ScannerCalibration, SensorCalibration
 from armscan.reconstruction.triangulate import (
@@ -443,9 +443,9 @@ class NeighbourBins:
     radius_mm
         Means within this distance make a point's tangent plane.
     cells
-        (M, 3) means, bin by bin.
+        (M, 3) means, bin by bin, or (M, K) with more numbers behind them.
     slots, keys, starts
-        As `armscan.kernels.grids.sort_into_bins` makes them.
+        As `armscan.kernels.faces.sort_into_bins` makes them.
     """
 
     low_mm: FloatArray

@@ -178,7 +178,8 @@ def display_levels(
         # few distinct levels: each is stretched once
         counts = np.bincount(image.ravel())
         table = np.arange(len(counts)) / exposure.full_scale
-        return _stretched(table, *(_quantile(table, counts, q) for q in (0.995, 0.5)))[image]
+        bright, middle = (_quantile(table, counts, share) for share in (0.995, 0.5))
+        return np.asarray(_stretched(table, bright, middle)[image])
     levels = image.astype(np.float64) / exposure.full_scale
     if is_grey and levels.ndim == 3:
         levels = levels.mean(axis=2)

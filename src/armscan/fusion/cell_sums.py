@@ -54,6 +54,17 @@ def cell_numbers(cell: IntArray) -> IntArray:
     return np.asarray(number)
 
 
+def cells_of(numbers: IntArray) -> IntArray:
+    """(N, 3) cells of numbers (N,): what `cell_numbers` numbered."""
+    cells = np.zeros((len(numbers), 3), dtype=np.int64)
+    block, part = numbers >> IN_BLOCK_BITS, numbers & (2**IN_BLOCK_BITS - 1)
+    for axis in range(3):
+        coarse = block >> BLOCK_BITS * (2 - axis) & (2**BLOCK_BITS - 1)
+        fine = part >> PART_BITS * (2 - axis) & (2**PART_BITS - 1)
+        cells[:, axis] = coarse << PART_BITS | fine
+    return cells
+
+
 @dataclass(slots=True, eq=False)
 class CellSums:
     """Sums of K values over cells.
@@ -122,6 +133,11 @@ class CellSums:
             self._spill()
         self._allot(2)
         yield from self._merge()
+
+    def all(self) -> tuple[IntArray, FloatArray]:
+        """As `merged`, in one piece."""
+        keys, sums = zip(*self.merged(), strict=True)
+        return np.concatenate(keys), np.concatenate(sums)
 
     def close(self) -> None:
         """Delete the runs."""

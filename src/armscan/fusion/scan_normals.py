@@ -16,9 +16,10 @@ from typing import BinaryIO
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from armscan.errors import OutputError
-from armscan.fusion.cell_sums import IN_BLOCK_BITS, PART_BITS, CellSums, cell_numbers
+from armscan.fusion.cell_sums import IN_BLOCK_BITS, PART_BITS, CellSums, cell_numbers, cells_of
 from armscan.fusion.point_spool import PointSpool
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.reconstruction.place import (
@@ -26,10 +27,9 @@ from armscan.reconstruction.place import (
     LOOKED_AT,
     SAMPLED,
     SMALLEST_RADIUS_MM,
+    NeighbourBins,
     cell_keys,
-    cell_means,
     radius_of_spacings,
-    tangent_normals_near,
 )
 
 MOST_KEYS = 2**20
@@ -38,7 +38,9 @@ numbers' hash ends in zeros, so that the choice does not depend on their order."
 MIXER = np.uint64(0x9E3779B97F4A7C15)
 """Odd multiplier of Fibonacci hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
 CELLS_HELD = 400_000
-"""Cells of the tree that is kept for the next points; 24 bytes and a node each."""
+"""Cells that are kept for the next points; 100 bytes each."""
+EDGE = 5
+"""Cells at a block's end from which the next block is within the radius: four, and the point's."""
 
 
 def choose_scan_radius_mm(spool: PointSpool) -> float:
@@ -101,10 +103,12 @@ def _sampled(spool: PointSpool, means: _MeansFile) -> IntArray:
         if not len(points):
             continue
         number = cell_keys(points, size_mm, (low, high)) * n_exposures + exposure
-        found = np.unique(number)
+        sums = CellSums(4)
+        sums.add(number, np.column_stack([points, np.ones(len(points))]))
+        found, values = sums.all()
         # of each exposure together, so that a stripe is read at once
         order = np.argsort(found % n_exposures, kind="stable")
-        means.add(cell_means(points, number)[order], found[order] % n_exposures)
+        means.add((values[:, :3] / values[:, 3:])[order], found[order] % n_exposures)
         keys = np.concatenate([keys, found[order]])
         rows = np.concatenate([rows, np.arange(written, written + len(found))])
         written += len(found)
@@ -140,10 +144,12 @@ def _spacings(means: _MeansFile, sample: IntArray) -> FloatArray:
         is_other = exposure[neighbour] != owner[here, None]
         nearest = np.where(is_other, distance, np.inf).min(axis=1)
         spacing[here] = np.minimum(spacing[here], nearest)
-        for k in here:
-            own = cells[exposure == owner[k]]
+        for number in np.unique(owner[here]):
+            of = here[owner[here] == number]
+            own = cells[slice(*np.searchsorted(exposure, [number, number + 1]))]
             if len(own) >= LOOKED_AT:
-                own_reach[k] = np.sort(np.linalg.norm(own - place[k], axis=1))[LOOKED_AT - 1]
+                away_mm = cdist(place[of], own)
+                own_reach[of] = np.partition(away_mm, LOOKED_AT - 1, axis=1)[:, LOOKED_AT - 1]
     return np.where(spacing < own_reach, spacing, np.inf)
 
 
@@ -176,8 +182,7 @@ class ScanNormals:
     _blocks: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     _starts: IntArray = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
     _file: BinaryIO = field(init=False)
-    _tree: cKDTree | None = None
-    _cells: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    _bins: NeighbourBins | None = None
     _held: frozenset[int] = frozenset()
 
     def __enter__(self) -> ScanNormals:
@@ -201,13 +206,17 @@ class ScanNormals:
 
     def at(self, points: FloatArray, towards_mm: FloatArray) -> FloatArray:
         """(N, 3) unit normals of points that follow each other, towards (N, 3); 0 where none."""
-        needed = self._blocks_near(points)
-        if self._tree is None or not needed <= self._held:
-            held = needed | self._held if len(self._cells) < CELLS_HELD else needed
-            self._held = held
-            self._cells = self._read(np.array(sorted(held), dtype=np.int64))
-            self._tree = cKDTree(self._cells)
-        return tangent_normals_near(points, towards_mm, self._cells, self._tree, self.radius_mm)
+        return self.near(points).normals(points, towards_mm)
+
+    def near(self, points: FloatArray) -> NeighbourBins:
+        """What gives normals to points (N, 3) that follow those asked before."""
+        needed, bins = self._blocks_near(points), self._bins
+        if bins is None or not needed <= self._held:
+            is_full = bins is None or len(bins.cells) >= CELLS_HELD
+            self._held = needed if is_full else needed | self._held
+            cells = self._read(np.array(sorted(self._held), dtype=np.int64))
+            self._bins = bins = NeighbourBins.of(cells, self._low_mm, self.radius_mm)
+        return bins
 
     def _cell(self, points: FloatArray) -> IntArray:
         return np.floor((points - self._low_mm) / (self.radius_mm / 4.0)).astype(np.int64)
@@ -234,16 +243,22 @@ class ScanNormals:
 
         A neighbour lies four cells away at most, a mean anywhere in its cell.
         """
-        found = set()
         cell = self._cell(points)
-        for corner in np.ndindex(3, 3, 3):
-            block = np.maximum(cell + 5 * (np.array(corner) - 1), 0) >> PART_BITS
-            number = np.unique(cell_numbers(block << PART_BITS) >> IN_BLOCK_BITS)
-            place = np.searchsorted(self._blocks, number)
-            is_there = place < len(self._blocks)
-            is_there[is_there] = self._blocks[place[is_there]] == number[is_there]
-            found.update(place[is_there].tolist())
-        return frozenset(found)
+        # where in a block's third a cell lies tells which blocks are near it
+        block, part = cell >> PART_BITS, cell & (2**PART_BITS - 1)
+        third = 1 + (part >= 2**PART_BITS - EDGE) - (part < EDGE).astype(np.int64)
+        number = np.unique(cell_numbers(4 * block + third))
+        thirds = cells_of(number)
+        block, side = thirds >> 2, (thirds & 3) - 1
+        found = [cell_numbers(block << PART_BITS) >> IN_BLOCK_BITS]
+        for corner in np.ndindex(2, 2, 2):
+            near = np.maximum(block + np.array(corner) * side, 0)
+            found.append(cell_numbers(near << PART_BITS) >> IN_BLOCK_BITS)
+        number = np.unique(np.concatenate(found))
+        place = np.searchsorted(self._blocks, number)
+        is_there = place < len(self._blocks)
+        is_there[is_there] = self._blocks[place[is_there]] == number[is_there]
+        return frozenset(place[is_there].tolist())
 
     def _read(self, places: IntArray) -> FloatArray:
         """(M, 3) means of the cells of blocks; consecutive blocks in one go."""

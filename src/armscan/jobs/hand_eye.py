@@ -469,8 +469,9 @@ def read_hand_eye_inputs(
     plate, notes = _reference(artefact, _tool_places(recordings))
     measure = MeasureOptions(stripes=stripe_options)
     groups = []
+    n_shown = _pictures_of_each(len(recordings))
     for recording in recordings:
-        seen = observe_stripes(recording, sensor, measure, progress=progress)
+        seen = observe_stripes(recording, sensor, measure, n_wanted=n_shown, progress=progress)
         groups.append((recording.name, _named(seen, _prefix(recording, len(recordings)))))
     tables = [path for folder in source.scans for path in recording_tables(folder)]
     files = [path for path in (*tables, source.sensor, artefact.plate, source.arm) if path]
@@ -568,15 +569,19 @@ def _named(seen: ObservedStripes, prefix: str) -> ObservedStripes:
 def _shown_exposures(inputs: HandEyeInputs) -> dict[str, Exposure]:
     """The images that a page shows, by the names that their stripes bear."""
     found: dict[str, Exposure] = {}
-    most = max(1, MAX_PICTURES // max(len(inputs.recordings), 1))
+    most = _pictures_of_each(len(inputs.recordings))
     for recording, (_, seen) in zip(inputs.recordings, inputs.groups, strict=False):
         prefix = _prefix(recording, len(inputs.recordings))
         used = {image.profile.source.removeprefix(prefix) for image in seen.images}
         rows = [k for k, row in enumerate(recording.rows) if row.source in used]
         for k in evenly_chosen(rows, most):
-            exposure = recording.exposure(k)
+            exposure = seen.exposures.get(k) or recording.exposure(k)
             found[prefix + exposure.source] = exposure
     return found
+
+
+def _pictures_of_each(n_recordings: int) -> int:
+    return max(1, MAX_PICTURES // max(n_recordings, 1))
 
 
 def _with_assumptions(failure: FitFailure, inputs: HandEyeInputs) -> FitFailure:

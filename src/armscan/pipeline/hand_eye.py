@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from armscan.reconstruction.place import delivered_points
 from armscan.reconstruction.points import MeasuredProfile
 from armscan.reconstruction.sync import exposure_poses
 from armscan.reconstruction.triangulate import sensor_columns
+from armscan.records.exposure import Exposure
 from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
 
@@ -60,12 +61,15 @@ class ObservedStripes:
         (source, reason) of exposures that were left out.
     warnings
         What is weak about the scan, in words.
+    exposures
+        The first of these exposures, as many as were wanted, by their row.
     """
 
     stripes: tuple[PosedStripe, ...]
     images: tuple[LabelledProfile, ...]
     not_used: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
+    exposures: Mapping[int, Exposure] = field(default_factory=dict)
 
 
 def observe_stripes(
@@ -74,6 +78,7 @@ def observe_stripes(
     options: MeasureOptions | None = None,
     *,
     max_exposures: int = MAX_EXPOSURES,
+    n_wanted: int = 0,
     progress: Progress = silent,
 ) -> ObservedStripes:
     """Measure the stripe of every exposure that has a pose.
@@ -94,6 +99,8 @@ def observe_stripes(
         Stripe extraction and the depths accepted.
     max_exposures
         Of a longer scan, so many are used, evenly spread.
+    n_wanted
+        Exposures that are kept, for a page that shows them.
     progress
         Told of every exposure.
 
@@ -117,6 +124,7 @@ def observe_stripes(
     posture_of = dict(zip(chosen, postures, strict=True))
     stripes: list[PosedStripe] = []
     images: list[LabelledProfile] = []
+    kept: dict[int, Exposure] = {}
     without_stripe: dict[int, str] = {}
     weak: list[str] = []
     # Each still is labelled by itself: where the sensor is on the arm is not known yet.
@@ -129,13 +137,17 @@ def observe_stripes(
     )
     for one in measured:
         instant = one.images.instant
-        for row, found in zip(instant.rows, one.profiles, strict=True):
+        for row, (exposure, _), found in zip(
+            instant.rows, one.images.pairs, one.profiles, strict=True
+        ):
             weak += found.warnings
             if len(found.points) < MIN_POINTS:
                 if not _is_shared(found.labelled):
                     without_stripe[row] = _why_without(found.labelled)
                 continue
             images.append(found.labelled)
+            if len(kept) < n_wanted:
+                kept[row] = exposure
             pose = poses.pose(instant.rows[0])
             stripe = posed_stripe(found, sensor, posture_of[instant], pose)
             stripes.append(replace(stripe, instant=source.rows[instant.rows[0]].source))
@@ -162,7 +174,7 @@ def observe_stripes(
         *merged,
         *summarised(weak),
     )
-    return ObservedStripes(tuple(stripes), tuple(images), not_used, warnings)
+    return ObservedStripes(tuple(stripes), tuple(images), not_used, warnings, kept)
 
 
 MAX_LOOKS = 2000

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -25,6 +26,7 @@ from armscan.pipeline.measure import (
     MeasureOptions,
     SheetDepths,
     cameras_of,
+    count_cores,
     labeller_for,
     measure_instants,
     measurement_warnings,
@@ -547,9 +549,12 @@ def _add_normals(
     points.look_from(cameras)
     radius_mm = choose_scan_radius_mm(points)
     n_done = n_without = 0
-    with ScanNormals(points, radius_mm) as surface:
+    n_threads = count_cores()
+    with ScanNormals(points, radius_mm) as surface, ThreadPoolExecutor(n_threads) as pool:
         for places, exposure in points.places():
-            normals = surface.at(places, cameras[exposure])
+            near = surface.near(places)
+            parts = [np.array_split(v, n_threads) for v in (places, cameras[exposure])]
+            normals = np.concatenate(list(pool.map(near.normals, *parts)))
             points.add_normals(normals)
             n_done += len(places)
             n_without += int((~normals.any(axis=1)).sum())

@@ -18,6 +18,8 @@ from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
+from armscan.kernels.faces import quadric_offsets
+from armscan.reconstruction.place import NeighbourBins
 
 PAUSE_PERIODS = 4.0
 """A pause of so many median periods between exposures begins a new pass."""
@@ -40,6 +42,8 @@ CENTRED = 0.4
 """The neighbours' middle lies within this part of their radius: a point is among the stripes."""
 SAME_FACE = 0.94
 """Normals of two passes on one face differ by less than 20 degrees."""
+RIDGE = 1e-6
+"""Far below any scatter; it only keeps neighbourhoods on one line from failing."""
 FEWEST_POINTS = 20
 """Points that a pair of passes must have in common to be compared."""
 AGREES = 5.0
@@ -271,15 +275,13 @@ def pass_distances(stripes: Stripes) -> PassDistances | None:
 class _PassSurface:
     """The stripes of one pass as a surface.
 
-    ``rows`` are its thinned points, ``misfit_mm`` is how far its own stripes lie off the surface
-    of their neighbours: what quadrics between stripes leave out.
+    ``near`` holds its thinned points with their exposures and rows, ``misfit_mm`` is how far its
+    own stripes lie off the surface of their neighbours: what quadrics between stripes leave out.
     """
 
     stripes: Stripes
     points: FloatArray
-    rows: IntArray
-    tree: cKDTree
-    radius_mm: float
+    near: NeighbourBins
     misfit_mm: float = 0.0
 
     @staticmethod
@@ -287,7 +289,9 @@ class _PassSurface:
         """The surface of the points ``own``; None if its stripes do not lie side by side."""
         radius = _radius_mm(points[own], stripes.exposure[own])
         rows = own[thinned_rows(points[own], stripes.exposure[own], radius / CELLS)]
-        bare = _PassSurface(stripes, points, rows, cKDTree(points[rows]), radius)
+        table = np.column_stack([points[rows], stripes.exposure[rows], rows])
+        near = NeighbourBins.of(table, points[rows].min(axis=0), radius)
+        bare = _PassSurface(stripes, points, near)
         some = rows[:: max(1, len(rows) // MOST_OWN)]
         left_out = bare.distances(some, -1, is_own=True).distance_mm
         if len(left_out) < FEWEST_POINTS:
@@ -296,34 +300,36 @@ class _PassSurface:
 
     def distances(self, asked: IntArray, number: int, *, is_own: bool = False) -> PassDistances:
         """Of the points that lie among its stripes; ``is_own`` leaves out a point's own stripe."""
-        stripes, points, rows = self.stripes, self.points, self.rows
-        count = min(NEIGHBOURS, len(rows))
-        near_mm, near = self.tree.query(
-            points[asked], k=np.arange(1, count + 1), distance_upper_bound=self.radius_mm
+        stripes, near, radius = self.stripes, self.near, self.near.radius_mm
+        without = stripes.exposure[asked] if is_own else np.full(len(asked), -1)
+        found = np.zeros((len(asked), 9))
+        quadric_offsets(
+            np.column_stack([self.points[asked], without]),
+            near.low_mm,
+            radius,
+            near.slots,
+            near.keys,
+            near.starts,
+            near.cells,
+            np.array([NEIGHBOURS, FEWEST_NEIGHBOURS, FEWEST_STRIPES, RIDGE]),
+            found,
         )
-        is_near = np.isfinite(near_mm)
-        near = rows[np.where(is_near, near, 0)]
-        if is_own:
-            is_near &= stripes.exposure[near] != stripes.exposure[asked, None]
-        stripe = np.sort(np.where(is_near, stripes.exposure[near], -1), axis=1)
-        n_stripes = (np.diff(stripe, axis=1) > 0).sum(axis=1) + is_near.all(axis=1)
-        enough = (is_near.sum(axis=1) >= FEWEST_NEIGHBOURS) & (n_stripes >= FEWEST_STRIPES)
-        asked, near, is_near = asked[enough], near[enough], is_near[enough]
-        offset = (points[near] - points[asked][:, None]) * is_near[:, :, None]
-        distance, normal, scatter, is_among = _quadric_offsets(offset, is_near, self.radius_mm)
-        nearest = near[np.arange(len(near)), is_near.argmax(axis=1)]
+        is_among = (found[:, 0] > 0.0) & (found[:, 8] >= 0.0) & (found[:, 8] <= CENTRED)
+        is_among &= found[:, 7] < 1.0
+        asked, found = asked[is_among], found[is_among]
+        nearest, normal = found[:, 1].astype(np.int64), found[:, 3:6]
         claimed = np.zeros(len(asked))
         for one in (asked, nearest):
             claimed += np.einsum("ni,nij,nj->n", normal, stripes.covariance_mm2[one], normal)
-        sigma = np.sqrt(claimed + scatter**2 + self.misfit_mm**2)
+        scatter = radius * found[:, 6] * np.sqrt(1.0 + found[:, 7])
         return PassDistances(
-            asked[is_among],
-            nearest[is_among],
-            np.full(int(is_among.sum()), number),
-            normal[is_among],
-            distance[is_among],
-            np.maximum(sigma[is_among], 1e-9),
-            np.sqrt(np.maximum(claimed[is_among], 0.0)),
+            asked,
+            nearest,
+            np.full(len(asked), number),
+            normal,
+            radius * found[:, 2],
+            np.maximum(np.sqrt(claimed + scatter**2 + self.misfit_mm**2), 1e-9),
+            np.sqrt(np.maximum(claimed, 0.0)),
         )
 
 
@@ -337,35 +343,3 @@ def _radius_mm(points: FloatArray, exposure: IntArray) -> float:
     spacing = np.minimum(spacing, LARGEST_RADIUS_MM)
     wanted = SPACINGS * float(np.median(spacing))
     return float(np.clip(wanted, LEAST_RADIUS_MM, LARGEST_RADIUS_MM))
-
-
-def _quadric_offsets(
-    offset: FloatArray, is_near: BoolArray, radius_mm: float
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Fit a quadric to each neighbourhood (N, K, 3) about its point, which is the origin.
-
-    Returns the point's distance from it along the normal, the normal, the standard deviation of
-    that distance from the neighbours' scatter, and whether the point lies among its neighbours.
-    """
-    weight = is_near.astype(np.float64)
-    count = weight.sum(axis=1)
-    mean = offset.sum(axis=1) / count[:, None]
-    centred = (offset - mean[:, None]) * weight[:, :, None]
-    values, axes = np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)
-    normal = axes[:, :, 0]
-    u, v, w = (
-        np.einsum("nki,ni->nk", offset, axes[:, :, column]) / radius_mm for column in (2, 1, 0)
-    )
-    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2) * weight[:, :, None]
-    gram = design.transpose(0, 2, 1) @ design
-    # the ridge is far below any scatter; it only keeps neighbourhoods on one line from failing
-    inverse = np.linalg.inv(gram + 1e-6 * np.eye(6))
-    solution = np.einsum("nij,nkj,nk->ni", inverse, design, w)
-    left = (w - np.einsum("nki,ni->nk", design, solution)) * weight
-    scatter = np.sqrt((left**2).sum(axis=1) / np.maximum(count - 6.0, 1.0))
-    middle = np.hypot((u * weight).sum(axis=1), (v * weight).sum(axis=1)) / count
-    # a neighbourhood on one line has no surface
-    wide = values[:, 1] > 0.02 * values[:, 2]
-    is_among = (middle <= CENTRED) & wide & (np.sqrt(inverse[:, 0, 0]) < 1.0)
-    sigma = radius_mm * scatter * np.sqrt(1.0 + inverse[:, 0, 0])
-    return -radius_mm * solution[:, 0], normal, sigma, is_among

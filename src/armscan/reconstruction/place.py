@@ -11,11 +11,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
+from armscan.geometry.arrays import Box, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.shapes import fit_plane
+from armscan.kernels.faces import sort_into_bins, tangent_normals
 from armscan.kernels.placing import carry_stripe, propagate_points
 from armscan.models.calibration import ArmNoise, ScannerCalibration, SensorCalibration
 from armscan.reconstruction.triangulate import (
@@ -325,10 +326,10 @@ def cut_cloud(cloud: PointCloud, box: Box) -> PointCloud:
     return cloud.select(box.holds(cloud.points_mm))
 
 
-AT_ONCE = 8_192
-"""Points whose neighbourhoods are held at the same time: 2 KB each."""
+AT_ONCE = 100_000
+"""Points between two words of progress."""
 NEIGHBOURS = 32
-"""Cells looked at around a point, at most: a full disc of four cells' radius holds 50."""
+"""Cells that make a point's plane, the nearest; a full disc of four cells' radius holds 50."""
 SMALLEST_RADIUS_MM, LARGEST_RADIUS_MM = 2.0, 20.0
 """Limits of the radius chosen by itself."""
 SPACINGS = 2.5
@@ -423,34 +424,65 @@ def estimate_normals(
     if len(points) == 0:
         return normals
     cells = cell_means(points, cell_keys(points, radius_mm / 4.0))
-    tree = cKDTree(cells)
+    bins = NeighbourBins.of(cells, points.min(axis=0), radius_mm)
     for first in range(0, len(points), AT_ONCE):
         part = slice(first, first + AT_ONCE)
-        normals[part] = tangent_normals_near(points[part], towards[part], cells, tree, radius_mm)
+        normals[part] = bins.normals(points[part], towards[part])
         told(min(first + AT_ONCE, len(points)))
     return normals
 
 
-def tangent_normals_near(
-    points: FloatArray, towards: FloatArray, cells: FloatArray, tree: cKDTree, radius_mm: float
-) -> FloatArray:
-    """(N, 3) unit normals, towards (N, 3), of the planes of the cells (M, 3) near points (N, 3).
+@dataclass(frozen=True, slots=True, eq=False)
+class NeighbourBins:
+    """Means of cells, sorted into bins as wide as the radius, so that those near a point are found.
 
-    ``tree`` holds the cells; it may lack those that are further than the radius from all points.
-    A normal is zero where there is none. Of many points, `AT_ONCE` are looked at together.
+    Parameters
+    ----------
+    low_mm
+        (3,) lowest coordinates of the points.
+    radius_mm
+        Means within this distance make a point's tangent plane.
+    cells
+        (M, 3) means, bin by bin, or (M, K) with more numbers behind them.
+    slots, keys, starts
+        As `armscan.kernels.faces.sort_into_bins` makes them.
     """
-    normals = np.zeros_like(points)
-    for first in range(0, len(points), AT_ONCE):
-        part = slice(first, first + AT_ONCE)
-        distance, neighbour = tree.query(
-            points[part], k=NEIGHBOURS, distance_upper_bound=radius_mm, workers=-1
+
+    low_mm: FloatArray
+    radius_mm: float
+    cells: FloatArray
+    slots: IntArray
+    keys: IntArray
+    starts: IntArray
+
+    @staticmethod
+    def of(cells: FloatArray, low_mm: FloatArray, radius_mm: float) -> NeighbourBins:
+        """Sort means (M, 3), which may lack those farther than the radius from all points asked."""
+        n_slots = 2 ** int(np.ceil(np.log2(2 * max(len(cells), 1))))
+        slots, keys = np.full(n_slots, -1), np.zeros(len(cells), dtype=np.int64)
+        starts, ordered = np.zeros(len(cells) + 1, dtype=np.int64), np.zeros_like(cells)
+        sort_into_bins(cells, low_mm, radius_mm, slots, keys, starts, ordered)
+        return NeighbourBins(low_mm, radius_mm, ordered, slots, keys, starts)
+
+    def normals(self, points: FloatArray, towards: FloatArray) -> FloatArray:
+        """(N, 3) unit normals, towards (N, 3), of the planes of the means near points (N, 3).
+
+        A normal is zero where there is none.
+        """
+        normals = np.zeros((len(points), 3))
+        tangent_normals(
+            np.ascontiguousarray(points),
+            np.ascontiguousarray(towards),
+            self.low_mm,
+            self.radius_mm,
+            self.slots,
+            self.keys,
+            self.starts,
+            self.cells,
+            np.array([MIN_NEIGHBOURS, NEIGHBOURS, MIN_WIDTH, MAX_THICKNESS]),
+            normals,
         )
-        is_near = np.isfinite(distance)
-        near = cells[np.where(is_near, neighbour, 0)]
-        found = _tangent_normals(points[part], near, is_near, radius_mm)
-        side = np.einsum("ni,ni->n", found, towards[part] - points[part])
-        normals[part] = np.where(side[:, None] < 0.0, -found, found)
-    return normals
+        return normals
 
 
 def cell_keys(
@@ -472,21 +504,3 @@ def cell_means(points: FloatArray, keys: IntArray) -> FloatArray:
     _, member = np.unique(keys, return_inverse=True)
     sums = [np.bincount(member, weights=points[:, k]) for k in range(3)]
     return np.stack(sums, axis=1) / np.bincount(member)[:, None]
-
-
-def _tangent_normals(
-    points: FloatArray, near_mm: FloatArray, is_near: BoolArray, radius_mm: float
-) -> FloatArray:
-    """(N, 3) least direction of each neighbourhood (N, K, 3), zero where it tells nothing."""
-    weight = is_near.astype(np.float64)
-    count = weight.sum(axis=1)
-    around = (near_mm - points[:, None]) * weight[:, :, None]
-    safe = np.maximum(count, 1.0)
-    mean = around.sum(axis=1) / safe[:, None]
-    covariance = around.transpose(0, 2, 1) @ around / safe[:, None, None]
-    covariance -= mean[:, :, None] * mean[:, None, :]
-    values, vectors = np.linalg.eigh(covariance)
-    thickness, width = np.sqrt(np.maximum(values[:, :2], 0.0)).T
-    is_plane = (count >= MIN_NEIGHBOURS) & (width >= MIN_WIDTH * radius_mm)
-    is_plane &= thickness <= MAX_THICKNESS * width
-    return np.where(is_plane[:, None], vectors[:, :, 0], 0.0)

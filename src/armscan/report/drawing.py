@@ -174,13 +174,32 @@ def display_levels(
     if scale < 1.0:
         size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    if image.ndim == 2 and image.dtype.kind == "u":
+        # few distinct levels: each is stretched once
+        counts = np.bincount(image.ravel())
+        table = np.arange(len(counts)) / exposure.full_scale
+        bright, middle = (_quantile(table, counts, share) for share in (0.995, 0.5))
+        return np.asarray(_stretched(table, bright, middle)[image])
     levels = image.astype(np.float64) / exposure.full_scale
     if is_grey and levels.ndim == 3:
         levels = levels.mean(axis=2)
-    bright = float(np.percentile(levels, 99.5))
-    scaled = levels / max(bright, 0.02) if bright < 0.7 else levels
-    gamma = 0.7 if float(np.median(scaled)) < 0.2 else 1.0
-    return np.asarray(255.0 * np.clip(scaled, 0.0, 1.0) ** gamma, dtype=np.uint8)
+    return _stretched(levels, float(np.percentile(levels, 99.5)), float(np.median(levels)))
+
+
+def _quantile(values: FloatArray, counts: IntArray, share: float) -> float:
+    """Of rising values that occur so often, between the two nearest (`numpy.quantile`)."""
+    ends = np.cumsum(counts)
+    place = share * (ends[-1] - 1)
+    low, high = values[np.searchsorted(ends, [np.floor(place), np.ceil(place)], side="right")]
+    return float(low + (place - np.floor(place)) * (high - low))
+
+
+def _stretched(
+    levels: FloatArray, bright: float, middle: float
+) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    scale = max(bright, 0.02) if bright < 0.7 else 1.0
+    gamma = 0.7 if middle / scale < 0.2 else 1.0
+    return np.asarray(255.0 * np.clip(levels / scale, 0.0, 1.0) ** gamma, dtype=np.uint8)
 
 
 def _mark_path(layer: Marks, exposure: Exposure, unit: float) -> str:

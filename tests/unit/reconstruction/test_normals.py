@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
@@ -56,6 +57,40 @@ def test_a_ball_seen_from_two_sides() -> None:
     angle = angles_deg(normals, truth)
     assert np.median(angle) < 0.5
     assert np.percentile(angle, 95) < 2.0
+
+
+def by_numpy(points: FloatArray, radius_mm: float) -> FloatArray:
+    """(N, 3) least axes of the 32 nearest means of cells of a quarter of the radius, unsigned."""
+    cell = np.floor((points - points.min(axis=0)) / (radius_mm / 4.0)).astype(np.int64)
+    _, member, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(member.ravel(), axis) for axis in points.T], axis=1)
+    means /= count[:, None]
+    found = np.zeros_like(points)
+    for k, point in enumerate(points):
+        distance, near = cKDTree(means).query(point, k=32, distance_upper_bound=radius_mm)
+        around = means[near[np.isfinite(distance)]]
+        if len(around) >= 6:
+            values, axes = np.linalg.eigh(np.cov(around.T, bias=True))
+            thickness, width = np.sqrt(np.maximum(values[:2], 0.0))
+            if width >= 0.15 * radius_mm and thickness <= 0.5 * width:
+                found[k] = axes[:, 0]
+    return found
+
+
+def test_they_are_those_of_a_tree_and_of_eigenvectors() -> None:
+    """A dense bent face, of which the nearest 32 cells count, and a slab that is nearly too thick.
+
+    Rounding of squares of 100 mm moves a direction by 1e-10.
+    """
+    rng = np.random.default_rng(3)
+    flat = rng.uniform(-6.0, 6.0, (600, 2))
+    bent = np.column_stack([flat, 0.05 * flat[:, 0] ** 2 + rng.normal(0.0, 0.02, 600)])
+    slab = rng.uniform(6.0, [12.0, 12.0, 7.4], (400, 3))
+    points = np.concatenate([bent, slab]) + 100.0
+    wanted = by_numpy(points, 3.0)
+    found = estimate_normals(points, points + wanted, 3.0)
+    assert 600 < wanted.any(axis=1).sum() < 1000
+    np.testing.assert_allclose(found, wanted, atol=1e-10)
 
 
 def test_where_there_is_no_tangent_plane_the_normal_is_zero() -> None:

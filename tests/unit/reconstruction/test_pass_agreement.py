@@ -5,14 +5,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import FloatArray
+from armscan.kernels.faces import quadric_offsets
 from armscan.reconstruction.pass_agreement import (
     Stripes,
     pass_agreement,
     passes_of,
     thinned_rows,
 )
+from armscan.reconstruction.place import NeighbourBins
 
 RADIUS_MM, NOISE_MM = 17.5, 0.005
 
@@ -62,6 +65,58 @@ def faces_of_a_block(turn_rad: float, seed: int = 1) -> Stripes:
         np.broadcast_to(np.eye(3), (20, 3, 3)),
         np.zeros((20, 3)),
     )
+
+
+def test_quadrics_are_those_of_a_tree_and_of_least_squares() -> None:
+    """The nearest 60 points within 3 mm, without one exposure: some have too few."""
+    rng = np.random.default_rng(0)
+    flat = np.concatenate([rng.uniform(-4.0, 4.0, (400, 2)), rng.uniform(4.0, 12.0, (150, 2))])
+    points = np.column_stack([flat, 0.03 * flat[:, 0] ** 2 + rng.normal(0.0, 0.02, 550)])
+    exposure, radius = rng.integers(0, 6, 550), 3.0
+    bins = NeighbourBins.of(
+        np.column_stack([points, exposure, np.arange(550)]), points.min(axis=0), radius
+    )
+    asked = points[::11] + rng.normal(0.0, 0.3, (50, 3))
+    asked[::5, 2] += 2.8
+    found = np.zeros((50, 9))
+    quadric_offsets(
+        np.column_stack([asked, np.full(50, 2.0)]),
+        bins.low_mm,
+        radius,
+        bins.slots,
+        bins.keys,
+        bins.starts,
+        bins.cells,
+        np.array([60.0, 12.0, 3.0, 0.0]),
+        found,
+    )
+    n_nearest = []
+    for k, place in enumerate(asked):
+        distance, near = cKDTree(points).query(place, k=60, distance_upper_bound=radius)
+        near = near[np.isfinite(distance)]
+        n_nearest.append(len(near))
+        near = near[exposure[near] != 2]
+        assert found[k, 0] == (len(near) >= 12)
+        if len(near) < 12:
+            continue
+        offset = (points[near] - place) / radius
+        values, axes = np.linalg.eigh(np.cov(offset.T, bias=True))
+        u, v, w = (offset @ axes[:, column] for column in (2, 1, 0))
+        design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+        solution, left, _, _ = np.linalg.lstsq(design, w, rcond=None)
+        sign = np.sign(found[k, 3:6] @ axes[:, 0])
+        np.testing.assert_allclose(found[k, 3:6], sign * axes[:, 0], atol=1e-9)
+        wanted = (
+            near[0],
+            -sign * solution[0],
+            np.sqrt(left[0] / max(len(near) - 6, 1)),
+            np.linalg.inv(design.T @ design)[0, 0],
+            np.hypot(u.mean(), v.mean()),
+        )
+        np.testing.assert_allclose(found[k, [1, 2, 6, 7, 8]], wanted, rtol=1e-7, atol=1e-9)
+        assert values[1] > 0.02 * values[2]
+    assert 60 in n_nearest
+    assert min(n_nearest) < 12
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -11,7 +11,7 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats, ints
 from armscan.inspection.cad.part import PartModel, edges_of
-from armscan.kernels.triangle_tree import (
+from armscan.kernels.mesh_search import (
     AT_A,
     AT_B,
     AT_C,

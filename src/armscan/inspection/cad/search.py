@@ -20,7 +20,7 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Cad, Part, Pose
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.inspection.cad.distance import PartSurface
-from armscan.kernels.pose_search import descend_poses
+from armscan.kernels.mesh_search import descend_poses
 
 TURNS = 700
 """Starting turns, about 24 degrees apart; half as many lost 1 of 100 poses in the study."""

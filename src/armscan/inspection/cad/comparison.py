@@ -22,9 +22,10 @@ from armscan.geometry.arrays import (
     ints,
 )
 from armscan.geometry.estimate import FitFailure
-from armscan.inspection.cad.alignment import Alignment, measured, sight_of
+from armscan.inspection.cad.alignment import TYPICAL, Alignment, measured, sight_of
 from armscan.inspection.cad.distance import PartSurface, SurfaceDistance
 from armscan.inspection.cad.point_errors import PointErrors, scatter_of_means
+from armscan.inspection.cad.units import across_mm
 from armscan.inspection.conformity import COVERAGE, judge
 from armscan.inspection.conformity import Verdict as Validity
 from armscan.records.cloud import PointCloud
@@ -48,6 +49,12 @@ SPOT_SHARE = 0.02
 average out. Of thin clouds spots are larger, so that they hold points enough."""
 LEAST_SPOT_POINTS = 10
 """A face none of whose spots has so many is not seen, and not judged."""
+MANY_BEYOND = 0.2
+"""Part of the points beyond the reach from which on the typical distance is looked at, too: a worn
+or raw part lies within the reach where it is off, another part only where it does by chance."""
+MOST_TYPICAL = 0.25
+"""Typical (median) distance, over the reach, that such a cloud may have; `TYPICAL` of its size if
+that is more."""
 ALONG_FACE = 0.98
 """Cosine between a deviation and the normal of its face, below which the closest point is on an
 edge: the facets of a round face are up to 10 degrees apart, and the point may be of either face."""
@@ -279,16 +286,9 @@ def compare_with_part(
     found = measured(surface, cloud, alignment.cad_from_part)
     near = np.abs(found.signed_mm) <= options.reach_mm
     rows = np.flatnonzero(near)
-    if len(rows) == 0 or len(rows) < (1.0 - MOST_BEYOND) * len(cloud):
-        # rounded down: half of the points would not be refused
-        share = f"only {1000 * len(rows) // len(cloud) / 10:g} % of the" if len(rows) else "no"
-        lead = "leave --align none out, " if alignment.method == "none" else ""
-        return FitFailure(
-            f"the cloud does not lie on the model: {share} points come within "
-            f"{options.reach_mm:g} mm of it",
-            f"{lead}give the model of this part, cut table and fixtures away with --region, or "
-            "give a larger --reach-mm",
-        )
+    failure = _elsewhere(surface, cloud, alignment, options.reach_mm, np.abs(found.signed_mm))
+    if failure is not None:
+        return failure
     placed = alignment.cad_from_part.apply(cloud.points_mm)
     normals, d = found.normals, found.signed_mm
     along = np.abs(np.einsum("nk,nk->n", surface.part.normals[found.triangle], normals))
@@ -345,6 +345,38 @@ def compare_with_part(
         n_given=len(cloud),
         spot_width_mm=spot_width,
         is_fused=cloud.is_fused,
+    )
+
+
+def _elsewhere(
+    surface: PartSurface,
+    cloud: PointCloud,
+    alignment: Alignment,
+    reach_mm: float,
+    away_mm: FloatArray,
+) -> FitFailure | None:
+    """Why a cloud whose points are (N,) from the model is not of it; None if it may be."""
+    n_near = int((away_mm <= reach_mm).sum())
+    lead = "leave --align none out, " if alignment.method == "none" else ""
+    remedy = (
+        f"{lead}give the model of this part, cut table and fixtures away with --region, or give a "
+        "larger --reach-mm"
+    )
+    if n_near == 0 or n_near < (1.0 - MOST_BEYOND) * len(cloud):
+        # rounded down: half of the points would not be refused
+        permille = 1000 * n_near // max(len(cloud), 1)
+        share = f"only {permille / 10:g} % of the" if n_near else "no"
+        what = f"the cloud does not lie on the model: {share} points come within {reach_mm:g} mm"
+        return FitFailure(f"{what} of it", remedy)
+    typical, size = float(np.median(away_mm)), min(across_mm(cloud.points_mm), surface.diagonal_mm)
+    least = max(TYPICAL * size, MOST_TYPICAL * reach_mm, 5.0 * float(np.median(cloud.sigma_mm)))
+    beyond = 1.0 - n_near / len(cloud)
+    if typical <= least or beyond <= MANY_BEYOND:
+        return None
+    return FitFailure(
+        f"the cloud does not lie on the model: half of its points lie more than {typical:.3g} mm "
+        f"off it, {100 * beyond:.0f} % more than {reach_mm:g} mm",
+        remedy,
     )
 
 

@@ -360,6 +360,26 @@ def test_a_stripe_along_a_rim_is_not_of_the_face_that_nobody_saw() -> None:
         assert found.faces[side].statistics.n == counted
 
 
+@pytest.mark.parametrize(
+    ("near_mm", "share", "far_mm", "is_refused"),
+    [
+        (1.8, 0.7, 6.0, True),  # another part, two thirds of it near by chance
+        (1.8, 1.0, 6.0, False),  # a raw part, too large all over
+        (0.0, 0.7, 6.0, False),  # a part with a face broken off, or its table
+    ],
+)
+def test_another_part_is_told_from_a_raw_or_a_broken_one(
+    near_mm: float, share: float, far_mm: float, is_refused: bool
+) -> None:
+    points = top_points(3000, height=20.0 + near_mm)
+    points[int(share * len(points)) :, 2] += far_mm
+    cloud = cloud_of(points)
+    found = compare_with_part(BOX, cloud, align_none(cloud), CadOptions(), errors_known=False)
+    assert isinstance(found, FitFailure) == is_refused
+    if isinstance(found, FitFailure):
+        assert "half of its points lie more than 1.8 mm off it, 30 % more than 2 mm" in found.reason
+
+
 def test_a_cloud_that_lies_elsewhere_is_refused_and_table_about_a_part_is_not() -> None:
     """40 and 60 % of the points are on the part, the rest 30 mm beside it."""
     beside = top_points(1000) + np.array([90.0, 0.0, 0.0])

@@ -250,6 +250,9 @@ def print_strata(found: dict[str, list[tuple[Row, Row]]]) -> None:
         for stage in stages:
             pairs = [pair for pair in _right(found[stage]) if pair[1]["freedom"]]
             value = np.array([row["strata"][name] for row, _ in pairs])
+            if not pairs:
+                cells.append("-")
+                continue
             low, high = np.quantile(value, [1 / 3, 2 / 3])
             parts = [value <= low, (value > low) & (value <= high), value > high]
             thirds = [

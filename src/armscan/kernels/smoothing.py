@@ -469,8 +469,9 @@ def find_pulls(
         square = fits[i, SIGMA] * fits[i, SIGMA]
         pull[i] = fits[i, BEND_GAIN] * (1.0 - n * n) * square / (2.0 * n)
         bend = max(BEND_MARGIN * seen_bend(points, normals, chain, i), SHARPEST_BEND)
-        matters[i] = abs(pull[i]) * bend > LEAST_PULL * sigma[i]
-        count += matters[i]
+        is_pulled = abs(pull[i]) * bend > LEAST_PULL * sigma[i]
+        matters[i] = is_pulled
+        count += 1 if is_pulled else 0
     return count
 
 

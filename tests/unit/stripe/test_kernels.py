@@ -6,6 +6,7 @@ import pytest
 from scipy.ndimage import correlate, map_coordinates, maximum_filter
 from scipy.optimize import curve_fit
 
+from armscan.kernels.arrays import COLUMN
 from armscan.kernels.chains import find_other_lines, measure_chains, sum_windows, walk_chains
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
@@ -26,6 +27,10 @@ from armscan.kernels.ridge import (
     sum_at_border,
 )
 from armscan.kernels.section import (
+    NORMAL_00,
+    NORMAL_11,
+    SCORE_0,
+    SCORE_1,
     bin_residuals,
     common_terms,
     mark_points,
@@ -34,6 +39,7 @@ from armscan.kernels.section import (
 )
 from armscan.kernels.smoothing import filter_residuals, multiply_lagged
 from armscan.records.exposure import Exposure
+from armscan.vision.stripe.fit import BLOCK, estimate_section
 from armscan.vision.stripe.image import lit_plane
 from armscan.vision.stripe.ridge import measure_level
 
@@ -650,3 +656,18 @@ def test_what_lies_beside_a_centre_widens_its_sigma() -> None:
     # flanks: lean times width; edges: the blur's share, at most half of the width, times contrast
     beside = np.array([0.3, 0.0, 0.5 * np.hypot(0.04, 0.5), 0.5 * 0.25])
     assert sigma == pytest.approx(np.hypot(0.04, beside), rel=1e-12)
+
+
+def test_stretches_that_say_nothing_of_a_term_leave_the_shape_of_the_section() -> None:
+    """Sixty stretches of one shape, of every other one the second term is not told."""
+    rng = np.random.default_rng(2)
+    n, true = 60 * BLOCK, np.array([0.03, -0.02])
+    normal = rng.uniform(50.0, 100.0, (n, 2))
+    normal[np.arange(n) // BLOCK % 2 == 1, 1] = 0.0
+    said = np.zeros((n, 8))
+    said[:, [NORMAL_00, NORMAL_11]] = normal
+    said[:, [SCORE_0, SCORE_1]] = normal * true + np.sqrt(normal) * rng.normal(0.0, 0.01, (n, 2))
+    usable, axis, chain = np.ones(n, dtype=bool), np.full(n, COLUMN), np.zeros(n, dtype=np.int64)
+    with np.errstate(all="raise"):
+        found = estimate_section(said, np.zeros(4), usable, axis, chain)
+    np.testing.assert_allclose(found[2 * COLUMN : 2 * COLUMN + 2], true, atol=1e-3)

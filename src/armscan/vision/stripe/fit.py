@@ -164,7 +164,10 @@ def _certain_terms(said: FloatArray, start: FloatArray, block: IntArray) -> Floa
     sums = [
         [np.bincount(block[inside], one[inside, k]) for one in (rest, diagonal)] for k in (0, 1)
     ]
-    differ = np.array([robust_sigma(apart / weight) for apart, weight in sums])
+    # a stretch whose profiles say nothing of a term differs in nothing
+    differ = np.array(
+        [robust_sigma(apart[weight > 0.0] / weight[weight > 0.0]) for apart, weight in sums]
+    )
     sigma = CERTAIN_SIGMAS * differ / np.sqrt(block.max() + 1)
     certain = np.maximum(1.0 - (sigma / np.maximum(np.abs(terms), 1e-12)) ** 2, 0.0)
     return np.asarray(terms * certain * terms**2 / np.maximum(terms**2 + differ**2, 1e-12))

@@ -85,7 +85,7 @@ def test_stripes_of_few_points_weigh_as_their_scatter_is_known(seed: int) -> Non
 
 
 def test_sheets_are_judged_by_the_lines_that_drew_their_points() -> None:
-    """Fifteen lines 2 mm apart, before a camera whose centre moves them by 2.5 mm."""
+    """Fifteen lines 1 to 2 mm apart, before a camera whose centre moves them by 2.5 mm."""
     made = draw_instrument(520335)
     camera = run_camera(made)
     assert run_sheets(made, camera.calibration, camera.information).outcome.result == "right"

@@ -105,7 +105,8 @@ def scatter_by_stripe(observations: SheetObservations, residual_px: FloatArray) 
     So would one of few points whose median happens to be small. Each stripe's own scatter, by the
     median, therefore counts as much as it is known, and what all have in common for the rest: its
     logarithm is the posterior mean beside a normal distribution over the stripes, whose width comes
-    from what they differ by more than medians err (DerSimonian and Laird 1986, eqs. 7 to 9).
+    from what they differ by more than medians of independent points err (DerSimonian and Laird
+    1986, eqs. 7 to 9). Medians of points that are alike err more; such stripes keep their own.
     """
     stripes = list(observations.each_stripe())
     rest = [_off_course(observations.select(of), residual_px[of]) for of in stripes]
@@ -114,9 +115,8 @@ def scatter_by_stripe(observations: SheetObservations, residual_px: FloatArray) 
     found = np.flatnonzero(own > 0.0)
     if not len(found):
         return factor
-    correlation = _correlation([rest[k] / own[k] for k in found])
     free = np.array([len(rest[k]) - N_SHAPE for k in found])
-    variance = MEDIAN_VARIANCE * correlation / np.maximum(free, 1)
+    variance = MEDIAN_VARIANCE / np.maximum(free, 1)
     for k, logarithm in zip(found, _moderated(np.log(own[found]), variance), strict=True):
         factor[stripes[k]] = np.exp(logarithm)
     return factor

@@ -401,10 +401,22 @@ def _nearest_rows(
                         count += 1
     if count <= most:
         return count
-    bound = np.partition(near[:count, 3], most - 1)[most - 1]
+    # halved until so many lie below it; a library's selection takes seconds to compile
+    low_square, bound = 0.0, radius * radius
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low_square + bound)
+        inside = 0
+        for c in range(count):
+            inside += 1 if near[c, 3] < middle else 0
+        if inside < most:
+            low_square = middle
+        else:
+            bound = middle
+        if inside == most:
+            break
     inside = 0
     for c in range(count):
-        if near[c, 3] <= bound and inside < most:
+        if near[c, 3] < bound and inside < most:
             for k in range(4):
                 near[inside, k] = near[c, k]
             kept[inside] = kept[c]
@@ -425,10 +437,14 @@ def _fit_quadric(
     found: FloatsOut,
 ) -> None:
     """What `quadric_offsets` says of a point, from offsets of the points near it."""
-    side[:] = 0.0
-    gram[:] = 0.0
-    matrix[:] = 0.0
     mean, terms = side[0], side[1]
+    for i in range(6):
+        mean[i] = side[2, i] = 0.0
+        for j in range(6):
+            gram[i, j] = 0.0
+    for i in range(3):
+        for j in range(3):
+            matrix[i, j] = 0.0
     for c in range(count):
         for i in range(3):
             mean[i] += near[c, i] / count

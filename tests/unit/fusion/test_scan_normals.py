@@ -10,7 +10,7 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.fusion import point_spool, scan_normals
-from armscan.fusion.cell_sums import AXIS_CELLS, CellSums, cell_numbers
+from armscan.fusion.cell_sums import AXIS_CELLS, CellSums, cell_numbers, cells_of
 from armscan.fusion.point_spool import PointSpool
 from armscan.fusion.scan_normals import ScanNormals, choose_scan_radius_mm
 from armscan.geometry.arrays import FloatArray
@@ -98,5 +98,6 @@ def test_numbers_of_cells_are_of_one_cell_each_and_end_somewhere() -> None:
     numbers = cell_numbers(cell.reshape(-1, 3))
     assert len(np.unique(numbers)) == len(numbers)
     assert (numbers >= 0).all()
+    np.testing.assert_array_equal(cells_of(numbers), cell.reshape(-1, 3))
     with pytest.raises(InputError):
         cell_numbers(np.array([[0, 0, AXIS_CELLS]]))

@@ -17,7 +17,13 @@ import trimesh
 from armscan.cli import main
 from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.jobs.info import describe_files
-from armscan.records.cloud import CalibrationMark, PointCloud, largest_eigenvalue
+from armscan.records.cloud import (
+    FIELD_POWERS,
+    CalibrationErrors,
+    CalibrationMark,
+    PointCloud,
+    largest_eigenvalue,
+)
 from armscan.storage.clouds import (
     CLOUD_SUFFIXES,
     CloudPiece,
@@ -38,6 +44,18 @@ LOSSLESS = {".ply": 0.0, ".e57": 1e-12, ".pcd": 0.0, ".laz": 0.51e-6, ".las": 0.
 POINTS = np.array([[1.5, -2.0, 3.25], [4.0, 5.0, -6.5], [0.0, 1.0, 2.0]])
 
 
+def calibration_errors(rng: np.random.Generator) -> CalibrationErrors:
+    """Of two sheets and three exposures."""
+    turns = np.linalg.qr(rng.normal(size=(3, 3, 3)))[0]
+    return CalibrationErrors(
+        turns=turns * np.linalg.det(turns)[:, None, None],
+        middle=rng.normal(size=(2, 2)),
+        half_width=rng.uniform(0.1, 1.0, (2, 2)),
+        modes_mm=rng.normal(size=(2, len(FIELD_POWERS), 3, 4)) * 0.01,
+        arm_mm=0.0025,
+    )
+
+
 def cloud(n: int = 60, has_normals: bool = True) -> PointCloud:
     rng = np.random.default_rng(3)
     factor = rng.normal(size=(n, 3, 3)) * 0.01
@@ -56,6 +74,7 @@ def cloud(n: int = 60, has_normals: bool = True) -> PointCloud:
         normals=normals / np.linalg.norm(normals, axis=1)[:, None] if has_normals else None,
         noise_length=rng.uniform(1.0, 12.0, n) if has_normals else None,
         seen_from_mm=rng.normal(size=(3, 3)) * 100 if has_normals else None,
+        calibration_errors=calibration_errors(rng) if has_normals else None,
         is_simulated=True,
         forced=("rms 9 px", "f unknown"),
         calibrations=(CalibrationMark("a1", "2026-05-01T10:00:00+00:00"), CalibrationMark("b")),
@@ -83,6 +102,12 @@ def test_all_that_a_cloud_carries_comes_back(
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
     np.testing.assert_allclose(after.points_mm, before.points_mm, rtol=0, atol=LOSSLESS[suffix])
     assert str(after.seen_from_mm) == str(before.seen_from_mm)
+    was, found = before.calibration_errors, after.calibration_errors
+    assert (found is None) is (was is None)
+    if was is not None and found is not None:
+        np.testing.assert_allclose(found.turns, was.turns, rtol=0, atol=2e-9)
+        for name in ("middle", "half_width", "modes_mm", "arm_mm"):
+            np.testing.assert_allclose(getattr(found, name), getattr(was, name), rtol=5e-6)
     nine_digits = 5e-9 if suffix == ".csv" else 0.0
     for name in ("covariance_mm2", "sigma_noise_mm", "intensity", "normals", "noise_length"):
         was, found = getattr(before, name), getattr(after, name)

@@ -15,7 +15,7 @@ import pytest
 import trimesh
 
 from armscan.cli import main
-from armscan.errors import FileFormatError, InputError, OptionError
+from armscan.errors import ArmscanError, FileFormatError, InputError, OptionError
 from armscan.jobs.info import describe_files
 from armscan.records.cloud import (
     FIELD_POWERS,
@@ -114,6 +114,28 @@ def test_all_that_a_cloud_carries_comes_back(
         assert (found is None) is (was is None)
         if was is not None:
             np.testing.assert_allclose(found, was, rtol=nine_digits, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("was", "now"),
+    [
+        (b"comment sensor_turn_rad 1 [", b"comment sensor_turn_rad 1 [[], "),
+        (b"comment arm_error_mm 0 [0", b"comment arm_error_mm 0 [-"),
+        (b"comment arm_error_mm 0 [0.0025]", b"comment arm_error_mm 0 [NaN]"),
+        (b"comment calibration_range 1", b"comment another_range 1"),
+        (b"comment calibration_error_mm 1", b"comment calibration_error_mn 1"),
+    ],
+)
+def test_damaged_errors_of_a_calibration_are_refused(
+    tmp_path: Path, was: bytes, now: bytes
+) -> None:
+    path = tmp_path / "cloud.ply"
+    write_cloud(path, cloud())
+    whole = path.read_bytes()
+    assert was in whole
+    path.write_bytes(whole.replace(was, now, 1))
+    with pytest.raises(ArmscanError):
+        read_cloud(path)
 
 
 @pytest.mark.parametrize("suffix", CLOUD_SUFFIXES)

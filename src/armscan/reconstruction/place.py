@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -199,16 +200,19 @@ def errors_of_calibration(
         middle=np.array(middle),
         half_width=np.array(half),
         modes_mm=np.array(modes),
-        arm_mm=_of_postures_mm(scanner.hand_eye),
+        arm_mm=_of_postures_mm(scanner.hand_eye, np.concatenate([seen for seen, _ in own])),
     )
 
 
-def _of_postures_mm(hand_eye: HandEyeCalibration) -> float:
-    """What postures of the calibration scattered by, along an axis, at the head: a shift, and two
-    thirds of the variance of a turn about the tool's origin (its square across any one axis).
+def _of_postures_mm(hand_eye: HandEyeCalibration, seen_mm: FloatArray) -> float:
+    """What postures of the calibration scattered by, along an axis, in the middle of points (M, 3).
+
+    It is a shift, and two thirds of the square of what a turn about the tool's origin moves: a turn
+    about any axis moves a point along two.
     """
-    noise, lever = hand_eye.arm_noise, np.linalg.norm(hand_eye.tool_from_sensor.translation_mm)
-    return float(np.hypot(noise.position_mm, np.sqrt(2.0 / 3.0) * noise.tool_rotation_rad * lever))
+    noise, middle = hand_eye.arm_noise, seen_mm.mean(axis=0)[None]
+    lever = float(np.linalg.norm(hand_eye.tool_from_sensor.apply(middle)))
+    return math.hypot(noise.position_mm, math.sqrt(2.0 / 3.0) * noise.tool_rotation_rad * lever)
 
 
 def _moves_of_sheet(

@@ -80,6 +80,11 @@ class CalibrationErrors(ArrayRecord):
     modes_mm: FloatArray = floats("S", len(FIELD_POWERS), 3, "K")
     arm_mm: float
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 <= self.arm_mm < np.inf or not (self.half_width > 0.0).all():
+            raise InputError("errors of a calibration have sizes of 0 or more, and a range above 0")
+
     def turned(self, rotation: FloatArray) -> Self:
         """The same in a frame into which ``rotation`` (3, 3) leads."""
         return replace(self, turns=rotation @ self.turns)

@@ -44,14 +44,14 @@ LOSSLESS = {".ply": 0.0, ".e57": 1e-12, ".pcd": 0.0, ".laz": 0.51e-6, ".las": 0.
 POINTS = np.array([[1.5, -2.0, 3.25], [4.0, 5.0, -6.5], [0.0, 1.0, 2.0]])
 
 
-def calibration_errors(rng: np.random.Generator) -> CalibrationErrors:
+def calibration_errors(rng: np.random.Generator, n_errors: int = 4) -> CalibrationErrors:
     """Of two sheets and three exposures."""
     turns = np.linalg.qr(rng.normal(size=(3, 3, 3)))[0]
     return CalibrationErrors(
         turns=turns * np.linalg.det(turns)[:, None, None],
         middle=rng.normal(size=(2, 2)),
         half_width=rng.uniform(0.1, 1.0, (2, 2)),
-        modes_mm=rng.normal(size=(2, len(FIELD_POWERS), 3, 4)) * 0.01,
+        modes_mm=rng.normal(size=(2, len(FIELD_POWERS), 3, n_errors)) * 0.01,
         arm_mm=0.0025,
     )
 
@@ -114,6 +114,14 @@ def test_all_that_a_cloud_carries_comes_back(
         assert (found is None) is (was is None)
         if was is not None:
             np.testing.assert_allclose(found, was, rtol=nine_digits, atol=0)
+
+
+def test_a_calibration_that_is_known_for_certain_has_no_errors(tmp_path: Path) -> None:
+    certain = calibration_errors(np.random.default_rng(1), 0)
+    write_cloud(tmp_path / "cloud.ply", replace(cloud(), calibration_errors=certain))
+    after = read_cloud(tmp_path / "cloud.ply").calibration_errors
+    assert after is not None
+    assert after.modes_mm.shape == certain.modes_mm.shape
 
 
 @pytest.mark.parametrize(

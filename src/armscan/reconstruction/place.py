@@ -172,6 +172,8 @@ def errors_of_calibration(
     if sensor is None or sensor.second is not None:
         return None
     factor = square_root(scanner.covariance, "the scanner's covariance")
+    if not factor.shape[1]:  # a calibration that is known for certain
+        factor = np.zeros((len(factor), 1))
     camera = sensor.camera.camera
     grid = np.meshgrid(
         np.linspace(0.0, camera.width_px - 1.0, FIELD_GRID),
@@ -186,6 +188,7 @@ def errors_of_calibration(
     values, vectors = np.linalg.eigh(moves.T @ moves)
     left = np.cumsum(np.maximum(values, 0.0))
     kept = vectors[:, left > LEAST_MODE * left[-1]]
+    n_kept = kept.shape[1]
     middle, half, modes = [], [], []
     for seen, move in own:
         direction = seen[:, :2] / seen[:, 2:]
@@ -193,8 +196,8 @@ def errors_of_calibration(
         middle.append((low + high) / 2.0)
         half.append(np.maximum((high - low) / 2.0, 1e-9))
         powers = direction_powers(seen, middle[-1], half[-1])
-        found = np.linalg.lstsq(powers, (move @ kept).reshape(len(seen), -1), rcond=1e-9)[0]
-        modes.append(found.reshape(powers.shape[1], 3, -1))
+        found = np.linalg.lstsq(powers, (move @ kept).reshape(len(seen), 3 * n_kept), rcond=1e-9)[0]
+        modes.append(found.reshape(powers.shape[1], 3, n_kept))
     return CalibrationErrors(
         turns=turns,
         middle=np.array(middle),

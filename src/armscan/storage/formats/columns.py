@@ -431,7 +431,7 @@ def _errors(notes: Sequence[str], n_sheets: int) -> CalibrationErrors | None:
         turns=Rotation.from_rotvec(turns).as_matrix(),
         middle=seen[:, :2],
         half_width=seen[:, 2:],
-        modes_mm=modes.reshape(n_sheets, terms, 3, -1),
+        modes_mm=modes.reshape(n_sheets, terms, 3, modes.shape[1] // 3),
         arm_mm=float(arm[0, 0]),
     )
 

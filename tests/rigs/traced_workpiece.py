@@ -16,7 +16,12 @@ from scipy.spatial.transform import Rotation
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import ScannerCalibration
-from armscan.reconstruction.place import BaseTransform, merge_clouds, propagate_to_base
+from armscan.reconstruction.place import (
+    BaseTransform,
+    errors_of_calibration,
+    merge_clouds,
+    propagate_to_base,
+)
 from armscan.reconstruction.triangulate import triangulate_stripe
 from armscan.records.cloud import PointCloud
 from armscan.records.profile import Profile
@@ -107,7 +112,7 @@ def scan_of(twin: Any, document: ScannerCalibration, seed: int) -> tuple[PointCl
     base_from_part = twin.truth.base_from_workpiece
     light, window = head.lasers[0], head.scan_window
     fan = light.rays(np.linspace(-light.half_angle_rad, light.half_angle_rad, FAN_RAYS))
-    clouds, kinds = [], []
+    clouds, kinds, sensors = [], [], []
     for row in scan.rows:
         part_from_sensor = base_from_part.inverse() @ scan.true_pose(row.index)
         source = part_from_sensor.apply(light.source_mm[None])[0]
@@ -125,7 +130,14 @@ def scan_of(twin: Any, document: ScannerCalibration, seed: int) -> tuple[PointCl
         pose: Pose[Base, Tool] = Pose(track.rotations[k], track.translations_mm[k])
         clouds.append(propagate_to_base(stripe, profile, pose, transform))
         kinds.append(what[stripe.row])
-    return merge_clouds(clouds), np.concatenate(kinds), base_from_part
+        sensors.append(pose @ scanner.hand_eye.tool_from_sensor)
+    turns = np.array([one.rotation for one in sensors])
+    cloud = replace(
+        merge_clouds(clouds),
+        seen_from_mm=np.array([one.translation_mm for one in sensors]),
+        calibration_errors=errors_of_calibration(scanner, turns),
+    )
+    return cloud, np.concatenate(kinds), base_from_part
 
 
 def seen(source: FloatArray, eye: FloatArray, rays: FloatArray) -> tuple[FloatArray, IntArray]:

@@ -15,9 +15,15 @@ import pytest
 import trimesh
 
 from armscan.cli import main
-from armscan.errors import FileFormatError, InputError, OptionError
+from armscan.errors import ArmscanError, FileFormatError, InputError, OptionError
 from armscan.jobs.info import describe_files
-from armscan.records.cloud import CalibrationMark, PointCloud, largest_eigenvalue
+from armscan.records.cloud import (
+    FIELD_POWERS,
+    CalibrationErrors,
+    CalibrationMark,
+    PointCloud,
+    largest_eigenvalue,
+)
 from armscan.storage.clouds import (
     CLOUD_SUFFIXES,
     CloudPiece,
@@ -38,6 +44,18 @@ LOSSLESS = {".ply": 0.0, ".e57": 1e-12, ".pcd": 0.0, ".laz": 0.51e-6, ".las": 0.
 POINTS = np.array([[1.5, -2.0, 3.25], [4.0, 5.0, -6.5], [0.0, 1.0, 2.0]])
 
 
+def calibration_errors(rng: np.random.Generator, n_errors: int = 4) -> CalibrationErrors:
+    """Of two sheets and three exposures."""
+    turns = np.linalg.qr(rng.normal(size=(3, 3, 3)))[0]
+    return CalibrationErrors(
+        turns=turns * np.linalg.det(turns)[:, None, None],
+        middle=rng.normal(size=(2, 2)),
+        half_width=rng.uniform(0.1, 1.0, (2, 2)),
+        modes_mm=rng.normal(size=(2, len(FIELD_POWERS), 3, n_errors)) * 0.01,
+        arm_mm=0.0025,
+    )
+
+
 def cloud(n: int = 60, has_normals: bool = True) -> PointCloud:
     rng = np.random.default_rng(3)
     factor = rng.normal(size=(n, 3, 3)) * 0.01
@@ -56,6 +74,7 @@ def cloud(n: int = 60, has_normals: bool = True) -> PointCloud:
         normals=normals / np.linalg.norm(normals, axis=1)[:, None] if has_normals else None,
         noise_length=rng.uniform(1.0, 12.0, n) if has_normals else None,
         seen_from_mm=rng.normal(size=(3, 3)) * 100 if has_normals else None,
+        calibration_errors=calibration_errors(rng) if has_normals else None,
         is_simulated=True,
         forced=("rms 9 px", "f unknown"),
         calibrations=(CalibrationMark("a1", "2026-05-01T10:00:00+00:00"), CalibrationMark("b")),
@@ -83,12 +102,48 @@ def test_all_that_a_cloud_carries_comes_back(
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
     np.testing.assert_allclose(after.points_mm, before.points_mm, rtol=0, atol=LOSSLESS[suffix])
     assert str(after.seen_from_mm) == str(before.seen_from_mm)
+    was, found = before.calibration_errors, after.calibration_errors
+    assert (found is None) is (was is None)
+    if was is not None and found is not None:
+        np.testing.assert_allclose(found.turns, was.turns, rtol=0, atol=2e-9)
+        for name in ("middle", "half_width", "modes_mm", "arm_mm"):
+            np.testing.assert_allclose(getattr(found, name), getattr(was, name), rtol=5e-6)
     nine_digits = 5e-9 if suffix == ".csv" else 0.0
     for name in ("covariance_mm2", "sigma_noise_mm", "intensity", "normals", "noise_length"):
         was, found = getattr(before, name), getattr(after, name)
         assert (found is None) is (was is None)
         if was is not None:
             np.testing.assert_allclose(found, was, rtol=nine_digits, atol=0)
+
+
+def test_a_calibration_that_is_known_for_certain_has_no_errors(tmp_path: Path) -> None:
+    certain = calibration_errors(np.random.default_rng(1), 0)
+    write_cloud(tmp_path / "cloud.ply", replace(cloud(), calibration_errors=certain))
+    after = read_cloud(tmp_path / "cloud.ply").calibration_errors
+    assert after is not None
+    assert after.modes_mm.shape == certain.modes_mm.shape
+
+
+@pytest.mark.parametrize(
+    ("was", "now"),
+    [
+        (b"comment sensor_turn_rad 1 [", b"comment sensor_turn_rad 1 [[], "),
+        (b"comment arm_error_mm 0 [0", b"comment arm_error_mm 0 [-"),
+        (b"comment arm_error_mm 0 [0.0025]", b"comment arm_error_mm 0 [NaN]"),
+        (b"comment calibration_range 1", b"comment another_range 1"),
+        (b"comment calibration_error_mm 1", b"comment calibration_error_mn 1"),
+    ],
+)
+def test_damaged_errors_of_a_calibration_are_refused(
+    tmp_path: Path, was: bytes, now: bytes
+) -> None:
+    path = tmp_path / "cloud.ply"
+    write_cloud(path, cloud())
+    whole = path.read_bytes()
+    assert was in whole
+    path.write_bytes(whole.replace(was, now, 1))
+    with pytest.raises(ArmscanError):
+        read_cloud(path)
 
 
 @pytest.mark.parametrize("suffix", CLOUD_SUFFIXES)

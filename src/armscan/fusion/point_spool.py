@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from armscan.errors import InputError, OutputError
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.records.cloud import CloudFrame, PointCloud
+from armscan.records.cloud import CalibrationErrors, CloudFrame, PointCloud
 
 PIECE_POINTS = 100_000
 """Points of a piece, unless one instant has more: 25 MB with all that is made of them."""
@@ -86,6 +86,7 @@ class PointSpool:
     _normals: BinaryIO | None = None
     _has_noise_length: bool | None = None
     _seen_from_mm: FloatArray | None = None
+    _calibration_errors: CalibrationErrors | None = None
 
     def __post_init__(self) -> None:
         self._places, self._sigmas, self._rest = map(self._opened, COLUMNS)
@@ -182,9 +183,11 @@ class PointSpool:
         """Leave out all other exposures from now on; rising numbers, as appended."""
         self._kept = np.array(exposures, dtype=np.int64)
 
-    def look_from(self, seen_from_mm: FloatArray) -> None:
-        """Say where the sensor stood, (E, 3), at the exposures kept, in their order."""
-        self._seen_from_mm = seen_from_mm
+    def look_from(self, seen_from_mm: FloatArray, errors: CalibrationErrors | None = None) -> None:
+        """Say where the sensor stood, (E, 3), at the exposures kept, in their order, and what its
+        calibration may err by.
+        """
+        self._seen_from_mm, self._calibration_errors = seen_from_mm, errors
 
     def add_normals(self, normals: FloatArray) -> None:
         """Append normals (N, 3) of the next points kept, in the order of `places`.
@@ -209,6 +212,7 @@ class PointSpool:
             noise_length=np.zeros(0) if self._has_noise_length else None,
             normals=None if self._normals is None else np.zeros((0, 3)),
             seen_from_mm=self._seen_from_mm,
+            calibration_errors=self._calibration_errors,
         )
 
     def of_exposure(self, exposure: int) -> PointCloud:
@@ -218,6 +222,7 @@ class PointSpool:
             exposure_sources=(self._sources[exposure],),
             normals=None,
             seen_from_mm=None,
+            calibration_errors=None,
         )
         owners = np.zeros(self.count(exposure), dtype=np.int64)
         return self._piece(0, np.array([exposure]), owners, names).cloud
@@ -315,5 +320,6 @@ class PointSpool:
             normals=normals,
             noise_length=rest["noise_length"] if self._has_noise_length else None,
             seen_from_mm=names.seen_from_mm,
+            calibration_errors=names.calibration_errors,
         )
         return SpoolPiece(start, cloud, sigmas[:, 0], np.asarray(rest["pixel_px"]))

@@ -298,6 +298,7 @@ def follow_recipe(recipe: Recipe, cloud: PointCloud) -> FollowedRecipe | FitFail
 def placed_cloud(cloud: PointCloud, pose: Pose[Cad, Part]) -> PointCloud:
     """A cloud moved into the model's frame, covariances and directions turned with it."""
     seen_from = None if cloud.seen_from_mm is None else pose.apply(cloud.seen_from_mm)
+    errors = cloud.calibration_errors
     return replace(
         cloud,
         frame="Cad",
@@ -305,6 +306,7 @@ def placed_cloud(cloud: PointCloud, pose: Pose[Cad, Part]) -> PointCloud:
         covariance_mm2=pose.rotate_covariance(cloud.covariance_mm2),
         normals=None if cloud.normals is None else pose.rotate(cloud.normals),
         seen_from_mm=seen_from,
+        calibration_errors=None if errors is None else errors.turned(pose.rotation),
     )
 
 

@@ -39,6 +39,10 @@ LEAST_NOISE = 1e-4
 """Least variance of a point's own noise over that which exposures share: exact ones have none."""
 
 
+LEAST_SHARE = 1e-3
+"""Least part of what points share that exposures err each for itself, along any direction."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FitLinearised:
     """A least-squares fit about its optimum.
@@ -125,19 +129,23 @@ def _propagated_mm(fit: FitLinearised, cloud: PointCloud, rows: IntArray) -> flo
 
     The stripes' own noise is taken out of the covariances and counted point by point, each with the
     correlation length that neighbours along the stripe share; a cloud that does not tell it is
-    taken as independent from point to point. The rest shifts an exposure as a whole. No cloud
-    tells whether that is new in each exposure, in each visit (exposures that follow each other
-    without a gap), drifts from one to the next, or is one for all, and whether exposures turn
-    besides. Each of these ways and sizes counts by how likely it makes the residuals' sums over
-    exposures: the variance is the mean over them (Bayesian model averaging, Hoeting et al. 1999).
-    NaN for a single exposure: an error of the sensor stretches it, and a shift cannot tell.
+    taken as independent from point to point. What the calibration errs, alike in all exposures, is
+    carried to the length as it is, if the cloud tells it apart. The rest shifts an exposure as a
+    whole. No cloud tells whether that is new in each exposure, in each visit (exposures that
+    follow each other without a gap), drifts from one to the next, or is one for all, and whether
+    exposures turn besides. Each of these ways and sizes counts by how likely it makes the
+    residuals' sums over exposures: the variance is the mean over them (Bayesian model averaging,
+    Hoeting et al. 1999). NaN for a single exposure: an error of the sensor stretches it, and a
+    shift cannot tell.
     """
     if len(np.unique(cloud.exposure[rows])) < 2 or not cloud.covariance_mm2[rows].any():
         return math.nan
     errors = _ExposureErrors.of(fit, cloud, rows)
     influence = influence_along(fit)
     private = float(influence**2 @ errors.private_mm2)
-    return math.sqrt(max(private + _shared_mm2(fit, errors, influence), 0.0))
+    by_calibration = influence @ errors.common_mm
+    variance = private + float(by_calibration @ by_calibration)
+    return math.sqrt(max(variance + _shared_mm2(fit, errors, influence), 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +165,8 @@ class _ExposureErrors:
     moves
         (N, 6) change of each residual by a shift of its exposure, and by a turn about its middle
         that moves points by so much at their usual distance from it.
+    common_mm
+        (N, K) change of each residual by each of K errors of the calibration, one sigma.
     """
 
     exposure: IntArray
@@ -164,19 +174,24 @@ class _ExposureErrors:
     private_mm2: FloatArray
     root_mm: FloatArray
     moves: FloatArray
+    common_mm: FloatArray
 
     @staticmethod
     def of(fit: FitLinearised, cloud: PointCloud, rows: IntArray) -> _ExposureErrors:
         exposure, n = exposure_blocks(cloud.exposure[rows], MOST_EXPOSURES)
         count = np.bincount(exposure, minlength=n)
         covariance, axis, share = without_noise(cloud, rows)
+        total = _sums(exposure, n, covariance.reshape(-1, 9)).reshape(n, 3, 3)
+        by_calibration, common = _calibration_errors(cloud, rows, fit.directions)
+        mean = total - _sums(exposure, n, by_calibration.reshape(-1, 9)).reshape(n, 3, 3)
+        mean, total = (one / count[:, None, None] for one in (mean, total))
         noise = cloud.sigma_noise_mm[rows] ** 2
         if cloud.noise_length is not None:
             noise = noise * cloud.noise_length[rows]
         along = share * np.einsum("ni,ni->n", axis, fit.directions) ** 2 + 1.0 - share
-        mean = _sums(exposure, n, covariance.reshape(-1, 9)).reshape(n, 3, 3)
-        values, vectors = np.linalg.eigh(mean / count[:, None, None])
-        size = np.sqrt(np.maximum(values, 0.0))
+        values, vectors = np.linalg.eigh(mean)
+        least = LEAST_SHARE * np.trace(total, axis1=1, axis2=2)[:, None]
+        size = np.sqrt(np.maximum(values, least))
         points = cloud.points_mm[rows]
         lever = points - (_sums(exposure, n, points) / count[:, None])[exposure]
         usual = max(float(np.sqrt(np.mean(np.sum(lever**2, axis=1)))), 1e-9)
@@ -187,6 +202,7 @@ class _ExposureErrors:
             noise * along,
             np.asarray((vectors * size[:, None, :]) @ vectors.transpose(0, 2, 1)),
             np.concatenate([fit.directions, turns], axis=1),
+            common,
         )
 
     @property
@@ -199,12 +215,27 @@ class _ExposureErrors:
         """Numbers that neighbouring exposures of one visit are apart at most."""
         return 1.5 * max(1.0, float(np.diff(self.number).min()))
 
-    def correlations(self) -> list[FloatArray]:
-        """(n, n) of exposures' errors: new in each, in each visit, drifting at several paces."""
+    @property
+    def usual_mm(self) -> FloatArray:
+        """(n,) standard deviation of an exposure's shift along any axis, root mean square."""
+        return np.asarray(np.sqrt(np.einsum("nij,nij->n", self.root_mm, self.root_mm) / 3.0))
+
+    @property
+    def unit_mm(self) -> FloatArray:
+        """(n, 6, 6) motions of one standard deviation; points turn by as much as they shift."""
+        unit = np.zeros((len(self.root_mm), 6, 6))
+        unit[:, :3, :3] = self.root_mm
+        unit[:, [3, 4, 5], [3, 4, 5]] = self.usual_mm[:, None]
+        return unit
+
+    def ways(self) -> list[FloatArray]:
+        """(n, n) correlations of exposures' errors: new in each, in each visit, drifting at several
+        paces, and last one for all.
+        """
         n, visit = len(self.number), self.visit
         apart = np.abs(self.number[:, None] - self.number[None, :])
         same = (visit[:, None] == visit[None, :]).astype(np.float64)
-        return [np.eye(n), same, *(np.exp(-apart / pace) for pace in PACES)]
+        return [np.eye(n), same, *(np.exp(-apart / pace) for pace in PACES), np.ones((n, n))]
 
 
 def _shared_mm2(fit: FitLinearised, errors: _ExposureErrors, influence: FloatArray) -> float:
@@ -213,70 +244,58 @@ def _shared_mm2(fit: FitLinearised, errors: _ExposureErrors, influence: FloatArr
     pulls = _sums(errors.exposure, n, influence[:, None] * errors.moves)
     shifts = np.einsum("nij,nj->ni", errors.root_mm, pulls[:, :3])
     scores = _Scores.of(fit, errors)
-    ways = errors.correlations()
-    shifted = [float(np.einsum("ni,nm,mi->", shifts, way, shifts)) for way in ways]
-    alike = float(np.sum(shifts.sum(axis=0) ** 2))
-    grouped = [scores.grouped(way) for way in ways]
-    sizes = _sizes(len(ways))
-    common = np.maximum(1.0 - sizes.sum(axis=1), 0.0)
-    is_shift = np.arange(scores.residual.size) % 6 < 3
-    y, noise, by = scores.whitened(is_shift)
-    terms = np.stack(
-        [*(_spread(by, one) for one in grouped), _spread(by, np.ones_like(grouped[0]))]
-    )
-    mixed = np.column_stack([sizes, common])
+    ways = errors.ways()
+    sizes = _sizes(len(ways) - 1)
+    mixed = np.column_stack([sizes, np.maximum(1.0 - sizes.sum(axis=1), 0.0)])
+    y, noise, by = scores.whitened(np.arange(6) < 3)
+    terms = np.stack([_spread(by, way) for way in ways])
     prior = _log_prior(sizes.sum(axis=1), 1.0)
     chance = _log_likelihood(y, noise + np.tensordot(mixed, terms, axes=1)) + prior
-    variance = float(_weights(chance) @ (mixed @ np.array([*shifted, alike])))
-    best = np.tensordot(
-        mixed[int(np.argmax(chance))], np.stack([*grouped, np.ones_like(grouped[0])]), 1
+    variance = _weights(chance) @ (
+        mixed @ [_spread(shifts.reshape(1, -1), way)[0, 0] for way in ways]
     )
-    return variance + _turned_mm2(errors, scores, pulls[:, 3:], (ways, best))
+    best = np.tensordot(mixed[int(np.argmax(chance))], np.stack(ways), 1)
+    return float(variance) + _turned_mm2(errors, scores, pulls[:, 3:], best)
 
 
 def _turned_mm2(
-    errors: _ExposureErrors,
-    scores: _Scores,
-    pulls: FloatArray,
-    shifts: tuple[list[FloatArray], FloatArray],
+    errors: _ExposureErrors, scores: _Scores, pulls: FloatArray, shifts: FloatArray
 ) -> float:
-    """The same by turns of exposures, beside the likeliest way of their shifts."""
-    ways, best = shifts
-    size = np.sqrt(np.einsum("nij,nij->n", errors.root_mm, errors.root_mm) / 3.0)
-    turned = pulls * size[:, None]
-    y, noise, by = scores.whitened(np.ones(scores.residual.size, dtype=np.bool_))
-    is_shift = np.arange(scores.residual.size) % 6 < 3
-    base = noise + _spread(by[:, is_shift], best)
-    spread = [_spread(by[:, ~is_shift], scores.grouped(way)) for way in ways[:2]]
+    """The same by turns of exposures, beside shifts of the likeliest covariance (n, n)."""
+    turned = (pulls * errors.usual_mm[:, None]).reshape(1, -1)
+    y, noise, by = scores.whitened(np.ones(6, dtype=np.bool_))
+    is_shift = np.arange(by.shape[1]) % 6 < 3
+    base = noise + _spread(by[:, is_shift], shifts)
+    ways = errors.ways()[:2]
+    spread = [_spread(by[:, ~is_shift], way) for way in ways]
     covariances = np.concatenate([base + TURN_SIZES[:, None, None] * one for one in spread])
-    found = [float(np.einsum("ni,nm,mi->", turned, way, turned)) for way in ways[:2]]
-    variances = np.concatenate([TURN_SIZES * one for one in found])
+    variances = np.concatenate([TURN_SIZES * _spread(turned, way)[0, 0] for way in ways])
     prior = np.tile(_log_prior(TURN_SIZES, -0.5), 2)
     return float(_weights(_log_likelihood(y, covariances) + prior) @ variances)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scores:
-    """Residuals summed by what exposures' motions change them, over G groups of neighbours.
+    """Residuals summed by what motions of exposures change them, over G groups of neighbours.
+
+    What exposures of one group err differently is in the sums, too: taken as one, shifts that
+    differ would look like turns.
 
     Parameters
     ----------
-    share
-        (G, n) of a group's points in each exposure.
-    root_mm
-        (G, 3, 3) root of the covariance of a group's shift.
     residual
-        (6 G,) sums; six motions a group.
-    by_motion
-        (6 G, 6 G) their derivative by the motions, the fit's answer in it.
+        (G, 6) sums, one a motion.
+    by_group
+        (G, 6, G, 6) their derivative by motions of groups as a whole, the fit's answer in it.
+    by_exposure
+        (G, 6, n, 6) the same by motions of exposures, of one standard deviation each.
     noise_mm2
-        (6 G, 6 G) their covariance by the points' own noise.
+        (G, 6, G, 6) their covariance by the points' own noise, and by the calibration's errors.
     """
 
-    share: FloatArray
-    root_mm: FloatArray
     residual: FloatArray
-    by_motion: FloatArray
+    by_group: FloatArray
+    by_exposure: FloatArray
     noise_mm2: FloatArray
 
     @staticmethod
@@ -284,57 +303,57 @@ class _Scores:
         n = len(errors.number)
         n_groups = min(n, GROUPS)
         rank = np.arange(n) * n_groups // n
-        group = rank[errors.exposure]
-        share = np.zeros((n_groups, n))
-        share[rank, np.arange(n)] = np.bincount(errors.exposure, minlength=n)
-        share /= share.sum(axis=1, keepdims=True)
+        first = np.searchsorted(rank, np.arange(n_groups))
         jacobian, moves = fit.jacobian, errors.moves
+        inverse = np.linalg.inv(jacobian.T @ jacobian)
         least = LEAST_NOISE * float(np.mean(errors.root_mm**2))
         noise = errors.private_mm2 + least
-        inverse = np.linalg.inv(jacobian.T @ jacobian)
-        by_fit, noisy = (
-            np.stack(
-                [
-                    _sums(group, n_groups, moves * (column * weight)[:, None]).ravel()
-                    for column in jacobian.T
-                ],
-                axis=1,
-            )
-            for weight in (np.ones(len(noise)), noise)
-        )
-        taken = by_fit @ inverse
-        both = taken @ noisy.T
-        within = jacobian.T @ (jacobian * noise[:, None])
-        return _Scores(
-            share,
-            np.einsum("gn,nij->gij", share, errors.root_mm),
-            _sums(group, n_groups, moves * fit.residuals_mm[:, None]).ravel(),
-            _products(group, n_groups, moves, np.ones(len(noise))) - taken @ by_fit.T,
-            _products(group, n_groups, moves, noise) - both - both.T + taken @ within @ taken.T,
-        )
 
-    def grouped(self, way: FloatArray) -> FloatArray:
-        """(G, G) correlations of groups' mean errors, of those (n, n) of exposures."""
-        return np.asarray(self.share @ way @ self.share.T)
+        def summed(values: FloatArray, weight: FloatArray) -> FloatArray:
+            """(G, 6, K) of values (N, K), by motion."""
+            each = _outer_sums(errors.exposure, n, moves * weight[:, None], values)
+            return np.asarray(np.add.reduceat(each, first))
+
+        own = _outer_sums(errors.exposure, n, moves, moves)
+        by_fit = _outer_sums(errors.exposure, n, moves, jacobian)
+        taken = np.add.reduceat(by_fit, first) @ inverse
+        by_exposure = -np.einsum("gip,njp->ginj", taken, by_fit)
+        by_exposure[rank, :, np.arange(n)] += own
+        noisy = summed(jacobian, noise)
+        both = np.einsum("gip,hjp->gihj", taken, noisy)
+        within = jacobian.T @ (jacobian * noise[:, None])
+        private = np.einsum("gip,pq,hjq->gihj", taken, within, taken)
+        private -= both + both.transpose(2, 3, 0, 1)
+        each = np.arange(n_groups)
+        private[each, :, each] += summed(moves, noise)
+        common = errors.common_mm
+        known = summed(common, np.ones(len(common))) - taken @ (jacobian.T @ common)
+        residual = summed(fit.residuals_mm[:, None], np.ones(len(noise)))[:, :, 0]
+        return _Scores(
+            residual,
+            np.add.reduceat(by_exposure, first, axis=2),
+            np.einsum("ginj,njk->gink", by_exposure, errors.unit_mm),
+            private + np.einsum("gik,hjk->gihj", known, known),
+        )
 
     def whitened(self, chosen: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Some of the sums as (D,) numbers of about equal noise; that (D, D); by motions (D, C).
+        """Sums by some of the six motions as (D,) numbers of about equal noise; that (D, D); by
+        the same motions of exposures (D, n C), in units of their standard deviations.
 
-        Sums that the fit takes up are left out; motions are in units of their standard deviations.
+        Sums that the fit takes up are left out.
         """
-        both = np.ix_(chosen, chosen)
-        values, vectors = np.linalg.eigh(self.by_motion[both])
+        rows = self.residual[:, chosen].size
+        square = (slice(None), chosen, slice(None))
+        by_group = self.by_group[square][..., chosen].reshape(rows, rows)
+        values, vectors = np.linalg.eigh(by_group)
         is_seen = values > 1e-6 * values[-1]
         size, vectors = np.sqrt(values[is_seen]), vectors[:, is_seen]
-        unit = np.zeros((len(self.root_mm), 6, len(self.root_mm), 6))
-        for k, root in enumerate(self.root_mm):
-            unit[k, :3, k, :3] = root
-            unit[k, 3:, k, 3:] = np.eye(3) * np.sqrt(np.sum(root**2) / 3.0)
-        flat = unit.reshape(len(chosen), -1)[both]
+        noise = self.noise_mm2[square][..., chosen].reshape(rows, rows)
+        by = self.by_exposure[square][..., chosen].reshape(rows, -1)
         return (
-            (vectors.T @ self.residual[chosen]) / size,
-            (vectors.T @ self.noise_mm2[both] @ vectors) / np.outer(size, size),
-            size[:, None] * (vectors.T @ flat),
+            (vectors.T @ self.residual[:, chosen].ravel()) / size,
+            (vectors.T @ noise @ vectors) / np.outer(size, size),
+            (vectors.T @ by) / size[:, None],
         )
 
 
@@ -343,22 +362,19 @@ def _sums(block: IntArray, n: int, values: FloatArray) -> FloatArray:
     return np.stack([np.bincount(block, one, n) for one in values.T], axis=1)
 
 
-def _products(block: IntArray, n: int, values: FloatArray, weights: FloatArray) -> FloatArray:
-    """(n K, n K) sums of products of values (N, K), blocks along the diagonal."""
-    k = values.shape[1]
-    found = np.zeros((n, k, n, k))
-    each = np.arange(n)
-    for i in range(k):
-        for j in range(k):
-            found[each, i, each, j] = np.bincount(block, values[:, i] * values[:, j] * weights, n)
-    return found.reshape(n * k, n * k)
+def _outer_sums(block: IntArray, n: int, left: FloatArray, right: FloatArray) -> FloatArray:
+    """(n, J, K) sums over blocks of products of values (N, J) and (N, K)."""
+    found = np.zeros((n, left.shape[1], right.shape[1]))
+    for k, one in enumerate(right.T):
+        found[:, :, k] = _sums(block, n, left * one[:, None])
+    return found
 
 
 def _spread(by_motions: FloatArray, correlation: FloatArray) -> FloatArray:
-    """(D, D) covariance by motions (D, 3 G) whose errors are correlated by (G, G)."""
+    """(D, D) covariance by motions (D, 3 n) of exposures whose errors are correlated by (n, n)."""
     d, n = len(by_motions), len(correlation)
-    mixed = np.einsum("dgi,gh->dhi", by_motions.reshape(d, n, 3), correlation)
-    return np.asarray(mixed.reshape(d, -1) @ by_motions.T)
+    along = by_motions.reshape(d, n, 3).transpose(0, 2, 1).reshape(3 * d, n)
+    return np.asarray((along @ correlation).reshape(d, -1) @ along.reshape(d, -1).T)
 
 
 def _sizes(n_ways: int) -> FloatArray:
@@ -394,6 +410,27 @@ def _weights(chance: FloatArray) -> FloatArray:
     """Of logarithms (K,), to a sum of 1."""
     found = np.exp(chance - chance.max())
     return np.asarray(found / found.sum())
+
+
+def _calibration_errors(
+    cloud: PointCloud, rows: IntArray, directions: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariance (N, 3, 3) of points by the calibration alone, and moves (N, K + 3) along
+    directions by it and by what the arm errs alike at all postures.
+
+    Both are zero of a cloud that does not tell.
+    """
+    errors, seen_from = cloud.calibration_errors, cloud.seen_from_mm
+    covariance = np.zeros((len(rows), 3, 3))
+    if errors is None or seen_from is None:
+        return covariance, np.zeros((len(rows), 0))
+    exposure = cloud.exposure[rows]
+    along = [errors.arm_mm * np.einsum("ni,nik->nk", directions, errors.turns[exposure])]
+    places = cloud.points_mm[rows], seen_from[exposure]
+    for move in errors.moves_mm(*places, exposure, cloud.sheet[rows]):
+        covariance += move[:, :, None] * move[:, None, :]
+        along.append(np.einsum("ni,ni->n", move, directions)[:, None])
+    return covariance, np.concatenate(along, axis=1)
 
 
 def without_noise(cloud: PointCloud, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:

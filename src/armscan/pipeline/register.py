@@ -299,7 +299,7 @@ def carry_cloud(
     points = cloud.points_mm @ a_from_b.rotation.T + a_from_b.translation_mm
     own = cloud.covariance_mm2
     is_known = bool(np.any(own))
-    seen = cloud.seen_from_mm
+    seen, errors = cloud.seen_from_mm, cloud.calibration_errors
     return replace(
         cloud,
         frame=frame,
@@ -309,6 +309,7 @@ def carry_cloud(
         ),
         normals=None if cloud.normals is None else cloud.normals @ a_from_b.rotation.T,
         seen_from_mm=None if seen is None else seen @ a_from_b.rotation.T + a_from_b.translation_mm,
+        calibration_errors=None if errors is None else errors.turned(a_from_b.rotation),
     )
 
 

@@ -41,6 +41,7 @@ from armscan.reconstruction.place import (
     BaseTransform,
     cut_cloud,
     delivered_points,
+    errors_of_calibration,
     merge_clouds,
     propagate_to_base,
 )
@@ -543,10 +544,11 @@ def _add_normals(
     progress: Progress,
 ) -> tuple[str, ...]:
     """Give the points normals towards the sensor of each exposure; what is weak about these."""
-    eye = transform.scanner.hand_eye.tool_from_sensor.translation_mm
+    hand_eye = transform.scanner.hand_eye.tool_from_sensor
     rows = list(pose_rows)
-    cameras = poses.rotations[rows] @ eye + poses.translations_mm[rows]
-    points.look_from(cameras)
+    cameras = poses.rotations[rows] @ hand_eye.translation_mm + poses.translations_mm[rows]
+    turns = poses.rotations[rows] @ hand_eye.rotation
+    points.look_from(cameras, errors_of_calibration(transform.scanner, turns))
     radius_mm = choose_scan_radius_mm(points)
     n_done = n_without = 0
     n_threads = count_cores()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,16 +19,29 @@ from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.shapes import fit_plane
 from armscan.kernels.faces import sort_into_bins, tangent_normals
 from armscan.kernels.placing import carry_stripe, propagate_points
-from armscan.models.calibration import ArmNoise, ScannerCalibration, SensorCalibration
+from armscan.models.calibration import (
+    ArmNoise,
+    HandEyeCalibration,
+    ScannerCalibration,
+    SensorCalibration,
+)
 from armscan.reconstruction.triangulate import (
+    CALIBRATED_DEPTHS,
     StripePoints,
+    differentiated,
+    intersect_sheets,
     lens_numbers,
     sensor_columns,
     sheet_numbers,
     sheet_rows,
     stripe_cloud,
 )
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import (
+    FIELD_POWERS,
+    CalibrationErrors,
+    PointCloud,
+    direction_powers,
+)
 from armscan.records.profile import PointProfile, Profile
 
 DELIVERED = "profile"
@@ -132,6 +146,95 @@ class BaseTransform:
         """Names of the light sheets."""
         sensor = self.scanner.sensor
         return (DELIVERED,) if sensor is None else tuple(one.name for one in sensor.sheets)
+
+
+FIELD_GRID = 40
+"""Pixels a side at which a calibration's errors are looked at, of the whole image."""
+LEAST_MODE = 0.003
+"""Part of the errors' variance that may be left out."""
+
+
+def errors_of_calibration(
+    scanner: ScannerCalibration, turns: FloatArray
+) -> CalibrationErrors | None:
+    """What the calibration of a scanner with one camera may move points of a scan by.
+
+    The joint covariance of camera, sheets and hand-eye is carried to points all over the sheets;
+    the largest independent errors there are kept as polynomials. None for other scanners.
+
+    Parameters
+    ----------
+    scanner
+        The calibration.
+    turns
+        (E, 3, 3) rotation of Sensor into Base at each exposure.
+    """
+    sensor = scanner.sensor
+    if sensor is None or sensor.second is not None:
+        return None
+    factor = square_root(scanner.covariance, "the scanner's covariance")
+    if not factor.shape[1]:  # a calibration that is known for certain
+        factor = np.zeros((len(factor), 1))
+    camera = sensor.camera.camera
+    grid = np.meshgrid(
+        np.linspace(0.0, camera.width_px - 1.0, FIELD_GRID),
+        np.linspace(0.0, camera.height_px - 1.0, FIELD_GRID),
+    )
+    pixels = np.stack([axis.ravel() for axis in grid], axis=1)
+    hand_eye = scanner.hand_eye.tool_from_sensor
+    own = [_moves_of_sheet(sensor, k, pixels, hand_eye, factor) for k in range(len(sensor.sheets))]
+    if any(len(seen) < len(FIELD_POWERS) for seen, _ in own):
+        return None
+    moves = np.concatenate([move.reshape(-1, move.shape[2]) for _, move in own])
+    values, vectors = np.linalg.eigh(moves.T @ moves)
+    left = np.cumsum(np.maximum(values, 0.0))
+    kept = vectors[:, left > LEAST_MODE * left[-1]]
+    n_kept = kept.shape[1]
+    middle, half, modes = [], [], []
+    for seen, move in own:
+        direction = seen[:, :2] / seen[:, 2:]
+        low, high = direction.min(axis=0), direction.max(axis=0)
+        middle.append((low + high) / 2.0)
+        half.append(np.maximum((high - low) / 2.0, 1e-9))
+        powers = direction_powers(seen, middle[-1], half[-1])
+        found = np.linalg.lstsq(powers, (move @ kept).reshape(len(seen), 3 * n_kept), rcond=1e-9)[0]
+        modes.append(found.reshape(powers.shape[1], 3, n_kept))
+    return CalibrationErrors(
+        turns=turns,
+        middle=np.array(middle),
+        half_width=np.array(half),
+        modes_mm=np.array(modes),
+        arm_mm=_of_postures_mm(scanner.hand_eye, np.concatenate([seen for seen, _ in own])),
+    )
+
+
+def _of_postures_mm(hand_eye: HandEyeCalibration, seen_mm: FloatArray) -> float:
+    """What postures of the calibration scattered by, along an axis, in the middle of points (M, 3).
+
+    It is a shift, and two thirds of the square of what a turn about the tool's origin moves: a turn
+    about any axis moves a point along two.
+    """
+    noise, middle = hand_eye.arm_noise, seen_mm.mean(axis=0)[None]
+    lever = float(np.linalg.norm(hand_eye.tool_from_sensor.apply(middle)))
+    return math.hypot(noise.position_mm, math.sqrt(2.0 / 3.0) * noise.tool_rotation_rad * lever)
+
+
+def _moves_of_sheet(
+    sensor: SensorCalibration,
+    sheet: int,
+    pixels: FloatArray,
+    hand_eye: Pose[Tool, Sensor],
+    factor: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Points (M, 3) of a sheet in Sensor, and their moves (M, 3, K) by columns of the factor."""
+    number = np.full(len(pixels), sheet, dtype=np.int64)
+    points, is_met = intersect_sheets(pixels, number, sensor)
+    points = points[is_met & CALIBRATED_DEPTHS.holds(points, number, sensor)]
+    lens, sheets = lens_numbers(sensor), sheet_numbers(sensor)
+    by_sensor = differentiated(points, np.full(len(points), sheet), lens, sheets)[1]
+    by_hand_eye = hand_eye.rotation.T @ hand_eye.jacobian(points)
+    columns = np.r_[sensor_columns(sensor, sheet), np.arange(-6, 0)]
+    return points, np.concatenate([by_sensor, by_hand_eye], axis=2) @ factor[columns]
 
 
 def propagate_to_base(

@@ -3,13 +3,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal, Self
 
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats, ints
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    floats,
+    ints,
+)
 
 CloudFrame = Literal["Sensor", "Base", "Part", "Cad"]
 
@@ -34,6 +42,84 @@ class CalibrationMark:
 
     document_id: str
     created_utc: str = ""
+
+
+FIELD_DEGREE = 4
+"""Of the polynomials of `CalibrationErrors`: they follow a head's errors to 2 % of the variance."""
+FIELD_POWERS = tuple(
+    (i, total - i) for total in range(FIELD_DEGREE + 1) for i in range(total, -1, -1)
+)
+FIELD_REACH = 1.1
+"""Half widths from the middle up to which a polynomial is taken; beyond, its value there."""
+
+
+class CalibrationErrors(ArrayRecord):
+    """What a calibration may err by: independent errors that move all points of a scan at once.
+
+    Seen from the sensor, a point on a light sheet is told by the direction (x/z, y/z) in which it
+    lies; it moves by a polynomial of that direction, and the sensor's turn carries the move along.
+
+    Parameters
+    ----------
+    turns
+        (E, 3, 3) rotation of the Sensor frame into the cloud's at each exposure.
+    middle, half_width
+        (S, 2) of the directions of each sheet.
+    modes_mm
+        (S, T, 3, K) move in Sensor by one standard deviation of each of K errors, as factors of the
+        T products of powers `FIELD_POWERS` of the direction less its middle over the half width.
+    arm_mm
+        One standard deviation, along each axis of Sensor, of what the arm errs alike at the
+        postures of a scan. A wrist errs by its angles, which the head carries along: at the
+        calibration's postures the hand-eye took it up, at others it is new.
+    """
+
+    turns: FloatArray = floats("E", 3, 3)
+    middle: FloatArray = floats("S", 2)
+    half_width: FloatArray = floats("S", 2)
+    modes_mm: FloatArray = floats("S", len(FIELD_POWERS), 3, "K")
+    arm_mm: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 <= self.arm_mm < np.inf or not (self.half_width > 0.0).all():
+            raise InputError("errors of a calibration have sizes of 0 or more, and a range above 0")
+
+    def turned(self, rotation: FloatArray) -> Self:
+        """The same in a frame into which ``rotation`` (3, 3) leads."""
+        return replace(self, turns=rotation @ self.turns)
+
+    def moves_mm(
+        self, points_mm: FloatArray, seen_from_mm: FloatArray, exposure: IntArray, sheet: IntArray
+    ) -> Iterator[FloatArray]:
+        """(N, 3) moves of points by each error, in the cloud's frame, one error after the other.
+
+        Parameters
+        ----------
+        points_mm, seen_from_mm
+            (N, 3) points, and where the sensor stood at each.
+        exposure, sheet
+            (N,) of each point.
+        """
+        turn = self.turns[exposure]
+        seen = np.einsum("nji,nj->ni", turn, points_mm - seen_from_mm)
+        powers = direction_powers(seen, self.middle[sheet], self.half_width[sheet])
+        for mode in np.moveaxis(self.modes_mm, 3, 0):
+            move = np.zeros((len(seen), 3))
+            for k in range(len(mode)):
+                of_sheet = sheet == k
+                move[of_sheet] = powers[of_sheet] @ mode[k]
+            yield np.einsum("nij,nj->ni", turn, move)
+
+
+def direction_powers(seen_mm: FloatArray, middle: FloatArray, half_width: FloatArray) -> FloatArray:
+    """(N, T) products of powers of the directions of points (N, 3) in Sensor.
+
+    ``middle`` and ``half_width`` are (2,) or (N, 2).
+    """
+    away = np.where(seen_mm[:, 2:] > 0.0, seen_mm[:, 2:], 1.0)
+    u, v = np.clip((seen_mm[:, :2] / away - middle) / half_width, -FIELD_REACH, FIELD_REACH).T
+    return np.stack([u**i * v**j for i, j in FIELD_POWERS], axis=1)
 
 
 class PointCloud(RowRecord):
@@ -74,6 +160,8 @@ class PointCloud(RowRecord):
         over a stripe has the variance of independent points times this. None where it is not known.
     seen_from_mm
         (E, 3) where the sensor stood at each exposure, in the cloud's frame; None where unknown.
+    calibration_errors
+        What of the covariance all points share, as the calibration may err; None where unknown.
     is_simulated
         True if the points were measured on rendered images.
     forced
@@ -96,6 +184,7 @@ class PointCloud(RowRecord):
     normals: FloatArray | None = floats("N", 3, default=None)
     noise_length: FloatArray | None = floats("N", default=None)
     seen_from_mm: FloatArray | None = floats(None, 3, default=None)
+    calibration_errors: CalibrationErrors | None = None
     is_simulated: bool = False
     forced: tuple[str, ...] = ()
     calibrations: tuple[CalibrationMark, ...] = ()
@@ -112,6 +201,16 @@ class PointCloud(RowRecord):
         if self.seen_from_mm is not None and len(self.seen_from_mm) != len(self.exposure_sources):
             raise InputError(
                 f"{len(self.seen_from_mm)} places for {len(self.exposure_sources)} exposures"
+            )
+        common = self.calibration_errors
+        if common is not None and (len(common.turns), len(common.middle)) != (
+            len(self.exposure_sources),
+            len(self.sheet_names),
+        ):
+            raise InputError(
+                f"the calibration's errors are of {len(common.turns)} exposures and "
+                f"{len(common.middle)} sheets, not of {len(self.exposure_sources)} and "
+                f"{len(self.sheet_names)}"
             )
 
     @property

@@ -11,13 +11,15 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.features import fit_shape
 from armscan.geometry.shapes import Plane, fit_sphere
+from armscan.inspection.features import Fitted, together
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import MeasuredLength
 from armscan.inspection.sphere import inspect_sphere, linearised_sphere
 from armscan.inspection.step import inspect_step
 from armscan.inspection.uncertainty import measured_length
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import FIELD_POWERS, CalibrationErrors, PointCloud
 from armscan.vision.stripe.smooth import Polyline, smooth
 from rigs.inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
 
@@ -198,6 +200,83 @@ def test_too_few_exposures_say_nothing_of_their_scatter() -> None:
     assert not isinstance(found, FitFailure)
     assert math.isnan(found.diameter.sigma_scatter_mm)
     assert math.isfinite(found.diameter.sigma_mm)
+
+
+def seen_by_a_sensor(seed: int, *, is_told: bool) -> MeasuredLength:
+    """A ball whose 16 exposures look straight at it, by a calibration that sees too near or far."""
+    rng = np.random.default_rng(seed)
+    outward, exposure = ball_stripes(16, 30), np.repeat(np.arange(16), 30)
+    towards = np.array([outward[exposure == k].mean(axis=0) for k in range(16)])
+    towards /= np.linalg.norm(towards, axis=1)[:, None]
+    too_far = 2.0 * ARM_MM * rng.standard_normal()
+    points = RADIUS_MM * outward + rng.normal(0.0, ARM_MM / 4.0, (16, 3))[exposure]
+    points -= too_far * towards[exposure]
+    cloud = cloud_of(points, exposure, sigma_mm=ARM_MM / 4.0, noise_mm=NOISE_MM / 4.0)
+    by_calibration = 2.0 * ARM_MM * towards[exposure]
+    across = np.cross(towards, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    turns = np.stack([np.cross(across, -towards), across, -towards], axis=2)
+    modes = np.zeros((1, len(FIELD_POWERS), 3, 1))
+    modes[0, 0, 2] = 2.0 * ARM_MM
+    errors = CalibrationErrors(
+        turns=turns, middle=np.zeros((1, 2)), half_width=np.ones((1, 2)), modes_mm=modes, arm_mm=0.0
+    )
+    cloud = replace(
+        cloud,
+        covariance_mm2=cloud.covariance_mm2 + by_calibration[:, :, None] * by_calibration[:, None],
+        seen_from_mm=150.0 * towards,
+        calibration_errors=errors if is_told else None,
+    )
+    ball = inspect_sphere(cloud, 2 * RADIUS_MM)
+    assert not isinstance(ball, FitFailure)
+    return ball.diameter
+
+
+def test_a_calibration_that_sees_too_near_makes_a_ball_too_large() -> None:
+    """It errs alike in all exposures, and each looks elsewhere: no two of them disagree.
+
+    Taken for errors of exposures, as of a cloud that does not tell, sigma is half as large.
+    """
+    found = [seen_by_a_sensor(seed, is_told=True) for seed in range(N_RUNS)]
+    scatter = float(np.std([one.value_mm for one in found], ddof=1))
+    stated = float(np.sqrt(np.mean([one.sigma_mm**2 for one in found])))
+    assert 1.0 / SPREAD_LIMIT < scatter / stated < SPREAD_LIMIT
+    assert seen_by_a_sensor(0, is_told=False).sigma_mm < 0.6 * stated
+
+
+def test_many_exposures_that_err_each_for_itself_do_not_look_as_if_they_turned() -> None:
+    """60 exposures, every other one of another ball: the distance is known as 30 of each tell it.
+
+    Neighbours taken together as one motion would seem to turn, and sigma be twice too large.
+    """
+    outward, exposure = ball_stripes(30, 16), np.repeat(np.arange(30), 16)
+    apart = np.array([40.0, 0.0, 0.0])
+    clean = np.concatenate([RADIUS_MM * outward, RADIUS_MM * outward + apart])
+    number = np.concatenate([2 * exposure, 2 * exposure + 1])
+    along = np.concatenate([outward, outward])
+    half = len(outward)
+    found = []
+    for seed in range(N_RUNS):
+        rng = np.random.default_rng(seed)
+        points = clean + rng.normal(0.0, ARM_MM, (60, 3))[number]
+        points += along * rng.normal(0.0, NOISE_MM / 4.0, (len(points), 1))
+        cloud = cloud_of(
+            points, number, sigma_mm=ARM_MM, noise_mm=NOISE_MM / 4.0, noise_along=along
+        )
+        fits = []
+        for rows in (np.arange(half), np.arange(half, 2 * half)):
+            one = fit_shape("sphere", points[rows])
+            assert not isinstance(one, FitFailure)
+            fits.append(Fitted(one.value, cloud, rows))
+        found.append(
+            together(
+                (fits[0], fits[1]),
+                lambda two: float(np.linalg.norm(two[1].point_mm - two[0].point_mm)),
+            )
+        )
+    scatter = float(np.std([one.value_mm for one in found], ddof=1))
+    stated = float(np.sqrt(np.mean([one.sigma_mm**2 for one in found])))
+    assert 1.0 / SPREAD_LIMIT < scatter / stated < SPREAD_LIMIT
 
 
 def smoothed_stripe(

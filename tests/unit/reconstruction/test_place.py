@@ -15,10 +15,12 @@ from armscan.geometry.rotations import rotation_from_vector, skew
 from armscan.kernels.placing import propagate_points
 from armscan.models.calibration import ArmNoise
 from armscan.models.camera import CameraModel
+from armscan.reconstruction import place
 from armscan.reconstruction.place import (
     BaseTransform,
     arm_covariance,
     delivered_points,
+    errors_of_calibration,
     place_with_jacobian,
     propagate_to_base,
 )
@@ -64,8 +66,11 @@ def test_derivatives_by_point_and_hand_eye() -> None:
         )
 
 
-def covariance_by_differences() -> FloatArray:
-    """(3, 3, 3) from the definition: sensor errors move the points AND, coupled, the hand-eye."""
+def moves_by_differences() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(3, 3, K), (3, 3, 6), (3, 3) of three points by sensor, hand-eye and noise, as defined.
+
+    Sensor errors move the points AND, coupled, the hand-eye.
+    """
     scanner = rig.scanner()
     assert scanner.sensor is not None
     camera, pair = thesis_rig().camera, rig.sheets()
@@ -89,6 +94,15 @@ def covariance_by_differences() -> FloatArray:
     )
     step_px = 1e-3 * np.array([0.6, 0.8])
     noise = rig.SIGMA_PX * (at(none, still, step_px) - at(none, still, -step_px)) / 2e-3
+    return by_sensor, by_hand_eye, noise
+
+
+def covariance_by_differences() -> FloatArray:
+    """(3, 3, 3) of the same points."""
+    by_sensor, by_hand_eye, noise = moves_by_differences()
+    scanner = rig.scanner()
+    assert scanner.sensor is not None
+    joint = scanner.sensor.covariance
     own = by_hand_eye @ scanner.hand_eye.covariance @ by_hand_eye.transpose(0, 2, 1)
     follow = by_sensor @ joint @ by_sensor.transpose(0, 2, 1)
     return np.asarray(own + follow + noise[:, :, None] * noise[:, None, :])
@@ -126,6 +140,34 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
     )
     assert cloud.frame == "Base"
     assert cloud.sheet.tolist() == SHEET_OF.tolist()
+
+
+@pytest.mark.parametrize(("left_out", "atol"), [(1e-9, 0.02), (place.LEAST_MODE, 0.03)])
+def test_what_a_calibration_errs_is_alike_in_points_of_two_sheets(
+    left_out: float, atol: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Covariances of each point and between points, of the polynomials and by differences.
+
+    Each sheet with errors of its own would leave the camera's and the hand-eye's out between them.
+    """
+    monkeypatch.setattr(place, "LEAST_MODE", left_out)
+    scanner = rig.scanner()
+    assert scanner.sensor is not None
+    by_sensor, by_hand_eye, _ = moves_by_differences()
+    root = np.linalg.cholesky(scanner.hand_eye.covariance)
+    sensor_root = np.linalg.cholesky(scanner.sensor.covariance)
+    expected = np.concatenate([by_hand_eye @ root, by_sensor @ sensor_root], axis=2).reshape(9, -1)
+    pose = rig.BASE_FROM_TOOL @ rig.TOOL_FROM_SENSOR
+    errors = errors_of_calibration(scanner, pose.rotation[None])
+    assert errors is not None
+    points = intersect_sheets(PLACES_PX, SHEET_OF, scanner.sensor, pose)[0]
+    eye = np.tile(pose.translation_mm, (3, 1))
+    moves = errors.moves_mm(points, eye, np.zeros(3, dtype=np.int64), SHEET_OF)
+    found = np.stack([move.ravel() for move in moves], axis=1)
+    size = np.sqrt(np.diag(expected @ expected.T))
+    both = np.outer(size, size)
+    # polynomials follow the errors to 2 %, and 0.3 % of their variance is left out: at a point more
+    np.testing.assert_allclose(found @ found.T / both, expected @ expected.T / both, atol=atol)
 
 
 def test_covariance_is_that_of_repeats() -> None:

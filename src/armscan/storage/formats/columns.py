@@ -15,10 +15,17 @@ from typing import Any, NoReturn, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.records.cloud import CalibrationMark, CloudFrame, PointCloud
+from armscan.records.cloud import (
+    FIELD_POWERS,
+    CalibrationErrors,
+    CalibrationMark,
+    CloudFrame,
+    PointCloud,
+)
 from armscan.storage.files import path_text, told_of
 from armscan.storage.tables import refuse_beyond_reach
 
@@ -48,13 +55,21 @@ CALIBRATION = "calibration"
 """Note of the calibration that points were measured with: its document's id and its time."""
 SEEN_FROM = "seen_from_mm"
 """Note of where the sensor stood at an exposure."""
+SENSOR_TURN = "sensor_turn_rad"
+"""Note of how the sensor was turned at an exposure, as a rotation vector."""
+SEEN_RANGE = "calibration_range"
+"""Note of middle and half width of the directions of a sheet, of `CalibrationErrors`."""
+ARM_ERROR = "arm_error_mm"
+"""Note of what the arm errs alike at all postures of a scan."""
+ERROR_MODES = "calibration_error_mm"
+"""Note of a sheet's moves by the calibration's errors, of one product of powers: 3 K numbers."""
 FOREIGN_FRAME: CloudFrame = "Part"
 """Frame of points about which a file says nothing."""
 
 TINY = float(np.finfo(np.float64).tiny)
 DAMAGED = "copy the file again; it may be cut or damaged"
 MOST_HEADER_BYTES = 512 * 2**20
-"""Of a PLY or PCD file: two notes for each of four million exposures."""
+"""Of a PLY or PCD file: three notes for each of two and a half million exposures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,7 +172,23 @@ def cloud_notes(cloud: PointCloud) -> tuple[str, ...]:
     if cloud.seen_from_mm is not None:
         places = cloud.seen_from_mm.tolist()
         notes += [f"{SEEN_FROM} {k} {json.dumps(place)}" for k, place in enumerate(places)]
+    if cloud.calibration_errors is not None:
+        notes += _error_notes(cloud.calibration_errors)
     return tuple(notes)
+
+
+def _error_notes(errors: CalibrationErrors) -> list[str]:
+    """Of what the calibration may err by; short lines, as some readers take no longer ones."""
+    turns = np.round(Rotation.from_matrix(errors.turns).as_rotvec(), 9).tolist()
+    notes = [f"{SENSOR_TURN} {k} {json.dumps(turn)}" for k, turn in enumerate(turns)]
+    notes.append(f"{ARM_ERROR} 0 [{errors.arm_mm:.6g}]")
+    for k, modes in enumerate(errors.modes_mm):
+        seen = [*errors.middle[k].tolist(), *errors.half_width[k].tolist()]
+        notes.append(f"{SEEN_RANGE} {k} {json.dumps(seen)}")
+        for mode in modes.reshape(len(modes), -1):
+            numbers = ", ".join(f"{value:.6g}" for value in mode)
+            notes.append(f"{ERROR_MODES} {k} [{numbers}]")
+    return notes
 
 
 def header_bytes(lines: Sequence[str]) -> bytes:
@@ -288,6 +319,7 @@ def own_cloud(found: CloudColumns, where: str) -> PointCloud:
             normals=_joined(columns, NORMAL) if set(NORMAL) <= set(columns) else None,
             noise_length=columns.get(NOISE_LENGTH),
             seen_from_mm=named.places_mm,
+            calibration_errors=named.errors,
             is_simulated=named.is_simulated,
             forced=named.forced,
             calibrations=named.calibrations,
@@ -341,6 +373,7 @@ class _Named:
     sheets: tuple[str, ...]
     exposures: tuple[str, ...]
     places_mm: FloatArray | None
+    errors: CalibrationErrors | None
     is_simulated: bool
     forced: tuple[str, ...]
     calibrations: tuple[CalibrationMark, ...]
@@ -363,7 +396,9 @@ def _named(notes: tuple[str, ...]) -> _Named:
         places.setflags(write=False)
     sheets, exposures, forced = (_names(notes, word) for word in ("sheet", "exposure", FORCED))
     simulated = SIMULATED in notes
-    return _Named(frame, sheets, exposures, places, simulated, forced, _calibrations(notes))
+    errors = None if places is None else _errors(notes, len(sheets))
+    marks = _calibrations(notes)
+    return _Named(frame, sheets, exposures, places, errors, simulated, forced, marks)
 
 
 def _frame(notes: Sequence[str]) -> CloudFrame | None:
@@ -375,13 +410,39 @@ def _frame(notes: Sequence[str]) -> CloudFrame | None:
 
 def _places(notes: Sequence[str]) -> FloatArray | None:
     """(E, 3) where the sensor stood, if the notes say so of every exposure."""
-    texts = [text.split(" ", 2)[2] for text in notes if text.startswith(f"{SEEN_FROM} ")]
-    if not texts:
+    found = _numbers(notes, SEEN_FROM, "places of the sensor")
+    return found if len(found) else None
+
+
+def _errors(notes: Sequence[str], n_sheets: int) -> CalibrationErrors | None:
+    """What the calibration may err by, if the notes say so."""
+    what = "errors of the calibration"
+    turns = _numbers(notes, SENSOR_TURN, "turns of the sensor")
+    if not len(turns):
         return None
+    words = (SEEN_RANGE, ERROR_MODES, ARM_ERROR)
+    seen, modes, arm = (_numbers(notes, word, what) for word in words)
+    terms = len(FIELD_POWERS)
+    is_whole = turns.shape[1:] == (3,) and seen.shape == (n_sheets, 4) and arm.shape == (1, 1)
+    is_whole &= modes.ndim == 2 and len(modes) == n_sheets * terms
+    if not is_whole or modes.shape[1] % 3:
+        raise InputError(f"the header's {what} ({SENSOR_TURN}, {ERROR_MODES}) are damaged")
+    return CalibrationErrors(
+        turns=Rotation.from_rotvec(turns).as_matrix(),
+        middle=seen[:, :2],
+        half_width=seen[:, 2:],
+        modes_mm=modes.reshape(n_sheets, terms, 3, modes.shape[1] // 3),
+        arm_mm=float(arm[0, 0]),
+    )
+
+
+def _numbers(notes: Sequence[str], word: str, what: str) -> FloatArray:
+    """(M, K) numbers of the notes of a word, in their order."""
+    texts = [text.split(" ", 2)[2] for text in notes if text.startswith(f"{word} ")]
     try:
         return np.array([json.loads(text) for text in texts], dtype=np.float64)
-    except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"the header's places of the sensor ({SEEN_FROM}) are damaged") from error
+    except (IndexError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"the header's {what} ({word}) are damaged") from error
 
 
 def _calibrations(notes: Sequence[str]) -> tuple[CalibrationMark, ...]:

@@ -114,3 +114,14 @@ def test_stripes_of_few_points_that_scatter_otherwise_weigh_otherwise() -> None:
     assert spread.max() < 1.3 * MEDIAN_OF_FEW
     # A cubic takes four of forty points, a median of few is low: what all have in common.
     assert np.abs(np.mean(errors, axis=0) - np.mean(errors)).max() < 0.5 * MEDIAN_OF_FEW
+
+
+def test_a_stripe_of_no_more_points_than_its_course_has_terms_tells_nothing() -> None:
+    """Its residuals are rounding: beside it the others keep what they have, and it takes theirs."""
+    observations = straight_observations(FEW_POINTS)
+    residual = np.random.default_rng(7).normal(0.0, SIGMA_PX, len(observations))
+    with_short = observations.select(np.arange(len(observations) - FEW_POINTS + 4))
+    found = scatter_by_stripe(with_short, residual[: len(with_short)])
+    alone = scatter_by_stripe(with_short.select(slice(0, -4)), residual[: len(with_short) - 4])
+    np.testing.assert_allclose(found[:-4], alone, rtol=1e-12)
+    assert alone.min() <= found[-1] <= alone.max()

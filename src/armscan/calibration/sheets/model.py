@@ -106,27 +106,31 @@ def scatter_by_stripe(observations: SheetObservations, residual_px: FloatArray) 
     median, therefore counts as much as it is known, and what all have in common for the rest: its
     logarithm is the posterior mean beside a normal distribution over the stripes, whose width comes
     from what they differ by more than medians of independent points err (DerSimonian and Laird
-    1986, eqs. 7 to 9). Medians of points that are alike err more; such stripes keep their own.
+    1986, eqs. 7 to 9). Medians of points that are alike err more; such stripes keep their own. A
+    stripe with no more points than its course has terms tells nothing, and takes the mean of all.
     """
     stripes = list(observations.each_stripe())
     rest = [_off_course(observations.select(of), residual_px[of]) for of in stripes]
     own = np.array([robust_sigma(left) for left in rest])
+    free = np.array([len(left) - N_SHAPE for left in rest])
+    is_known = (own > 0.0) & (free > 0)
     factor = np.ones(len(observations))
-    found = np.flatnonzero(own > 0.0)
-    if not len(found):
+    if not is_known.any():
         return factor
-    free = np.array([len(rest[k]) - N_SHAPE for k in found])
-    variance = MEDIAN_VARIANCE / np.maximum(free, 1)
-    for k, logarithm in zip(found, _moderated(np.log(own[found]), variance), strict=True):
-        factor[stripes[k]] = np.exp(logarithm)
+    logarithms = np.log(own, out=np.zeros(len(own)), where=is_known)
+    variances = np.divide(MEDIAN_VARIANCE, free, out=np.full(len(own), np.inf), where=is_known)
+    for stripe, logarithm in zip(stripes, _moderated(logarithms, variances), strict=True):
+        factor[stripe] = np.exp(logarithm)
     return factor
 
 
 def _moderated(values: FloatArray, variances: FloatArray) -> FloatArray:
-    """(K,) posterior means of values that differ by an unknown variance and err by known ones."""
+    """(K,) posterior means of values that differ by an unknown variance and err by known ones,
+    infinite where a value tells nothing.
+    """
     weight = 1.0 / variances
     mean = weight @ values / weight.sum()
-    excess = weight @ (values - mean) ** 2 - (len(values) - 1)
+    excess = weight @ (values - mean) ** 2 - (np.count_nonzero(weight) - 1)
     between = max(float(excess), 0.0) / max(weight.sum() - weight @ weight / weight.sum(), 1e-300)
     whole = 1.0 / (variances + between)
     mean = whole @ values / whole.sum()

@@ -37,7 +37,13 @@ from armscan.kernels.section import (
     weigh_section,
     widen_sigmas,
 )
-from armscan.kernels.smoothing import filter_residuals, multiply_lagged
+from armscan.kernels.smoothing import (
+    BEND_SPAN,
+    BEYOND_BENDS,
+    filter_residuals,
+    multiply_lagged,
+    seen_bend,
+)
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.fit import BLOCK, estimate_section
 from armscan.vision.stripe.image import lit_plane
@@ -644,6 +650,19 @@ def test_residuals_are_those_of_a_convolution() -> None:
         product = residual[: n - lag] * residual[lag:]
         own = np.isfinite(product) & (chain[: n - lag] == chain[lag:])
         assert total == pytest.approx([product[own].sum(), own.sum()], rel=1e-12)
+
+
+def test_the_bend_of_a_line_is_seen_within_its_own_chain_only() -> None:
+    """A circle of 150 px, its points a pixel apart, cut into two chains."""
+    radius, n = 150.0, 80
+    turn = np.arange(n) / radius
+    normals = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    points, chain = radius * normals, np.arange(n) // 40
+    found = np.array([seen_bend(points, normals, chain, i) for i in range(n)])
+    from_end = np.minimum(np.arange(n) % 40, 39 - np.arange(n) % 40)
+    assert (found[from_end < BEND_SPAN] == BEYOND_BENDS).all()
+    # a chord sees 1 + a quarter of the squared half angle times it
+    assert found[from_end >= BEND_SPAN] == pytest.approx(1 / radius, rel=(BEND_SPAN / radius) ** 2)
 
 
 def test_what_lies_beside_a_centre_widens_its_sigma() -> None:

@@ -22,6 +22,13 @@ def test_a_folder_with_own_files_is_left_alone(
     assert (tmp_path / name).read_text() == "mine"
 
 
+def test_a_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "demo").write_text("mine")
+    assert main(["demo", "photos", "-o", str(tmp_path / "demo")]) == 2
+    assert "demo: this is a file" in capsys.readouterr().err
+    assert (tmp_path / "demo").read_text() == "mine"
+
+
 def test_an_unknown_preset_is_refused_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,7 +21,6 @@ from armscan.cli import (
     twin,
 )
 from armscan.cli import reconstruct as reconstruct_command
-from armscan.cli.delivery import delivered
 from armscan.cli.live.rig import CONSOLE_EXAMPLE, RECORD_EXAMPLE, console, record
 
 EXIT_INPUT = 2
@@ -58,7 +57,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 calibrate = typer.Typer(
-    help="Calibrate a camera, then its light sheets, then where they sit on the arm.",
+    help="Calibrate cameras, light sheets and their place on the arm.",
     epilog=(
         "\b\nExample:\n"
         "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json"
@@ -74,32 +73,26 @@ calibrate.command("laser", epilog=calibrate_sensor.LASER_EXAMPLE)(calibrate_sens
 calibrate.command("hand-eye", epilog=calibrate_sensor.HAND_EYE_EXAMPLE)(calibrate_sensor.hand_eye)
 calibrate.command("latency", epilog=calibrate_cameras.LATENCY_EXAMPLE)(calibrate_cameras.latency)
 inspect_group = typer.Typer(
-    help="Find features in measured points, and compare them with what they should be.",
+    help="Compare measured points with what they should be.",
     epilog=inspect.SPHERE_EXAMPLE,
     context_settings=HELP_OPTIONS,
     invoke_without_command=True,
     callback=_help_unless_a_command_follows,
     rich_markup_mode=None,
 )
-inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(delivered(inspect.plane))
-inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(delivered(inspect.sphere))
-inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(delivered(inspect.step))
-inspect_group.command("cad", epilog=inspect_cad.CAD_EXAMPLE)(delivered(inspect_cad.cad))
+inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(inspect.plane)
+inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
+inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
+inspect_group.command("cad", epilog=inspect_cad.CAD_EXAMPLE)(inspect_cad.cad)
 inspect_group.command("recipe", epilog=inspect_cad.RECIPE_EXAMPLE)(inspect_cad.recipe)
-inspect_group.command("line", epilog=inspect_features.LINE_EXAMPLE)(
-    delivered(inspect_features.line)
-)
-inspect_group.command("circle", epilog=inspect_features.CIRCLE_EXAMPLE)(
-    delivered(inspect_features.circle)
-)
+inspect_group.command("line", epilog=inspect_features.LINE_EXAMPLE)(inspect_features.line)
+inspect_group.command("circle", epilog=inspect_features.CIRCLE_EXAMPLE)(inspect_features.circle)
 inspect_group.command("cylinder", epilog=inspect_features.CYLINDER_EXAMPLE)(
-    delivered(inspect_features.cylinder)
+    inspect_features.cylinder
 )
-inspect_group.command("cone", epilog=inspect_features.CONE_EXAMPLE)(
-    delivered(inspect_features.cone)
-)
+inspect_group.command("cone", epilog=inspect_features.CONE_EXAMPLE)(inspect_features.cone)
 inspect_group.command("relation", epilog=inspect_features.RELATION_EXAMPLE)(
-    delivered(inspect_features.relation)
+    inspect_features.relation
 )
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect_group, name="inspect")
@@ -115,8 +108,12 @@ app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
 app.command("clean", epilog=surface.CLEAN_EXAMPLE)(surface.clean)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
 app.command("mesh", epilog=surface.MESH_EXAMPLE)(surface.mesh)
-app.command("record", epilog=RECORD_EXAMPLE)(record)
-app.command("console", epilog=CONSOLE_EXAMPLE)(console)
+app.command(
+    "record", epilog=RECORD_EXAMPLE, short_help="Record cameras, arm and lasers to one file."
+)(record)
+app.command(
+    "console", epilog=CONSOLE_EXAMPLE, short_help="Calibrate, scan and inspect in a browser."
+)(console)
 app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)
 app.command("recover", epilog=files.RECOVER_EXAMPLE)(files.recover)
 app.command("info", epilog=files.INFO_EXAMPLE)(files.info)

@@ -9,17 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
-from armscan.cli.delivery import run
+from armscan.cli.delivery import OF_CALIBRATIONS, Work, job_command
 from armscan.cli.options import (
     ArmFile,
-    AsJson,
     BitsAlign,
     BitsUsed,
-    Cache,
     DefaultOf,
     Document,
-    Force,
-    ForceBad,
     LaserColourOption,
     Method,
     MethodOption,
@@ -73,13 +69,13 @@ Distortion = Annotated[
 ]
 
 
+@job_command(Document, Path("camera.json"), also=OF_CALIBRATIONS)
 def camera(
     context: typer.Context,
     *,
     images: Photographs = None,
     target: OptionalTarget = None,
     again: AgainFile = None,
-    output: Document = Path("camera.json"),
     scan: TargetScan = None,
     leave_out: NotUsed = None,
     auto_leave_out: Annotated[
@@ -95,11 +91,7 @@ def camera(
     method: MethodOption = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
-    force: Force = False,
-    force_bad: ForceBad = False,
-    cache: Cache = True,
-    as_json: AsJson = False,
-) -> None:
+) -> Work:
     """Calibrate a camera from photographs of a flat target."""
     from armscan.calibration.cameras.result import CameraOptions
     from armscan.errors import OptionError
@@ -122,36 +114,23 @@ def camera(
             context, NOT_AGAIN, "--from takes target and views from the document's own files"
         )
         changes = {key: value for key, value in changed.items() if value is not None}
-        run(
-            lambda job: calibrate_camera_from_file(job, again, changes),
-            as_json=as_json,
-            output=output,
-            force=force,
-            force_bad=force_bad,
-        )
-        return
+        return lambda job: calibrate_camera_from_file(job, again, changes)
     if target is None:
         context.fail("Missing option '--target'.")
     options = given(CameraOptions, **changed)
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
-    run(
-        lambda job: calibrate_camera(
-            job,
-            target,
-            images or (),
-            scan=scan,
-            options=options,
-            image_options=pixels,
-            is_beside_thesis=method is Method.THESIS,
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
-        force_bad=force_bad,
-        cache=cache,
+    return lambda job: calibrate_camera(
+        job,
+        target,
+        images or (),
+        scan=scan,
+        options=options,
+        image_options=pixels,
+        is_beside_thesis=method is Method.THESIS,
     )
 
 
+@job_command(Document, Path("stereo.json"), also=OF_CALIBRATIONS)
 def stereo(
     *,
     left: Annotated[
@@ -161,7 +140,6 @@ def stereo(
         str, typer.Argument(help="Right images, in the same order.", show_default=False)
     ] = "",
     target: Target,
-    output: Document = Path("stereo.json"),
     scan: Annotated[
         Path | None,
         typer.Option(help="Recording of cameras 0 and 1 instead of images; paired by instant."),
@@ -187,11 +165,7 @@ def stereo(
     distortion: Distortion = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
-    force: Force = False,
-    force_bad: ForceBad = False,
-    cache: Cache = True,
-    as_json: AsJson = False,
-) -> None:
+) -> Work:
     """Calibrate two cameras and where they are to each other."""
     from armscan.calibration.cameras.pairs import StereoOptions
     from armscan.calibration.cameras.result import CameraOptions
@@ -215,43 +189,32 @@ def stereo(
     if not is_given:
         options = replace(options, intrinsics="free")
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
-    run(
-        lambda job: calibrate_stereo(
-            job,
-            target,
-            left,
-            right,
-            scan=scan,
-            cameras=cameras,
-            options=options,
-            image_options=pixels,
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
-        force_bad=force_bad,
-        cache=cache,
+    return lambda job: calibrate_stereo(
+        job,
+        target,
+        left,
+        right,
+        scan=scan,
+        cameras=cameras,
+        options=options,
+        image_options=pixels,
     )
 
 
+@job_command(Document, Path("scanner-timed.json"))
 def latency(
     *,
     scan: Annotated[Path, typer.Argument(help="Recording of the plate.", show_default=False)],
     scanner: Annotated[Path, typer.Option(help="The scanner's document.", show_default=False)],
     arm: ArmFile = None,
-    output: Document = Path("scanner-timed.json"),
     laser_colour: LaserColourOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Find the time between camera and arm, from a plate and a stand-off that moves."""
+) -> Work:
+    """Find the time between camera and arm.
+
+    From a flat plate over which the head is moved nearer and away.
+    """
     from armscan.jobs.hand_eye import calibrate_latency
     from armscan.vision.stripe.image import StripeOptions
 
     stripes = given(StripeOptions, laser_colour=laser_colour)
-    run(
-        lambda job: calibrate_latency(job, scan, scanner, arm=arm, stripe_options=stripes),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
+    return lambda job: calibrate_latency(job, scan, scanner, arm=arm, stripe_options=stripes)

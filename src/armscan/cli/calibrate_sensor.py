@@ -9,18 +9,14 @@ from typing import Annotated, Any
 
 import typer
 
-from armscan.cli.delivery import run
+from armscan.cli.delivery import OF_CALIBRATIONS, Work, job_command
 from armscan.cli.options import (
     ArmFile,
-    AsJson,
     BitsAlign,
     BitsUsed,
-    Cache,
     DefaultOf,
     Document,
     EulerAngles,
-    Force,
-    ForceBad,
     LaserColourOption,
     Method,
     MethodOption,
@@ -143,6 +139,7 @@ PoseTable = Annotated[
 ]
 
 
+@job_command(Document, Path("sensor.json"), also=OF_CALIBRATIONS)
 def laser(
     context: typer.Context,
     *,
@@ -152,7 +149,6 @@ def laser(
     on: LitImages = None,
     off: DarkImages = None,
     scan: LaserScan = None,
-    output: Document = Path("sensor.json"),
     sheets: Sheets = None,
     name: SheetNames = None,
     leave_out: LeaveOut = None,
@@ -165,12 +161,8 @@ def laser(
     laser_colour: LaserColourOption = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
-    force: Force = False,
-    force_bad: ForceBad = False,
-    cache: Cache = True,
-    as_json: AsJson = False,
-) -> None:
-    """Calibrate light sheets from images of laser lines on a flat target."""
+) -> Work:
+    """Calibrate light sheets from laser lines on a flat target."""
     from armscan.calibration.sheets.result import SheetOptions
     from armscan.jobs.sheets import (
         SheetImages,
@@ -193,14 +185,7 @@ def laser(
             context, NOT_AGAIN, "--from takes cameras and stripes from the document's own files"
         )
         changes = {key: value for key, value in changed.items() if value is not None}
-        run(
-            lambda job: calibrate_sheets_from_file(job, again, changes),
-            as_json=as_json,
-            output=output,
-            force=force,
-            force_bad=force_bad,
-        )
-        return
+        return lambda job: calibrate_sheets_from_file(job, again, changes)
     if camera is None or target is None:
         context.fail(f"Missing option '{'--camera' if camera is None else '--target'}'.")
     images = SheetImages(tuple(on or ()), tuple(off or ()), scan, tuple(leave_out or ()))
@@ -209,18 +194,12 @@ def laser(
         sheets=given(SheetOptions, **changed),
     )
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
-    run(
-        lambda job: calibrate_sheets(
-            job, camera, target, images, options=options, image_options=pixels
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
-        force_bad=force_bad,
-        cache=cache,
+    return lambda job: calibrate_sheets(
+        job, camera, target, images, options=options, image_options=pixels
     )
 
 
+@job_command(Document, Path("scanner.json"))
 def hand_eye(
     *,
     scans: Scans = None,
@@ -250,13 +229,13 @@ def hand_eye(
         typer.Option(help="Scatter of the plate's surface; left out, estimated."),
     ] = None,
     method: MethodOption = None,
-    output: Document = Path("scanner.json"),
     stripe_method: StripeMethodOption = None,
     laser_colour: LaserColourOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Find where the sensor sits on the arm, from postures over a flat plate or a sphere."""
+) -> Work:
+    """Find where the sensor sits on the arm.
+
+    From postures over a flat plate or a sphere.
+    """
     from armscan.calibration.hand_eye.observations import HandEyeOptions
     from armscan.geometry.rotations import check_convention
     from armscan.jobs.hand_eye import Artefact, StripeSource, calibrate_hand_eye
@@ -281,16 +260,11 @@ def hand_eye(
         solve_plate=solve_plate,
     )
     stripes = given(StripeOptions, method=stripe_method, laser_colour=laser_colour)
-    run(
-        lambda job: calibrate_hand_eye(
-            job,
-            source,
-            artefact,
-            options=options,
-            stripe_options=stripes,
-            is_beside_thesis=method is Method.THESIS,
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
+    return lambda job: calibrate_hand_eye(
+        job,
+        source,
+        artefact,
+        options=options,
+        stripe_options=stripes,
+        is_beside_thesis=method is Method.THESIS,
     )

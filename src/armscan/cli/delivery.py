@@ -1,22 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a command runs its job, and what it hands out: progress, the report, its page as PDF.
-
-``--title-block`` and ``--pdf`` are options of every command that inspects a cloud.
-"""
+"""How a command runs its job, and what it hands out: progress, the report, its page as PDF."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from armscan.cli.options import AsJson, Cache, Force, ForceBad
 
 if TYPE_CHECKING:
     from armscan.jobs.job import Job
@@ -39,86 +37,77 @@ PdfOption = Annotated[
 ]
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What a person asked for beside the inspection itself."""
-
-    title_block: tuple[str, ...] = ()
-    pdf: Path | None = None
-
-
-ASKED: ContextVar[Asked | None] = ContextVar("asked", default=None)
-"""Set while a command runs, so that each of them hands on nothing that it does not use."""
-
-
-def delivered(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command with both options; jobs that it runs are given them by `with_delivery`."""
-
-    @functools.wraps(command)
-    def both(*words: Any, title_block: list[str] | None, pdf: Path | None, **options: Any) -> Any:
-        token = ASKED.set(Asked(tuple(title_block or ()), pdf))
-        try:
-            return command(*words, **options)
-        finally:
-            ASKED.reset(token)
-
-    kinds: dict[str, tuple[Any, Any]] = {
-        "title_block": (TitleBlockOption, None),
-        "pdf": (PdfOption, None),
-    }
-    known = inspect.signature(command, eval_str=True)
-    added = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-        for name, (kind, default) in kinds.items()
-    ]
-    # the options that all commands have stand last
-    own = list(known.parameters.values())
-    places = [k for k, one in enumerate(own) if one.name == "output"]
-    at = places[0] + 1 if places else len(own)
-    whole = known.replace(parameters=[*own[:at], *added, *own[at:]])
-    both.__signature__ = whole  # type: ignore[attr-defined]
-    both.__annotations__ = {name: one.annotation for name, one in whole.parameters.items()}
-    return both
+Work = Callable[["Job"], "Summary"]
+"""What a command does with its job: where to write, and whom to tell."""
+OPTIONS: dict[str, tuple[Any, Any]] = {
+    "title_block": (TitleBlockOption, None),
+    "pdf": (PdfOption, None),
+    "force": (Force, False),
+    "force_bad": (ForceBad, False),
+    "cache": (Cache, True),
+}
+OF_CALIBRATIONS = "force force_bad cache"
+OF_INSPECTIONS = "title_block pdf force"
 
 
-def with_delivery(job: Job) -> Job:
-    """The job with the title block and PDF that were asked for.
+def job_command(
+    output: Any,
+    default: Any = inspect.Parameter.empty,
+    *,
+    also: str = "force",
+    code: Callable[[Summary], int] | None = None,
+) -> Callable[[Callable[..., Work]], Callable[..., int]]:
+    """A command of a function that makes work out of its own arguments and options.
 
-    Raises
-    ------
-    ArmscanError
-        If the title block is not understood, or there is no page for the PDF.
+    The command has ``-o`` and ``--json`` besides, runs the work, and prints its report.
+
+    Parameters
+    ----------
+    output, default
+        What ``-o`` is, and its value where it is not given; empty if it must be.
+    also
+        Further options between ``-o`` and ``--json``: names in `OPTIONS`, between blanks.
+    code
+        The exit code that a report asks for; 0 if None.
     """
-    asked = ASKED.get()
-    if asked is None or asked == Asked():
-        return job
-    from armscan.errors import OptionError
-    from armscan.storage.parts.recipes import read_title_block
+    kinds = {
+        "output": (output, default),
+        **{name: OPTIONS[name] for name in also.split()},
+        "as_json": (AsJson, False),
+    }
+    added = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=value, annotation=kind)
+        for name, (kind, value) in kinds.items()
+    ]
 
-    if asked.pdf is not None and job.output is None:
-        raise OptionError(
-            "a PDF is made of the page", where=f"--pdf {asked.pdf}", remedy="give -o NAME.html too"
-        )
-    if asked.pdf is not None and asked.pdf.suffix.lower() != ".pdf":
-        raise OptionError(
-            f"the name of the PDF ends in '{asked.pdf.suffix}'",
-            where=f"--pdf {asked.pdf}",
-            remedy="end it in .pdf",
-        )
-    block = read_title_block(asked.title_block, "--title-block")
-    return replace(job, title_block=block, pdf=asked.pdf)
+    def command_of(work_of: Callable[..., Work]) -> Callable[..., int]:
+        @functools.wraps(work_of)
+        def command(*words: Any, **options: Any) -> int:
+            asked = {name: options.pop(name) for name in kinds}
+            summary = run(work_of(*words, **options), **asked)
+            return 0 if code is None else code(summary)
+
+        known = inspect.signature(work_of, eval_str=True)
+        whole = known.replace(parameters=[*known.parameters.values(), *added])
+        command.__signature__ = whole  # type: ignore[attr-defined]
+        command.__annotations__ = {name: one.annotation for name, one in whole.parameters.items()}
+        return command
+
+    return command_of
 
 
 def run(
-    work: Callable[[Job], Summary],
+    work: Work,
     *,
+    output: Path | None,
     as_json: bool,
-    output: Path | None = None,
     force: bool = False,
     force_bad: bool = False,
     cache: bool = False,
+    title_block: list[str] | None = None,
+    pdf: Path | None = None,
 ) -> Summary:
-    """Run a job under a progress bar, and show what came out."""
+    """Run the work of a job under a progress bar, and show what came out."""
     from armscan.jobs.job import Job
 
     with progress_bar() as progress:
@@ -126,7 +115,8 @@ def run(
             output=output, is_overwriting=force, is_forced=force_bad, is_caching=cache,
             command=("armscan", *sys.argv[1:]), progress=progress,
         )  # fmt: skip
-        job = with_delivery(job)
+        if title_block or pdf is not None:
+            job = _with_delivery(job, title_block or (), pdf)
         try:
             summary = work(job)
         except KeyboardInterrupt:
@@ -135,6 +125,30 @@ def run(
             raise
     show(summary, as_json=as_json)
     return summary
+
+
+def _with_delivery(job: Job, title_block: Sequence[str], pdf: Path | None) -> Job:
+    """The job with the title block and PDF that were asked for.
+
+    Raises
+    ------
+    ArmscanError
+        If the title block is not understood, or there is no page for the PDF.
+    """
+    from armscan.errors import OptionError
+    from armscan.storage.parts.recipes import read_title_block
+
+    if pdf is not None and job.output is None:
+        raise OptionError(
+            "a PDF is made of the page", where=f"--pdf {pdf}", remedy="give -o NAME.html too"
+        )
+    if pdf is not None and pdf.suffix.lower() != ".pdf":
+        raise OptionError(
+            f"the name of the PDF ends in '{pdf.suffix}'",
+            where=f"--pdf {pdf}",
+            remedy="end it in .pdf",
+        )
+    return replace(job, title_block=read_title_block(title_block, "--title-block"), pdf=pdf)
 
 
 def show(summary: Summary, *, as_json: bool) -> None:

@@ -39,7 +39,7 @@ def info(
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Say what files are: image, calibration, cloud, observations, recording or folder."""
+    """Say what files and folders are, and what is in them."""
     from armscan.jobs.info import describe_files
 
     show(describe_files(files), as_json=as_json)
@@ -73,7 +73,7 @@ def convert(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a cloud or recording in another format, or a calibration's camera for ROS."""
+    """Write a cloud, a recording or a camera in another format."""
     from armscan.report.quantity import Summary
     from armscan.storage.clouds import convert_file
 
@@ -104,7 +104,7 @@ def recover(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write what is whole of a recording that was killed, cut or damaged."""
+    """Write what is whole of a recording that was damaged."""
     from armscan.jobs.live.recordings import recover_recording
 
     show(recover_recording(source, output, is_overwriting=force), as_json=as_json)
@@ -130,7 +130,7 @@ def doctor(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Check versions, compiler, folders, optional packages and drivers of devices."""
+    """Check what is installed: packages, compiler, drivers."""
     from armscan.jobs.info import examine_installation
 
     if bundle is not None:
@@ -157,7 +157,7 @@ def devices(
     kind: Annotated[Kind | None, typer.Option(help="Only these.", show_default=False)] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the cameras, arms and laser controllers that are there, and the drivers for others."""
+    """List devices that are there, and drivers for others."""
     from armscan.devices.registry import survey_drivers
     from armscan.report.quantity import Summary, Table
 

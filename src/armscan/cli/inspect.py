@@ -4,22 +4,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armscan.cli.delivery import run
+from armscan.cli.delivery import OF_INSPECTIONS, Work, job_command
 from armscan.cli.options import (
-    AsJson,
     DefaultOf,
     FeatureOption,
-    Force,
     PageOption,
     RegionOption,
     SideOption,
     given,
     numbers,
 )
+
+if TYPE_CHECKING:
+    from armscan.report.quantity import Summary
 
 PLANE_EXAMPLE = (
     "\b\nExample:\n  armscan inspect plane plate.ply --plate plate.csv -o plate-inspection.html"
@@ -47,6 +48,7 @@ CloudArgument = Annotated[
 ]
 
 
+@job_command(PageOption, None, also=OF_INSPECTIONS)
 def plane(
     cloud: CloudArgument,
     *,
@@ -62,11 +64,8 @@ def plane(
     side: SideOption = None,
     region: RegionOption = "",
     feature_mm: FeatureOption = None,
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Distances of points to a plane: fitted to them, and nominal if one is given."""
+) -> Work:
+    """Distances of points to a plane, fitted or nominal."""
     from armscan.calibration.hand_eye.probed_plate import ProbeSide
     from armscan.inspection.selection import InspectionOptions
     from armscan.jobs.inspection.shapes import inspect_plane
@@ -74,16 +73,12 @@ def plane(
     box = numbers(region, "--region")
     options = given(InspectionOptions, feature_mm=feature_mm)
     axis: ProbeSide | None = None if side is None else side.value
-    run(
-        lambda job: inspect_plane(
-            job, cloud, plane=plane, plate=plate, side=axis, region=box, options=options
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
+    return lambda job: inspect_plane(
+        job, cloud, plane=plane, plate=plate, side=axis, region=box, options=options
     )
 
 
+@job_command(PageOption, None, also=OF_INSPECTIONS)
 def sphere(
     cloud: CloudArgument,
     *,
@@ -92,24 +87,17 @@ def sphere(
     ],
     region: RegionOption = "",
     feature_mm: FeatureOption = None,
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Find a ball in a cloud; compare it with the standard, and with the fitted ball."""
+) -> Work:
+    """Find a ball in a cloud and compare it with the standard."""
     from armscan.inspection.selection import InspectionOptions
     from armscan.jobs.inspection.shapes import inspect_sphere
 
     box = numbers(region, "--region")
     options = given(InspectionOptions, feature_mm=feature_mm)
-    run(
-        lambda job: inspect_sphere(job, cloud, diameter, region=box, options=options),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
+    return lambda job: inspect_sphere(job, cloud, diameter, region=box, options=options)
 
 
+@job_command(PageOption, None, also=OF_INSPECTIONS)
 def step(
     cloud: CloudArgument,
     *,
@@ -130,11 +118,8 @@ def step(
     ] = None,
     region: RegionOption = "",
     feature_mm: FeatureOption = None,
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Find two parallel faces in a cloud and measure the distance between them."""
+) -> Work:
+    """Find two parallel faces and measure their distance."""
     from armscan.inspection.selection import InspectionOptions, StepOptions
     from armscan.jobs.inspection.shapes import inspect_step
 
@@ -142,16 +127,16 @@ def step(
     direction = numbers(normal, "--normal")
     options = given(InspectionOptions, feature_mm=feature_mm)
     steps = given(StepOptions, margin_mm=margin)
-    run(
-        lambda job: inspect_step(
-            job, cloud, height, normal=direction, region=box, options=options, step_options=steps
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
+    return lambda job: inspect_step(
+        job, cloud, height, normal=direction, region=box, options=options, step_options=steps
     )
 
 
+def _code(summary: Summary) -> int:
+    return 0 if summary.data["verdict"] == "still valid" else EXIT_NOT_PASSED
+
+
+@job_command(PageOption, None, code=_code)
 def verify(
     scan: Annotated[
         Path,
@@ -190,11 +175,8 @@ def verify(
     side: SideOption = None,
     region: RegionOption = "",
     feature_mm: FeatureOption = None,
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> int:
-    """Say whether a scanner still measures as its calibration predicts."""
+) -> Work:
+    """Say whether a scanner is still as its calibration says."""
     from armscan.inspection.selection import InspectionOptions
     from armscan.jobs.verify import Standard
     from armscan.jobs.verify import verify as verify_scanner
@@ -204,12 +186,6 @@ def verify(
     options = given(VerifyOptions, mpe_mm=mpe, reference_u_mm=uncertainty)
     inspection = given(InspectionOptions, feature_mm=feature_mm)
     standard = Standard(ball, plate, None if side is None else side.value)
-    summary = run(
-        lambda job: verify_scanner(
-            job, scan, scanner, standard, region=box, options=options, inspection=inspection
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
+    return lambda job: verify_scanner(
+        job, scan, scanner, standard, region=box, options=options, inspection=inspection
     )
-    return 0 if summary.data["verdict"] == "still valid" else EXIT_NOT_PASSED

@@ -5,13 +5,16 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armscan.cli.delivery import run
+from armscan.cli.delivery import OF_INSPECTIONS, Work, job_command
 from armscan.cli.inspect import EXIT_NOT_PASSED, CloudArgument
-from armscan.cli.options import AsJson, DefaultOf, Force, PageOption, RegionOption, given, numbers
+from armscan.cli.options import DefaultOf, PageOption, RegionOption, given, numbers
+
+if TYPE_CHECKING:
+    from armscan.report.quantity import Summary
 
 CAD_EXAMPLE = (
     "\b\nExample:\n"
@@ -91,7 +94,20 @@ Tolerance = Annotated[
     ),
 ]
 
+ResultsFolder = Annotated[
+    Path, typer.Option("-o", "--output", help="Folder of the results, new or of earlier ones.")
+]
 
+
+def _code_of_part(summary: Summary) -> int:
+    return 0 if summary.data.get("verdict", "pass") == "pass" else EXIT_NOT_PASSED
+
+
+def _code_of_parts(summary: Summary) -> int:
+    return 0 if summary.data["all_passed"] else EXIT_NOT_PASSED
+
+
+@job_command(PageOption, None, also=OF_INSPECTIONS, code=_code_of_part)
 def cad(
     cloud: CloudArgument,
     part: PartArgument,
@@ -128,11 +144,8 @@ def cad(
         ),
     ] = None,
     region: RegionOption = "",
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> int:
-    """Deviations of a part from its model, face by face, with a verdict."""
+) -> Work:
+    """Judge the deviations of a part from its model by face."""
     from armscan.inspection.cad.comparison import CadOptions
     from armscan.jobs.inspection.cad import PartOptions, inspect_cad
     from armscan.storage.parts.step import ChordError
@@ -148,18 +161,19 @@ def cad(
         measured=measured,
     )
     chord = None if chord_mm is None else ChordError(chord_mm=chord_mm)
-    summary = run(
-        lambda job: inspect_cad(
-            job, cloud, part, tolerance=tolerance, region=box, part_options=how,
-            options=options, chord=chord,
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )  # fmt: skip
-    return 0 if summary.data.get("verdict", "pass") == "pass" else EXIT_NOT_PASSED
+    return lambda job: inspect_cad(
+        job,
+        cloud,
+        part,
+        tolerance=tolerance,
+        region=box,
+        part_options=how,
+        options=options,
+        chord=chord,
+    )
 
 
+@job_command(ResultsFolder, code=_code_of_parts)
 def recipe(
     recipe: Annotated[
         Path, typer.Argument(help="What to do with every part (TOML).", show_default=False)
@@ -171,21 +185,8 @@ def recipe(
             show_default=False,
         ),
     ],
-    *,
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", help="Folder of the results, new or of earlier ones."),
-    ],
-    force: Force = False,
-    as_json: AsJson = False,
-) -> int:
-    """Clean, align, compare and measure many parts alike: one table, with the trend."""
+) -> Work:
+    """Inspect many parts alike, with one table and the trend."""
     from armscan.jobs.inspection.recipe import inspect_recipe
 
-    summary = run(
-        lambda job: inspect_recipe(job, recipe, clouds),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
-    return 0 if summary.data["all_passed"] else EXIT_NOT_PASSED
+    return lambda job: inspect_recipe(job, recipe, clouds)

@@ -8,17 +8,9 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.delivery import run
+from armscan.cli.delivery import OF_INSPECTIONS, Work, job_command
 from armscan.cli.inspect import CloudArgument
-from armscan.cli.options import (
-    AsJson,
-    FeatureOption,
-    Force,
-    PageOption,
-    RegionOption,
-    given,
-    numbers,
-)
+from armscan.cli.options import FeatureOption, PageOption, RegionOption, given, numbers
 
 LINE_EXAMPLE = "\b\nExample:\n  armscan inspect line edge.ply --region=0,40,-1,1,9,11 -o edge.html"
 CIRCLE_EXAMPLE = (
@@ -58,6 +50,7 @@ Axis = Annotated[
 ]
 
 
+@job_command(PageOption, None, also=OF_INSPECTIONS)
 def line(
     cloud: CloudArgument,
     *,
@@ -65,22 +58,12 @@ def line(
     seed: Seed = "",
     region: RegionOption = "",
     feature_mm: FeatureOption = None,
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Work:
     """Fit a straight line to points along an edge or a wire."""
-    _inspect(
-        "line",
-        cloud,
-        {"axis": axis, "seed_mm": seed, "region": region},
-        feature_mm=feature_mm,
-        output=output,
-        force=force,
-        as_json=as_json,
-    )
+    return _inspect("line", cloud, feature_mm, axis=axis, seed_mm=seed, region=region)
 
 
+@job_command(PageOption, None, also=OF_INSPECTIONS)
 def circle(
     cloud: CloudArgument,
     *,
@@ -90,23 +73,15 @@ def circle(
     seed: Seed = "",
     region: RegionOption = "",
     feature_mm: FeatureOption = None,
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Work:
     """Fit a circle to points of a rim or of a thin section."""
-    _inspect(
-        "circle",
-        cloud,
-        {"axis": axis, "seed_mm": seed, "region": region, "diameter_range_mm": diameter_range},
-        diameter=diameter,
-        feature_mm=feature_mm,
-        output=output,
-        force=force,
-        as_json=as_json,
-    )
+    return _inspect(
+        "circle", cloud, feature_mm, axis=axis, seed_mm=seed, region=region,
+        diameter_range_mm=diameter_range, diameter_mm=diameter,
+    )  # fmt: skip
 
 
+@job_command(PageOption, None, also=OF_INSPECTIONS)
 def cylinder(
     cloud: CloudArgument,
     *,
@@ -116,23 +91,15 @@ def cylinder(
     seed: Seed = "",
     region: RegionOption = "",
     feature_mm: FeatureOption = None,
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Work:
     """Find a cylinder, a bore or a boss, and fit it."""
-    _inspect(
-        "cylinder",
-        cloud,
-        {"axis": axis, "seed_mm": seed, "region": region, "diameter_range_mm": diameter_range},
-        diameter=diameter,
-        feature_mm=feature_mm,
-        output=output,
-        force=force,
-        as_json=as_json,
-    )
+    return _inspect(
+        "cylinder", cloud, feature_mm, axis=axis, seed_mm=seed, region=region,
+        diameter_range_mm=diameter_range, diameter_mm=diameter,
+    )  # fmt: skip
 
 
+@job_command(PageOption, None, also=OF_INSPECTIONS)
 def cone(
     cloud: CloudArgument,
     *,
@@ -144,72 +111,42 @@ def cone(
     seed: Seed = "",
     region: RegionOption = "",
     feature_mm: FeatureOption = None,
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Work:
     """Find a cone and fit it."""
-    _inspect(
-        "cone",
-        cloud,
-        {"axis": axis, "seed_mm": seed, "region": region},
-        half_angle=half_angle,
-        feature_mm=feature_mm,
-        output=output,
-        force=force,
-        as_json=as_json,
+    return _inspect(
+        "cone", cloud, feature_mm, axis=axis, seed_mm=seed, region=region, half_angle_deg=half_angle
     )
 
 
+@job_command(PageOption, None, also=OF_INSPECTIONS)
 def relation(
     cloud: CloudArgument,
     first: Annotated[str, typer.Argument(help="One feature.", show_default=False)],
     second: Annotated[str, typer.Argument(help="The other.", show_default=False)],
     *,
     feature_mm: FeatureOption = None,
-    output: PageOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Work:
     """Distance and angle of two features of one cloud."""
     from armscan.inspection.selection import InspectionOptions
     from armscan.jobs.inspection.features import inspect_relation, parse_feature
 
     one, other = parse_feature(first, "the first feature"), parse_feature(second, "the second")
     options = given(InspectionOptions, feature_mm=feature_mm)
-    run(
-        lambda job: inspect_relation(job, cloud, one, other, options=options),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
+    return lambda job: inspect_relation(job, cloud, one, other, options=options)
 
 
-def _inspect(
-    kind: str,
-    cloud: Path,
-    texts: dict[str, str],
-    *,
-    diameter: float | None = None,
-    half_angle: float | None = None,
-    feature_mm: float | None,
-    output: Path | None,
-    force: bool,
-    as_json: bool,
-) -> None:
+def _inspect(kind: str, cloud: Path, feature_mm: float | None, **said: str | float | None) -> Work:
+    """Work on one feature, of which each field was said as a number or as numbers in a text."""
     from armscan.inspection.selection import InspectionOptions
     from armscan.jobs.inspection.features import inspect_feature, wanted_feature
 
-    known = {name: numbers(text, OPTION_OF[name]) for name, text in texts.items()}
-    sizes = {"diameter_mm": diameter, "half_angle_deg": half_angle}
-    wanted = wanted_feature(kind, f"inspect {kind}", {**known, **sizes})
+    known: dict[str, object] = {
+        name: numbers(value, OPTION_OF[name]) if isinstance(value, str) else value
+        for name, value in said.items()
+    }
+    wanted = wanted_feature(kind, f"inspect {kind}", known)
     options = given(InspectionOptions, feature_mm=feature_mm)
-    run(
-        lambda job: inspect_feature(job, cloud, wanted, options=options),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
+    return lambda job: inspect_feature(job, cloud, wanted, options=options)
 
 
 OPTION_OF = {

@@ -8,13 +8,11 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.delivery import run
+from armscan.cli.delivery import Work, job_command
 from armscan.cli.options import (
-    AsJson,
     BitsAlign,
     BitsUsed,
     DefaultOf,
-    Force,
     Method,
     MethodOption,
     Side,
@@ -64,7 +62,23 @@ Disc = Annotated[
     typer.Option(help="light (in a dark ring) or dark.", show_default=DefaultOf(RINGS + "disc")),
 ]
 
+TouchedPoints = Annotated[
+    Path | None,
+    typer.Option("-o", "--output", help="Points on the surface, a CSV table.", show_default=False),
+]
+MarkerFile = Annotated[
+    Path | None,
+    typer.Option(
+        "-o", "--output", help="Page NAME.html; with --stereo the table NAME.csv and a page."
+    ),
+]
+RegisteredFolder = Annotated[
+    Path,
+    typer.Option("-o", "--output", help="New folder for clouds, registration.json and page."),
+]
 
+
+@job_command(TouchedPoints, None)
 def probe(
     touches: Annotated[
         Path,
@@ -74,12 +88,6 @@ def probe(
         ),
     ],
     *,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", help="Points on the surface, a CSV table.", show_default=False
-        ),
-    ] = None,
     side: Annotated[
         Side | None,
         typer.Option(
@@ -97,13 +105,12 @@ def probe(
     leave_out: Annotated[
         bool, typer.Option("--leave-out", help="Leave out touches that do not fit the others.")
     ] = False,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Fit the plane of a plate to touches; the tip's radius is taken off on the side of the probe.
+) -> Work:
+    """Fit the plane of a plate to touches.
 
-    A touch that does not fit the others is named. In probe.toml: centre_tool_mm = [x, y, z] and
-    tip_diameter_mm = 6.0. A table of tip centres says so in its first line:
+    The tip's radius is taken off on the side of the probe. A touch that does not fit the others is
+    named. In probe.toml: centre_tool_mm = [x, y, z] and tip_diameter_mm = 6.0. A table of tip
+    centres says so in its first line:
     # point = tip-centre, tip_diameter_mm = 6
     """
     from armscan.calibration.hand_eye.probed_plate import ProbingOptions
@@ -112,14 +119,10 @@ def probe(
     options = ProbingOptions(
         side=None if side is None else side.value, leave_out_outliers=leave_out, feature=feature
     )
-    run(
-        lambda job: probe_plate(job, touches, probe, options),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
+    return lambda job: probe_plate(job, touches, probe, options)
 
 
+@job_command(MarkerFile, None)
 def markers(
     *,
     images: Annotated[
@@ -132,12 +135,6 @@ def markers(
     ],
     stereo: Annotated[
         Path | None, typer.Option(help="Calibration of two cameras: match and triangulate.")
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", help="Page NAME.html; with --stereo the table NAME.csv and a page."
-        ),
     ] = None,
     diameter: Annotated[
         float | None, typer.Option(help="Outer diameter of the markers, mm; with --stereo.")
@@ -159,10 +156,11 @@ def markers(
     ] = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Find ring markers in images; with two calibrated cameras, where they are."""
+) -> Work:
+    """Find ring markers in images.
+
+    With two calibrated cameras, also where they are.
+    """
     from armscan.errors import OptionError
     from armscan.jobs.markers import find_markers, measure_markers
     from armscan.markers.candidates import RingMatchOptions, parse_depth
@@ -189,20 +187,16 @@ def markers(
     depth_mm = parse_depth(depth) if depth else None
     matching = given(RingMatchOptions, depth_mm=depth_mm, diameter_mm=diameter)
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
-    run(
-        lambda job: (
-            find_markers(job, images, rings=rings, image_options=pixels, codes=code or ())
-            if stereo is None
-            else measure_markers(
-                job, images, stereo, rings=rings, matching=matching, image_options=pixels
-            )
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
+    return lambda job: (
+        find_markers(job, images, rings=rings, image_options=pixels, codes=code or ())
+        if stereo is None
+        else measure_markers(
+            job, images, stereo, rings=rings, matching=matching, image_options=pixels
+        )
     )
 
 
+@job_command(RegisteredFolder, Path("registered"), also="")
 def register(
     lists: Annotated[
         list[Path],
@@ -213,10 +207,6 @@ def register(
         ),
     ],
     *,
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", help="New folder for clouds, registration.json and page."),
-    ] = Path("registered"),
     moved: Annotated[
         Path | None,
         typer.Option(
@@ -252,13 +242,12 @@ def register(
         typer.Option("--by-id", help="With --moved: equal ids in both lists are one marker."),
     ] = False,
     method: MethodOption = None,
-    as_json: AsJson = False,
-) -> None:
-    """Join scans by markers: views of a handheld scanner, or an arm that moved to a new place.
+) -> Work:
+    """Join scans by ring markers.
 
-    Markers carry no numbers: they are recognised by their distances, and what fits in more than
-    one way is refused. Views are joined in the frame of the first one; an arm that moved goes on
-    in its old frame.
+    Views of a handheld scanner are joined in the frame of the first one; an arm that was moved to
+    a new place goes on in its old frame. Markers carry no numbers: they are recognised by their
+    distances, and what fits in more than one way is refused.
     """
     from armscan.jobs.register import register as register_scans
     from armscan.markers.alignments import MarkerMatchOptions
@@ -271,8 +260,4 @@ def register(
         is_by_id=by_id,
         is_by_thesis=method is Method.THESIS,
     )
-    run(
-        lambda job: register_scans(job, lists, moved=moved, clouds=cloud or (), options=options),
-        as_json=as_json,
-        output=output,
-    )
+    return lambda job: register_scans(job, lists, moved=moved, clouds=cloud or (), options=options)

@@ -4,19 +4,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armscan.cli.delivery import run
+from armscan.cli.delivery import Work, job_command
 from armscan.cli.options import (
     ArmFile,
-    AsJson,
     BitsAlign,
     BitsUsed,
-    Cache,
     EulerAngles,
-    Force,
     LaserColourOption,
     Method,
     MethodOption,
@@ -25,6 +22,9 @@ from armscan.cli.options import (
     refuse_given,
     refuse_vain,
 )
+
+if TYPE_CHECKING:
+    from armscan.report.quantity import Summary
 
 EXIT_INPUT = 2
 OF_IMAGES = (
@@ -102,7 +102,22 @@ Volume = Annotated[
     str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
 ]
 
+CloudsPlace = Annotated[
+    Path,
+    typer.Option(
+        "-o", "--output", help="Cloud to write: .ply, or as `convert`; a folder for many."
+    ),
+]
+CloudFile = Annotated[
+    Path, typer.Option("-o", "--output", help="Cloud to write: .ply, or as `convert`.")
+]
 
+
+def _code(summary: Summary) -> int:
+    return EXIT_INPUT if summary.extra.get("n_failed") else 0
+
+
+@job_command(CloudsPlace, Path("cloud.ply"), also="cache force", code=_code)
 def reconstruct(
     context: typer.Context,
     *,
@@ -125,24 +140,15 @@ def reconstruct(
     arm: ArmFile = None,
     poses: ProfilePoses = None,
     euler: EulerAngles = None,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", help="Cloud to write: .ply, or as `convert`; a folder for many."
-        ),
-    ] = Path("cloud.ply"),
     method: MethodOption = None,
     stripe_method: StripeMethodOption = None,
     laser_colour: LaserColourOption = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
-    cache: Cache = True,
     profile: ProfileOption = False,
     cluster: ClusterOption = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Measure points from a recording of a scan, or from images of laser lines on objects."""
+) -> Work:
+    """Measure points from recordings of scans, or from images."""
     from armscan.jobs.reconstruct import PoseTable, StillPaths
     from armscan.jobs.reconstruct import reconstruct as reconstruct_points
     from armscan.pipeline.cluster.extraction import ClusterAddress
@@ -159,30 +165,23 @@ def reconstruct(
         sheet=sheet,
         is_by_thesis=method is Method.THESIS,
     )
-    summary = run(
-        lambda job: reconstruct_points(
-            job,
-            sensor,
-            StillPaths(*(tuple(one or ()) for one in names)),
-            volume=volume,
-            arm=arm,
-            poses=None if poses is None else given(PoseTable, path=poses, euler=euler),
-            options=options,
-            image_options=given(ImageOptions, bits_used=bits_used, align=bits_align),
-            is_profiled=profile,
-            cluster=None if cluster is None else ClusterAddress(cluster),
-            voxel_mm=voxel,
-            tell=lambda line: typer.echo(line, err=True),
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
-        cache=cache,
+    return lambda job: reconstruct_points(
+        job,
+        sensor,
+        StillPaths(*(tuple(one or ()) for one in names)),
+        volume=volume,
+        arm=arm,
+        poses=None if poses is None else given(PoseTable, path=poses, euler=euler),
+        options=options,
+        image_options=given(ImageOptions, bits_used=bits_used, align=bits_align),
+        is_profiled=profile,
+        cluster=None if cluster is None else ClusterAddress(cluster),
+        voxel_mm=voxel,
+        tell=lambda line: typer.echo(line, err=True),
     )
-    if summary.extra.get("n_failed"):
-        raise typer.Exit(EXIT_INPUT)
 
 
+@job_command(CloudFile, Path("fused.ply"))
 def fuse(
     clouds: Annotated[
         list[Path], typer.Argument(help="Clouds in one frame, .ply or text.", show_default=False)
@@ -191,21 +190,14 @@ def fuse(
     voxel: Annotated[
         float, typer.Option("--voxel", help="Edge of a voxel, mm.", show_default=False)
     ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Cloud to write: .ply, or as `convert`.")
-    ] = Path("fused.ply"),
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Thin clouds to one point a voxel: averaged by weight, with what is left of their sigma."""
+) -> Work:
+    """Thin clouds to one point a voxel.
+
+    Points are averaged by weight, with what is left of their sigma.
+    """
     from armscan.jobs.fuse import fuse as fuse_clouds
 
-    run(
-        lambda job: fuse_clouds(job, clouds, voxel),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
+    return lambda job: fuse_clouds(job, clouds, voxel)
 
 
 def _check_poses(context: typer.Context, poses: Path | None, euler: str | None) -> None:

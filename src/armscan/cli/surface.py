@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.delivery import run
+from armscan.cli.delivery import Work, job_command
 from armscan.cli.inspect import CloudArgument
-from armscan.cli.options import AsJson, Force, RegionOption, given, numbers
+from armscan.cli.options import RegionOption, given, numbers
 
 CLEAN_EXAMPLE = (
     "\b\nExample:\n  armscan clean part.ply -o cleaned.ply --max-incidence 60 --isolated 0.5 "
@@ -19,14 +19,19 @@ CLEAN_EXAMPLE = (
 )
 MESH_EXAMPLE = "\b\nExample:\n  armscan mesh cloud.ply -o part.stl --cell 0.3"
 
+CleanedCloud = Annotated[
+    Path, typer.Option("-o", "--output", help="Cloud to write; a page goes beside it.")
+]
+MeshFile = Annotated[
+    Path,
+    typer.Option("-o", "--output", help="Mesh to write: .stl or .ply.", show_default=False),
+]
 
+
+@job_command(CleanedCloud)
 def clean(
     cloud: CloudArgument,
     *,
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", help="Cloud to write; a page goes beside it."),
-    ],
     region: RegionOption = "",
     max_incidence: Annotated[
         float | None,
@@ -64,10 +69,8 @@ def clean(
         float | None,
         typer.Option(help="Keep one point a cell of this size, mm."),
     ] = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Take outliers, grazing points, edges, overlap and excess out of a cloud."""
+) -> Work:
+    """Take outliers, edges, overlap and excess out of a cloud."""
     from armscan.geometry.arrays import Box
     from armscan.inspection.cleaning import CleaningOptions
     from armscan.jobs.inspection.cleaning import clean as clean_file
@@ -84,18 +87,15 @@ def clean(
         overlap_mm=overlap,
         density_mm=density,
     )
-    run(lambda job: clean_file(job, cloud, options), as_json=as_json, output=output, force=force)
+    return lambda job: clean_file(job, cloud, options)
 
 
+@job_command(MeshFile)
 def mesh(
     cloud: Annotated[
         Path, typer.Argument(help="A cloud of `armscan reconstruct`.", show_default=False)
     ],
     *,
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", help="Mesh to write: .stl or .ply.", show_default=False),
-    ],
     cell: Annotated[
         float | None,
         typer.Option(
@@ -117,9 +117,7 @@ def mesh(
             help="Keep about so many triangles, fewest where it is flat.", show_default=False
         ),
     ] = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Work:
     """Draw triangles where points were measured; holes stay open.
 
     The surface is smooth over a cell: edges are rounded by about one, and a round face of radius R
@@ -129,9 +127,4 @@ def mesh(
     from armscan.reconstruction.surface import SurfaceOptions
 
     options = given(SurfaceOptions, cell_mm=cell, reach_mm=reach)
-    run(
-        lambda job: draw_mesh(job, cloud, options=options, n_triangles=triangles),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
+    return lambda job: draw_mesh(job, cloud, options=options, n_triangles=triangles)

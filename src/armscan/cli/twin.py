@@ -82,7 +82,10 @@ def demo(
     ] = "thesis",
     as_json: AsJson = False,
 ) -> None:
-    """Render images, calibrate from them, measure things, and state the errors."""
+    """Show the whole chain on simulated images.
+
+    Images are rendered, calibrated from and measured in, and the errors are stated.
+    """
     from armscan.devices.sources import Preset
     from armscan.jobs.demo import DemoRequest, run_all_heads, run_head_demo, run_photo_demo
     from armscan.jobs.inspection.demo import run_workpiece_demo
@@ -158,7 +161,9 @@ def simulate(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Render a recording of the digital twin; NAME.truth.json beside it says what it was made from.
+    """Render a recording of the digital twin.
+
+    NAME.truth.json beside it says what it was made from.
 
     Scenes: camera and laser are images of a target for the head's calibration; hand-eye is the
     plate from many postures; plate, ball, steps, part and waves are scans by hand; still-step is

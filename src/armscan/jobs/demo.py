@@ -151,7 +151,9 @@ def _check_replaceable(folder: Path) -> None:
     listing = folder / FILES
     listed = listing.read_text("utf-8").splitlines() if listing.is_file() else []
     foreign = [name for name in _files_in(folder) if name not in listed]
-    if foreign or (folder.exists() and not folder.is_dir()):
+    if folder.exists() and not folder.is_dir():
+        raise OutputError("this is a file", where=str(folder), remedy="name a new or empty folder")
+    if foreign:
         raise OutputError(
             f"the folder holds other files than a demo's ({', '.join(foreign[:3])})",
             where=str(folder),

@@ -26,25 +26,22 @@ from armscan.models.calibration import (
     HAND_EYE_PARAMETER_NAMES,
     CameraCalibration,
     Provenance,
-    ScannerCalibration,
     SecondCamera,
     SensorCalibration,
     SheetCalibration,
 )
 from armscan.models.camera import PARAMETER_NAMES
-from armscan.models.two_views import StereoCalibration
 from armscan.reconstruction.sync import exposure_poses, largest_gap_ns
 from armscan.records.cloud import PointCloud
 from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
 from armscan.report.quantity import Summary, Table, fact, with_sigma
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
-from armscan.storage.clouds import parse_ply, read_cloud, read_ply
+from armscan.storage.clouds import BY_SUFFIX, parse_ply, read_cloud, read_ply
 from armscan.storage.codec import parse_json
 from armscan.storage.documents import (
     REGISTRATION_SCHEMA,
     SCANNER_SCHEMA,
     STEREO_SCHEMA,
-    Registration,
     read_calibration,
     read_camera_calibration,
     read_registration,
@@ -52,6 +49,7 @@ from armscan.storage.documents import (
     read_stereo_calibration,
 )
 from armscan.storage.files import files_in, holds_files, is_file, read_bytes
+from armscan.storage.formats.columns import COVARIANCE
 from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import image_format, read_exposure
 from armscan.storage.observations import read_observations
@@ -60,8 +58,9 @@ from armscan.storage.recording import FolderRecording, is_recording, read_arm_tr
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 
 
-def describe_registration(document: Registration) -> dict[str, Any]:
+def describe_registration(path: Path) -> dict[str, Any]:
     """Scans, markers and evidence of ``registration.json``."""
+    document = read_registration(path)
     return {
         "what": f"registration by markers ({document.kind}), {len(document.transforms)} scans in "
         f"the {document.common_frame} frame of {document.common_frame_of}",
@@ -76,8 +75,9 @@ def describe_registration(document: Registration) -> dict[str, Any]:
     }
 
 
-def describe_stereo(calibration: StereoCalibration) -> dict[str, Any]:
-    """Cameras, relative pose and evidence of ``stereo.json``, origin apart."""
+def describe_stereo(path: Path) -> dict[str, Any]:
+    """Cameras, relative pose, evidence and origin of ``stereo.json``."""
+    calibration = read_stereo_calibration(path)
     left, right = calibration.left.camera, calibration.right.camera
     pose = calibration.right_from_left
     angle = float(np.rad2deg(np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0))))
@@ -99,7 +99,7 @@ def describe_stereo(calibration: StereoCalibration) -> dict[str, Any]:
             content["hold_out_rms_px"] = known.hold_out_rms_px
         content["intrinsics"] = known.intrinsics
         content["taken_apart"] = [name for name, _ in known.left_out]
-    return content
+    return content | _origin(calibration.provenance)
 
 
 NS_PER_S = 1e9
@@ -142,8 +142,9 @@ def describe_touches(folder: Path) -> dict[str, Any]:
     return content | _notes((), notes)
 
 
-def describe_scanner(calibration: ScannerCalibration) -> dict[str, Any]:
-    """Values of the hand-eye with their uncertainty, and what it rests on."""
+def describe_scanner(path: Path) -> dict[str, Any]:
+    """Values of the hand-eye with their uncertainty, what it rests on, and its origin."""
+    calibration = read_scanner_calibration(path)
     hand_eye = calibration.hand_eye
     sensor = calibration.sensor
     second = None if sensor is None else sensor.second
@@ -166,6 +167,7 @@ def describe_scanner(calibration: ScannerCalibration) -> dict[str, Any]:
         **({} if known is None else {"method": known.method, "condition": known.condition}),
         "latency_ns": calibration.latency_ns,
         **({} if timed is None else {"latency_sigma_ns": timed}),
+        **_origin(calibration.provenance),
     }
 
 
@@ -335,6 +337,10 @@ def _line(key: str, value: Any) -> str:
     return f"{key.replace('_', ' ')}: {f'{value:.6g}' if isinstance(value, float) else value}"
 
 
+CLOUDS = tuple(suffix for suffix in BY_SUFFIX if suffix not in (".ply", ".csv"))
+"""Suffixes of files that are read as clouds, whatever is in them."""
+
+
 def _file(path: Path) -> dict[str, Any]:
     data = read_bytes(path)
     if image_format(data):
@@ -343,9 +349,15 @@ def _file(path: Path) -> dict[str, Any]:
         return _ply(path, data)
     if data.startswith(b"PK"):
         return _observations(path)
-    if path.suffix.lower() in BINARY_CLOUDS:
+    if path.suffix.lower() in CLOUDS or _is_own_table(data):
         return _cloud(read_cloud(path))
     return _text(path, data)
+
+
+def _is_own_table(data: bytes) -> bool:
+    """Whether this is a cloud that armscan wrote as CSV; probed points have other columns."""
+    heading = data.partition(b"\n")[0].decode("utf-8", "replace")
+    return not COVARIANCE.keys().isdisjoint(heading.split(","))
 
 
 def _text(path: Path, data: bytes) -> dict[str, Any]:
@@ -361,7 +373,7 @@ def _text(path: Path, data: bytes) -> dict[str, Any]:
     raise FileFormatError(
         "armscan does not know this kind of file",
         where=str(path),
-        remedy="give an image, a calibration, a PLY cloud, probed points or a folder",
+        remedy="give an image, a calibration, a cloud, probed points, a recording or a folder",
     )
 
 
@@ -397,9 +409,6 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
             ]
     content["properties"] = fields
     return content
-
-
-BINARY_CLOUDS = (".e57", ".laz", ".las", ".pcd")
 
 
 def _cloud(cloud: PointCloud) -> dict[str, Any]:
@@ -450,24 +459,10 @@ def _calibration(path: Path) -> dict[str, Any]:
     return _sensor(document)
 
 
-def _scanner(path: Path) -> dict[str, Any]:
-    document = read_scanner_calibration(path)
-    return {**describe_scanner(document), **_origin(document.provenance)}
-
-
-def _stereo(path: Path) -> dict[str, Any]:
-    document = read_stereo_calibration(path)
-    return {**describe_stereo(document), **_origin(document.provenance)}
-
-
-def _registration(path: Path) -> dict[str, Any]:
-    return describe_registration(read_registration(path))
-
-
 DESCRIBE_SCHEMA: dict[str, Callable[[Path], dict[str, Any]]] = {
-    SCANNER_SCHEMA: _scanner,
-    STEREO_SCHEMA: _stereo,
-    REGISTRATION_SCHEMA: _registration,
+    SCANNER_SCHEMA: describe_scanner,
+    STEREO_SCHEMA: describe_stereo,
+    REGISTRATION_SCHEMA: describe_registration,
 }
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from armscan.models.arm import thesis_arm
 from armscan.records.recording import ArmTrack
 from armscan.report.quantity import summary_json, summary_text
 from armscan.storage.arm import ProbeTip, arm_model_toml, write_probing
+from armscan.storage.clouds import read_cloud, write_cloud
 from armscan.storage.documents import scanner_document
 from rigs.calibration_documents import scanner_calibration
 from rigs.recording_folders import ARM, EXPOSURES, lab_folder
@@ -102,6 +104,17 @@ def test_touches_probe_arm_and_probed_points(tmp_path: Path) -> None:
     found = described(points)
     assert found["what"] == "2 probed points, centres of the tip"
     assert found["y_range_mm"] == [-5.0, 2.0]
+
+
+def test_clouds_as_text_are_described_as_clouds(tmp_path: Path) -> None:
+    """A table that armscan wrote of a cloud is no list of probed points."""
+    plain, own = tmp_path / "cloud.xyz", tmp_path / "cloud.csv"
+    plain.write_text("1 2 3\n4 -5 6\n")
+    assert described(plain)["what"] == "point cloud, 2 points"
+    assert described(plain)["y_range"] == [-5.0, 2.0]
+    write_cloud(own, replace(read_cloud(plain), frame="Base"))
+    assert described(own)["what"] == "point cloud, 2 points"
+    assert described(own)["frame"] == "Base"
 
 
 def test_other_tables_are_refused(tmp_path: Path) -> None:

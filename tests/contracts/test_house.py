@@ -116,3 +116,21 @@ def test_commands_that_pages_show_exist(page: str, line: str) -> None:
     assert options <= known, f"{page} shows {line}"
     if getattr(node, "commands", None):
         assert options or not words, f"{page} shows the unknown command {words[0]}"
+
+
+def unnamed_options(node: Any, named: set[str], path: str = "armscan") -> list[str]:
+    """Options of a command and of those below it of which no name is among these."""
+    names = [(*one.opts, *one.secondary_opts) for one in node.params if one.opts[0][0] == "-"]
+    found = [f"{path} {' '.join(one)}" for one in names if not named & set(one)]
+    for name, child in getattr(node, "commands", {}).items():
+        found += unnamed_options(child, named, f"{path} {name}")
+    return found
+
+
+def test_the_commands_page_names_every_option() -> None:
+    page = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
+    named = set(re.findall(r"(?<![\w-])--[a-z][\w-]*", page))
+    assert (
+        unnamed_options(command(), named | {"-o", "--help", "--version", "--show-completion"}) == []
+    )
+    assert "armscan verify --mpe" in unnamed_options(command(), named - {"--mpe"})

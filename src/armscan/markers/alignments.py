@@ -88,13 +88,10 @@ class Matched:
         Pairs and motion.
     n_rival
         Markers that the best other alignment explains.
-    log10_false_alarms
-        Logarithm of the count of alignments as good that chance alone would give.
     """
 
     alignment: Alignment
     n_rival: int
-    log10_false_alarms: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -130,7 +130,7 @@ def _judged(
     if n < options.least_common:
         fact = f"{n} markers agree, and {options.least_common} are asked for"
         return NoMatch(fact, ENOUGH_MARKERS, n)
-    return Matched(found[0], rival, chance)
+    return Matched(found[0], rival)
 
 
 def _ambiguity(

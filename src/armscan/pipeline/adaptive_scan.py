@@ -193,18 +193,6 @@ class ChosenLasers:
         return self.scan.expose(row, self.lasers[row])
 
 
-def scan_adaptively(
-    scan: SimulatedScan,
-    scanner: ScannerCalibration,
-    labeller: StripeLabeller,
-    *,
-    keep: Keep | None = None,
-) -> ChosenLasers:
-    """Take all passes of a scan one after the other; parameters and errors as of `take_pass`."""
-    taken = [take_pass(scan, rows, labeller, scanner, keep=keep) for rows in scan_passes(scan.rows)]
-    return ChosenLasers.of_passes(scan, taken)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rig:
     """What takes passes in one process: a scene of a twin, of each pass its first exposures."""

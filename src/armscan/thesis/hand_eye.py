@@ -223,8 +223,6 @@ class TwoStepHandEye:
         1 if the centre lies where the sheet's normal points, -1 if on the other side.
     shifted
         Names of the exposures from which the rotation came.
-    rotation_misfit_mm
-        Root mean square of what eq. 2.49 leaves.
     centre_misfit_mm
         (n,) distance of each exposure's placed centre from the mean one.
     left_out
@@ -235,7 +233,6 @@ class TwoStepHandEye:
     centre_mm: FloatArray
     side: int
     shifted: tuple[str, ...]
-    rotation_misfit_mm: float
     centre_misfit_mm: FloatArray
     left_out: tuple[str, ...]
 
@@ -314,7 +311,7 @@ def _solve(
     first = rotation_from_shifts([poses[k] for k in shifted], centres[shifted])
     if isinstance(first, FitFailure):
         return first
-    rotation, misfit = first
+    rotation, _ = first
     second = translation_from_turns(poses, centres @ rotation.T)
     if isinstance(second, FitFailure):
         return second
@@ -329,7 +326,6 @@ def _solve(
         middle,
         side,
         tuple(sections[k].stripe.source for k in shifted),
-        misfit,
         np.asarray(np.linalg.norm(placed - middle, axis=1)),
         left_out,
     )

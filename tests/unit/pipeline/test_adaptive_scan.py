@@ -15,7 +15,6 @@ from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.pipeline.adaptive_scan import (
     ChosenLasers,
     TakenPass,
-    scan_adaptively,
     scan_passes,
     take_pass,
 )
@@ -126,7 +125,11 @@ def test_passes_end_at_pauses() -> None:
 def test_what_the_namer_asks_for_is_exposed_and_named() -> None:
     scan, namer = DarkScan(), Counting()
     kept: list[int] = []
-    chosen = scan_adaptively(scan, scanner(), namer, keep=lambda row, exposure: kept.append(row))
+    taken = [
+        take_pass(scan, r, namer, scanner(), keep=lambda row, exposure: kept.append(row))
+        for r in scan_passes(scan.rows)
+    ]
+    chosen = ChosenLasers.of_passes(scan, taken)
     assert tuple(on for _, on in scan.asked) == EXPECTED
     assert [t_ns for *_, t_ns in namer.told] == TIMES_NS
     # the arm's pose of row 2 is not known: the namer is told so, nothing is made up

@@ -346,7 +346,6 @@ def _matched(
     apart_left_px, apart_right_px = epipolar_distances_px(views, left_px, right_px)
     return MatchedPoints(
         left_px=left_px,
-        right_px=right_px,
         in_left_px=apart_left_px,
         in_right_px=apart_right_px,
         depth_mm=sensor_from_board.apply(left.points_board_mm[in_left])[:, 2],

@@ -69,8 +69,8 @@ class MatchedPoints(RowRecord):
 
     Parameters
     ----------
-    left_px, right_px
-        (K, 2) pixels.
+    left_px
+        (K, 2) pixels in the left image.
     in_left_px, in_right_px
         (K,) signed distances from each other's epipolar lines, see
         `armscan.models.two_views.epipolar_distances_px`.
@@ -79,7 +79,6 @@ class MatchedPoints(RowRecord):
     """
 
     left_px: FloatArray = floats("N", 2)
-    right_px: FloatArray = floats("N", 2)
     in_left_px: FloatArray = floats("N")
     in_right_px: FloatArray = floats("N")
     depth_mm: FloatArray = floats("N")

@@ -184,11 +184,6 @@ class HandEyeSolution:
                 return float(sigma)
         return 0.0
 
-    def log_sigma_of(self, name: str) -> float:
-        """Standard deviation of the logarithm of that; 0 where it was given."""
-        k = [component.name for component in self.components].index(name)
-        return float(np.sqrt(self.noise.log_covariance[k, k]))
-
     def scatter_of(self, name: str, rows: IntArray) -> FloatArray:
         """(n, n) covariance of some residuals by one cause of scatter, a pose's turns included."""
         found = np.zeros((len(rows), len(rows)))

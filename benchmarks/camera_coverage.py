@@ -19,27 +19,13 @@ from scipy import stats
 
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
-from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard, CircleGrid
 from rigs.camera_scene import CAMERA, Scene, make_views, normalised_error
+from rigs.plain_scanner import plain_camera
 
-WIDE = CameraModel(
-    fx_px=533.0,
-    fy_px=534.0,
-    cx_px=342.0,
-    cy_px=236.0,
-    distortion=np.array([-0.29, 0.11, 1e-3, 0.0, 0.0]),
-    width_px=640,
-    height_px=480,
-)
-HEAD = CameraModel(
-    fx_px=5150.0,
-    fy_px=5152.0,
-    cx_px=1540.0,
-    cy_px=1020.0,
-    distortion=np.array([-0.08, 0.15, 2e-4, -3e-4, 0.0]),
-    width_px=3072,
-    height_px=2048,
+WIDE = plain_camera((533.0, 534.0), (342.0, 236.0), (640, 480), [-0.29, 0.11, 1e-3, 0.0, 0.0])
+HEAD = plain_camera(
+    (5150.0, 5152.0), (1540.0, 1020.0), (3072, 2048), [-0.08, 0.15, 2e-4, -3e-4, 0.0]
 )
 GEOMETRIES = {
     "12 views, 11x9 grid, 2048x1536, noise 0.05 px": Scene(),

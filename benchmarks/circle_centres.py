@@ -32,6 +32,7 @@ from armscan.vision.targets.circle_edges import measure_circles
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import CircleGrid, TargetView
+from rigs.plain_scanner import plain_camera
 from rigs.slow_renderer import add_noise
 
 TARGET = CircleGrid(13, 9, 3.75)
@@ -113,15 +114,7 @@ def accuracy() -> None:
         )
     ]
     k = DISTORTION
-    model = CameraModel(
-        fx_px=FOCAL_PX,
-        fy_px=FOCAL_PX,
-        cx_px=1535.5,
-        cy_px=1023.5,
-        distortion=k,
-        width_px=WIDTH_PX,
-        height_px=HEIGHT_PX,
-    )
+    model = plain_camera(FOCAL_PX, (1535.5, 1023.5), (WIDTH_PX, HEIGHT_PX), k)
     errors: dict[tuple[str, float], list[FloatArray]] = defaultdict(list)
     for seed, (tilt, azimuth, blur, gradient, is_light) in enumerate(conditions):
         rotation, translation = pose(tilt, azimuth, 17.0 * seed)

@@ -31,6 +31,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard, TargetView
 from rigs.camera_scene import Scene, make_views, normalised_error
+from rigs.plain_scanner import plain_camera
 
 MODELS = ("k1", "k1k2", "k1k2p1p2", "k1k2p1p2k3")
 ROWS = [
@@ -64,14 +65,11 @@ def draw_camera(model: str, rng: np.random.Generator) -> CameraModel:
         "p2": rng.normal(0.0, 7e-4),
     }
     distortion = [values[name] if name in has else 0.0 for name in ("k1", "k2", "p1", "p2", "k3")]
-    return CameraModel(
-        fx_px=f,
-        fy_px=f * rng.uniform(0.998, 1.002),
-        cx_px=0.5 * width * rng.uniform(0.97, 1.03),
-        cy_px=0.5 * height * rng.uniform(0.97, 1.03),
-        distortion=np.array(distortion),
-        width_px=width,
-        height_px=height,
+    return plain_camera(
+        (f, f * rng.uniform(0.998, 1.002)),
+        (0.5 * width * rng.uniform(0.97, 1.03), 0.5 * height * rng.uniform(0.97, 1.03)),
+        (width, height),
+        np.array(distortion),
     )
 
 

@@ -24,13 +24,13 @@ from armscan.models.calibration import (
     CameraCalibration,
     SecondCamera,
     SensorCalibration,
-    SheetCalibration,
 )
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.label_stereo import StereoLabeller
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
+from rigs.plain_scanner import stored_sheet
 from rigs.sheet_rig import PROVENANCE
 from rigs.stereo_head import DEPTHS_MM, StereoHead
 
@@ -74,14 +74,13 @@ def true_sensor(truth: Any) -> SensorCalibration:
 
     names = sorted(truth.sheet_points_mm, key=lambda name: int(name.split(".")[1]))
     sheets = tuple(
-        SheetCalibration(
-            name=name,
-            sheet=fitted(truth.sheet_points_mm[name]),
+        stored_sheet(
+            name,
+            fitted(truth.sheet_points_mm[name]),
+            DEPTHS_MM,
             rms_mm=0.004,
             n_boards=12,
             n_points=6000,
-            depth_range_mm=DEPTHS_MM,
-            is_redundant=True,
         )
         for name in names
     )

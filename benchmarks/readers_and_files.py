@@ -14,26 +14,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from armscan.geometry.poses import CameraRight, Pose, Sensor, Tool
-from armscan.geometry.shapes import Plane, fit_plane
+from armscan.geometry.poses import CameraRight, Pose, Sensor
+from armscan.geometry.shapes import fit_plane
 from armscan.jobs.info import describe_files
-from armscan.models.calibration import (
-    ArmNoise,
-    CameraCalibration,
-    CameraDiagnostics,
-    FTest,
-    HandEyeCalibration,
-    HandEyeDiagnostics,
-    Provenance,
-    ScannerCalibration,
-    SensorCalibration,
-    SensorDiagnostics,
-    SheetCalibration,
-    SheetDiagnostics,
-    WarpedBoard,
-)
-from armscan.models.camera import CameraModel
-from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import StereoCalibration, StereoDiagnostics
 from armscan.pipeline.live.rig import read_rig
 from armscan.records.cloud import PointCloud
@@ -73,6 +56,13 @@ from armscan.storage.recordings import write_mcap
 from armscan.storage.recordings.mcap_folder import folder_in
 from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.vision.targets.target import TargetView
+from rigs.calibration_documents import (
+    camera_calibration,
+    covariance,
+    provenance,
+    scanner_calibration,
+    sensor_calibration,
+)
 
 Files = dict[str, bytes]
 
@@ -102,138 +92,22 @@ class Reader:
 # valid files ------------------------------------------------------------------------------------
 
 WIDTH_PX, HEIGHT_PX = 64, 48
-AXES = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
-
-
-def _covariance(n: int) -> Any:
-    values = 1.0 / np.arange(2, 2 + n)
-    return np.outer(values, values) / 7 + np.diag(values) / 1e3
-
-
-PROVENANCE = Provenance(
-    document_id="3f0c1a9e-0000-4000-8000-000000000001",
-    created_utc="2026-01-02T03:04:05+00:00",
-    armscan_version="0.1.0",
-    command=("armscan", "calibrate"),
-    inputs=(),
-)
-TEST = FTest(f_ratio=1.5, degrees_of_freedom=3, p_value=0.25)
 PLATE = "x_mm,y_mm,z_mm\n" + "".join(
     f"{30.0 * i:.1f},{40.0 * j:.1f},{500 + 0.01 * (i + j)}\n" for i in range(4) for j in range(3)
 )
 
 
-def _camera() -> CameraCalibration:
-    return CameraCalibration(
-        camera=CameraModel(
-            fx_px=477.0,
-            fy_px=478.0,
-            cx_px=320.0,
-            cy_px=240.0,
-            distortion=np.array([0.1, -0.2, 0, 0, 0.3]),
-            width_px=640,
-            height_px=480,
-        ),
-        covariance=_covariance(9),
-        has_covariance=True,
-        rms_px=0.3,
-        sigma_point_px=0.1,
-        n_views=16,
-        n_points=1056,
-        covered_px=np.array([10.0, 20.0, 600.0, 400.0]),
-        provenance=PROVENANCE,
-        diagnostics=CameraDiagnostics(
-            free_parameters=("fx_px", "k1"),
-            model_reason="k2 does not pay",
-            hold_out_rms_px=0.4,
-            n_folds=8,
-            condition=1e3,
-            noise_scale=1.1,
-            covered_fraction=0.7,
-            board=WarpedBoard(bow_mm=(0.03, -0.2), sigma_mm=(1e-3, 2e-3), test=TEST),
-        ),
-    )
-
-
-def _sensor() -> SensorCalibration:
-    sheets = tuple(
-        SheetCalibration(
-            name=name,
-            sheet=LightSheet(
-                origin_mm=np.array([1.0, 2.0, 300.0]),
-                axes=AXES,
-                scale_mm=13.0,
-                bow_mm=np.arange(5) / 70,
-            ),
-            rms_mm=0.03,
-            n_boards=3,
-            n_points=900,
-            depth_range_mm=(212.0, 290.0),
-            is_redundant=True,
-            diagnostics=SheetDiagnostics(
-                rms_px=0.1,
-                plane_test=TEST,
-                final_test=TEST,
-                bow_decision="it pays",
-                coplanarity_mm=0.01,
-                coplanarity_sigma_mm=0.02,
-                board_angle_deg=37.5,
-            ),
-        )
-        for name in ("A", "B")
-    )
-    return SensorCalibration(
-        camera=_camera(),
-        sheets=sheets,
-        covariance=_covariance(25),
-        provenance=PROVENANCE,
-        diagnostics=SensorDiagnostics(
-            noise_factor=1.2, correlation_points=3.4, naming="one sheet in each image"
-        ),
-    )
-
-
-def _scanner() -> ScannerCalibration:
-    pose: Pose[Tool, Sensor] = Pose(AXES.T, np.array([-149.94, 714.56, 0.3]))
-    hand_eye = HandEyeCalibration(
-        tool_from_sensor=pose,
-        covariance=_covariance(6),
-        dhand_eye_dsensor=np.arange(150).reshape(6, 25) / 7,
-        arm_noise=ArmNoise(position_mm=0.02, rotation_rad=1e-5),
-        rms_mm=0.03,
-        n_postures=12,
-        n_exposures=36,
-        n_points=9000,
-        plate=Plane(point_mm=np.array([1.0, 2.0, 300.0]), axes=AXES),
-        diagnostics=HandEyeDiagnostics(
-            method="plate",
-            rank=6,
-            condition=1e3,
-            weakest="along the laser line",
-            plate_flatness_mm=0.01,
-            flatness_length_mm=float("nan"),
-            is_noise_estimated=True,
-            left_out_rotation_deg=0.1,
-            left_out_translation_mm=0.2,
-            chi2_probability=0.3,
-        ),
-    )
-    return ScannerCalibration(
-        sensor=_sensor(), hand_eye=hand_eye, provenance=PROVENANCE, latency_ns=-1000
-    )
-
-
 def _stereo() -> StereoCalibration:
-    pose: Pose[CameraRight, Sensor] = Pose(AXES, np.array([-117.4, 0.3, 63.2]))
+    pose: Pose[CameraRight, Sensor] = Pose(np.eye(3), np.array([-117.4, 0.3, 63.2]))
     return StereoCalibration(
-        left=_camera(),
-        right=_camera(),
+        left=camera_calibration(),
+        right=camera_calibration(),
         right_from_left=pose,
-        covariance=_covariance(24),
+        covariance=covariance(24, 1),
         rms_px=0.2,
         n_pairs=9,
         n_points=800,
-        provenance=PROVENANCE,
+        provenance=provenance(),
         diagnostics=StereoDiagnostics(
             epipolar_rms_px=0.1, epipolar_mean_px=0.01, left_out=(("a and b", "too flat"),)
         ),
@@ -430,7 +304,7 @@ def _registration() -> Registration:
                 own_frame="Sensor",
                 rotation_rows=np.eye(3),
                 translation_mm=np.zeros(3),
-                covariance=_covariance(6),
+                covariance=covariance(6, 1),
                 n_markers=8,
                 rms_mm=0.01,
             ),
@@ -442,7 +316,7 @@ def _registration() -> Registration:
         not_joined=(ScanNotJoined(name="b", reason="two markers in common"),),
         chi2=12.5,
         degrees_of_freedom=11,
-        provenance=PROVENANCE,
+        provenance=provenance(),
     )
 
 
@@ -453,9 +327,9 @@ def _unsigned(document: bytes) -> bytes:
 
 def _documents() -> dict[str, Reader]:
     kinds: dict[str, tuple[bytes, Callable[[Path], object]]] = {
-        "camera.json": (camera_document(_camera()), read_camera_calibration),
-        "sensor.json": (sensor_document(_sensor()), read_calibration),
-        "scanner.json": (scanner_document(_scanner()), read_scanner_calibration),
+        "camera.json": (camera_document(camera_calibration()), read_camera_calibration),
+        "sensor.json": (sensor_document(sensor_calibration()), read_calibration),
+        "scanner.json": (scanner_document(scanner_calibration()), read_scanner_calibration),
         "stereo.json": (stereo_document(_stereo()), read_stereo_calibration),
         "registration.json": (registration_document(_registration()), read_registration),
     }

@@ -19,8 +19,8 @@ from typing import cast
 
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.features import SHAPE_KINDS, ShapeKind, fit_shape
-from armscan.storage.formats.reference_sets import ReferencePair, read_reference_pair, shape_error
 from rigs.reference_features import reference_set
+from rigs.reference_sets import ReferencePair, read_reference_pair, shape_error
 
 ARCS_DEG = (360.0, 90.0, 30.0, 15.0)
 

@@ -12,15 +12,10 @@ from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import CircleGrid, Target, TargetView
+from rigs.plain_scanner import plain_camera
 
-CAMERA = CameraModel(
-    fx_px=2300.0,
-    fy_px=2310.0,
-    cx_px=1010.0,
-    cy_px=770.0,
-    distortion=np.array([-0.12, 0.1, 6e-4, -4e-4, 0.02]),
-    width_px=2048,
-    height_px=1536,
+CAMERA = plain_camera(
+    (2300.0, 2310.0), (1010.0, 770.0), (2048, 1536), [-0.12, 0.1, 6e-4, -4e-4, 0.02]
 )
 GRID = CircleGrid(11, 9, 15.0)
 

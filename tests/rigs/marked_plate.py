@@ -11,9 +11,9 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import Provenance
-from armscan.models.camera import CameraModel
 from armscan.models.two_views import StereoCalibration
 from armscan.storage.documents import stereo_document
+from rigs.plain_scanner import plain_camera
 from rigs.ring_scenes import Mark, render, tilted
 from rigs.true_scanner import certain_camera
 
@@ -42,15 +42,7 @@ def draw_marked_plate(path: Path) -> None:
     ):
         rendered = render(marks, rotation, translation, (WIDTH, HEIGHT), focal_px=FOCAL_PX, rays=4)
         cv2.imwrite(str(path / f"{name}.png"), rendered.exposure(1).image)
-    camera = CameraModel(
-        fx_px=FOCAL_PX,
-        fy_px=FOCAL_PX,
-        cx_px=(WIDTH - 1) / 2,
-        cy_px=(HEIGHT - 1) / 2,
-        distortion=np.zeros(5),
-        width_px=WIDTH,
-        height_px=HEIGHT,
-    )
+    camera = plain_camera(FOCAL_PX, ((WIDTH - 1) / 2, (HEIGHT - 1) / 2), (WIDTH, HEIGHT))
     origin = Provenance(
         document_id="drawn",
         created_utc="2026-01-01T00:00:00+00:00",

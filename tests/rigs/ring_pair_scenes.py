@@ -15,6 +15,7 @@ from armscan.geometry.poses import Pose
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import TwoViews
 from armscan.records.points import RingImages
+from rigs.plain_scanner import plain_camera
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,14 +53,11 @@ def true_views() -> TwoViews:
         [[np.cos(turn), 0.0, np.sin(turn)], [0.0, 1.0, 0.0], [-np.sin(turn), 0.0, np.cos(turn)]]
     )
     centre = BASELINE_MM * np.array([np.cos(half), 0.0, np.sin(half)])
-    camera = CameraModel(
-        fx_px=FOCAL_PX,
-        fy_px=FOCAL_PX,
-        cx_px=(WIDTH_PX - 1) / 2.0,
-        cy_px=(HEIGHT_PX - 1) / 2.0,
-        distortion=np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0]),
-        width_px=WIDTH_PX,
-        height_px=HEIGHT_PX,
+    camera = plain_camera(
+        FOCAL_PX,
+        ((WIDTH_PX - 1) / 2.0, (HEIGHT_PX - 1) / 2.0),
+        (WIDTH_PX, HEIGHT_PX),
+        [-0.1, 0.05, 1e-3, -5e-4, 0.0],
     )
     return TwoViews(camera, camera, Pose(rotation, -rotation @ centre))
 

@@ -13,28 +13,17 @@ from armscan.errors import FileFormatError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import (
-    ArmNoise,
-    HandEyeCalibration,
     ScannerCalibration,
     SensorCalibration,
-    SheetCalibration,
 )
-from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
+from rigs.plain_scanner import plain_camera, stored_hand_eye, stored_sheet
 from rigs.sheet_rig import PROVENANCE, THESIS_PLANE
 from rigs.true_scanner import certain_camera
 
-CAMERA = CameraModel(
-    fx_px=600.0,
-    fy_px=600.0,
-    cx_px=160.0,
-    cy_px=120.0,
-    distortion=np.zeros(5),
-    width_px=320,
-    height_px=240,
-)
+CAMERA = plain_camera(600.0, (160.0, 120.0), (320, 240))
 TOOL_FROM_SENSOR: Pose[Tool, Sensor] = Pose.from_vectors([0.0, 0.0, 0.7], [41.0, 20.0, 110.0])
 PEAK, LINE_SIGMA_PX, GREY_NOISE = 180.0, 2.5, 2.0
 PERIOD_NS = 10_000_000
@@ -53,27 +42,8 @@ def scanner(latency_ns: int = 0) -> ScannerCalibration:
         bow_mm=np.zeros(5),
     )
     camera = certain_camera(CAMERA, PROVENANCE)
-    sheets = (
-        SheetCalibration(
-            name="A",
-            sheet=sheet,
-            rms_mm=0.01,
-            n_boards=6,
-            n_points=600,
-            depth_range_mm=(115.0, 160.0),
-            is_redundant=True,
-        ),
-    )
-    hand_eye = HandEyeCalibration(
-        tool_from_sensor=TOOL_FROM_SENSOR,
-        covariance=np.zeros((6, 6)),
-        dhand_eye_dsensor=None,
-        arm_noise=ArmNoise(position_mm=0.005, rotation_rad=2e-5),
-        rms_mm=0.007,
-        n_postures=12,
-        n_exposures=12,
-        n_points=8000,
-    )
+    sheets = (stored_sheet("A", sheet, (115.0, 160.0)),)
+    hand_eye = stored_hand_eye(TOOL_FROM_SENSOR)
     sensor = SensorCalibration(
         camera=camera, sheets=sheets, covariance=np.zeros((17, 17)), provenance=PROVENANCE
     )

@@ -17,6 +17,7 @@ from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.camera import CameraModel
 from armscan.records.profile import Profile
 from armscan.vision.targets.target import TargetView
+from rigs.plain_scanner import plain_camera
 
 THESIS_PLANE = np.array([-0.0042275, 0.73558, -0.67742, 91.78])
 """The thesis's printed single-line sheet, camera frame, mm."""
@@ -210,14 +211,8 @@ def placed(
 
 def thesis_rig(bow_uu_mm: float = 0.0, bow_uv_mm: float = 0.0) -> SheetRig:
     """Six tilted boards in the thesis's printed sheet, a camera of its working distance."""
-    camera = CameraModel(
-        fx_px=2600.0,
-        fy_px=2602.0,
-        cx_px=1010.0,
-        cy_px=745.0,
-        distortion=np.array([-0.12, 0.08, 4e-4, -3e-4, 0.02]),
-        width_px=2048,
-        height_px=1536,
+    camera = plain_camera(
+        (2600.0, 2602.0), (1010.0, 745.0), (2048, 1536), [-0.12, 0.08, 4e-4, -3e-4, 0.02]
     )
     tilts = (
         (0, 0, 134),

@@ -16,24 +16,13 @@ from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import TwoViews
 from armscan.vision.targets.target import CircleGrid, Target, TargetView
+from rigs.plain_scanner import plain_camera
 
-LEFT = CameraModel(
-    fx_px=2300.0,
-    fy_px=2310.0,
-    cx_px=1010.0,
-    cy_px=770.0,
-    distortion=np.array([-0.12, 0.1, 6e-4, -4e-4, 0.02]),
-    width_px=2048,
-    height_px=1536,
+LEFT = plain_camera(
+    (2300.0, 2310.0), (1010.0, 770.0), (2048, 1536), [-0.12, 0.1, 6e-4, -4e-4, 0.02]
 )
-RIGHT = CameraModel(
-    fx_px=2340.0,
-    fy_px=2335.0,
-    cx_px=1040.0,
-    cy_px=755.0,
-    distortion=np.array([-0.1, 0.08, -5e-4, 7e-4, 0.03]),
-    width_px=2048,
-    height_px=1536,
+RIGHT = plain_camera(
+    (2340.0, 2335.0), (1040.0, 755.0), (2048, 1536), [-0.1, 0.08, -5e-4, 7e-4, 0.03]
 )
 CONVERGING: Pose[CameraRight, Sensor] = Pose.from_vectors([0.02, 0.45, -0.01], [-128.0, 2.0, 35.0])
 """The axes meet about 270 mm ahead, 26 degrees apart."""

@@ -19,6 +19,7 @@ from armscan.simulation.objects.boards import (
 )
 from armscan.simulation.optics.camera import RenderCamera
 from rigs.flat_prints import ChessboardPattern
+from rigs.plain_scanner import plain_camera
 from rigs.slow_renderer import add_noise
 
 NOISE = 2.0
@@ -32,15 +33,7 @@ def camera(blur_sigma_px: float = 1.0, distorted: bool = False) -> RenderCamera:
 
 def model(distorted: bool = False) -> CameraModel:
     k = DISTORTION if distorted else (0.0,) * 5
-    return CameraModel(
-        fx_px=2000.0,
-        fy_px=2000.0,
-        cx_px=600.4,
-        cy_px=449.7,
-        distortion=np.array(k),
-        width_px=1200,
-        height_px=900,
-    )
+    return plain_camera(2000.0, (600.4, 449.7), (1200, 900), np.array(k))
 
 
 def render(

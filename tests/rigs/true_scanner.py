@@ -11,17 +11,15 @@ import numpy as np
 from armscan.devices.sources import Twin
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import (
-    ArmNoise,
     CameraCalibration,
-    HandEyeCalibration,
     Provenance,
     ScannerCalibration,
     SensorCalibration,
-    SheetCalibration,
 )
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import TwoViews
+from rigs.plain_scanner import plain_camera, stored_hand_eye, stored_sheet
 from rigs.sheet_rig import PROVENANCE
 from rigs.stereo_head import DEPTHS_MM, StereoHead
 
@@ -31,11 +29,7 @@ SENSOR_PX = (3072, 2048)
 def camera_model(parameters: FloatArray) -> CameraModel:
     """``fx fy cx cy k1 k2 p1 p2 k3`` on the full sensor."""
     fx, fy, cx, cy = map(float, parameters[:4])
-    width, height = SENSOR_PX
-    return CameraModel(
-        fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=parameters[4:],
-        width_px=width, height_px=height,
-    )  # fmt: skip
+    return plain_camera((fx, fy), (cx, cy), SENSOR_PX, parameters[4:])
 
 
 def fitted(points_mm: FloatArray) -> LightSheet:
@@ -65,16 +59,7 @@ def true_scanner(twin: Twin) -> ScannerCalibration:
         sensor = StereoHead(
             views, head.lasers, tuple(sheets.values()), head.covariance
         ).calibration()
-    hand_eye = HandEyeCalibration(
-        tool_from_sensor=truth.tool_from_sensor,
-        covariance=np.zeros((6, 6)),
-        dhand_eye_dsensor=None,
-        arm_noise=ArmNoise(position_mm=0.005, rotation_rad=2e-5),
-        rms_mm=0.007,
-        n_postures=12,
-        n_exposures=12,
-        n_points=8000,
-    )
+    hand_eye = stored_hand_eye(truth.tool_from_sensor)
     return ScannerCalibration(sensor=sensor, hand_eye=hand_eye, provenance=PROVENANCE)
 
 
@@ -95,13 +80,7 @@ def certain_camera(camera: CameraModel, provenance: Provenance | None = None) ->
 
 def _of_one_camera(camera: CameraModel, sheets: dict[str, LightSheet]) -> SensorCalibration:
     document = certain_camera(camera)
-    calibrated = tuple(
-        SheetCalibration(
-            name=name, sheet=sheet, rms_mm=0.01, n_boards=6, n_points=600,
-            depth_range_mm=DEPTHS_MM, is_redundant=True,
-        )
-        for name, sheet in sheets.items()
-    )  # fmt: skip
+    calibrated = tuple(stored_sheet(name, sheet, DEPTHS_MM) for name, sheet in sheets.items())
     n = 9 + 8 * len(calibrated)
     return SensorCalibration(
         camera=document, sheets=calibrated, covariance=np.zeros((n, n)), provenance=PROVENANCE

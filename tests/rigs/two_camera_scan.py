@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armscan.geometry.poses import Pose
-from armscan.models.calibration import ArmNoise, HandEyeCalibration, ScannerCalibration
+from armscan.models.calibration import ScannerCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import TwoViews
 from armscan.pipeline.instants import ExposurePair
@@ -17,6 +17,7 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from armscan.vision.stripe.image import StripeOptions
+from rigs.plain_scanner import stored_hand_eye
 from rigs.scan_fake import TOOL_FROM_SENSOR
 from rigs.sheet_rig import PROVENANCE
 from rigs.stereo_head import LEFT, RIGHT, RIGHT_FROM_LEFT, StereoHead, fitted_sheet, sheet_lasers
@@ -46,16 +47,7 @@ def plate_profiles(head: StereoHead) -> tuple[Profile, Profile]:
 
 def stereo_scanner(head: StereoHead) -> ScannerCalibration:
     """The head on an arm."""
-    hand_eye = HandEyeCalibration(
-        tool_from_sensor=TOOL_FROM_SENSOR,
-        covariance=np.zeros((6, 6)),
-        dhand_eye_dsensor=None,
-        arm_noise=ArmNoise(position_mm=0.005, rotation_rad=2e-5),
-        rms_mm=0.007,
-        n_postures=12,
-        n_exposures=12,
-        n_points=8000,
-    )
+    hand_eye = stored_hand_eye(TOOL_FROM_SENSOR)
     return ScannerCalibration(sensor=head.calibration(), hand_eye=hand_eye, provenance=PROVENANCE)
 
 

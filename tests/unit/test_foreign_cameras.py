@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError, InputError
-from armscan.models.camera import CameraModel
 from armscan.storage.documents import read_foreign_camera
 from armscan.storage.foreign import camera_info_yaml
+from rigs.plain_scanner import plain_camera
 
-CAMERA = CameraModel(
-    fx_px=1430.123456789,
-    fy_px=1425.5,
-    cx_px=478.25,
-    cy_px=642.1,
-    distortion=np.array([-0.2, 0.08, 6e-4, -1e-17, 0.01]),
-    width_px=960,
-    height_px=1280,
+CAMERA = plain_camera(
+    (1430.123456789, 1425.5), (478.25, 642.1), (960, 1280), [-0.2, 0.08, 6e-4, -1e-17, 0.01]
 )
 ROS = """image_width: 640
 image_height: 480

@@ -16,19 +16,11 @@ from armscan.errors import InputError
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
-from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard
 from rigs.camera_scene import CAMERA, GRID, Scene, board_pose, make_views, normalised_error, view_of
+from rigs.plain_scanner import plain_camera
 
-TELE = CameraModel(
-    fx_px=9000.0,
-    fy_px=9000.0,
-    cx_px=1023.5,
-    cy_px=767.5,
-    distortion=np.zeros(5),
-    width_px=2048,
-    height_px=1536,
-)
+TELE = plain_camera(9000.0, (1023.5, 767.5), (2048, 1536))
 SMALL = Chessboard(5, 4, 4.0)
 
 

@@ -16,16 +16,9 @@ from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
 from rigs.camera_scene import CAMERA, Scene, make_views
+from rigs.plain_scanner import plain_camera
 
-PINHOLE = CameraModel(
-    fx_px=2300.0,
-    fy_px=2310.0,
-    cx_px=1010.0,
-    cy_px=770.0,
-    distortion=np.zeros(5),
-    width_px=2048,
-    height_px=1536,
-)
+PINHOLE = plain_camera((2300.0, 2310.0), (1010.0, 770.0), (2048, 1536))
 EXACT = Scene(camera=PINHOLE, noise_px=0.0)
 
 

@@ -7,19 +7,11 @@ from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
-from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard, TargetView
 from rigs.camera_scene import Scene, view_of
+from rigs.plain_scanner import plain_camera
 
-LENS = CameraModel(
-    fx_px=620.0,
-    fy_px=618.14,
-    cx_px=665.6,
-    cy_px=376.0,
-    distortion=np.array([-0.3, 0.11, 7e-4, -4e-4, -0.004]),
-    width_px=1280,
-    height_px=800,
-)
+LENS = plain_camera((620.0, 618.14), (665.6, 376.0), (1280, 800), [-0.3, 0.11, 7e-4, -4e-4, -0.004])
 SCENE = Scene(camera=LENS, target=Chessboard(10, 7, 20.0), noise_px=0.1)
 SEED = 6
 

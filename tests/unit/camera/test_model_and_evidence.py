@@ -14,9 +14,10 @@ from armscan.calibration.cameras.result import (
 from armscan.calibration.cameras.robust import excess_variance_px2
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.estimate import Estimate
-from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.camera import PARAMETER_NAMES
 from armscan.vision.targets.target import TargetView
 from rigs.camera_scene import CAMERA, Scene, make_views, normalised_error
+from rigs.plain_scanner import plain_camera
 
 ALL_FIVE = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
 
@@ -190,15 +191,7 @@ def test_views_of_one_place_are_told_in_one_sentence() -> None:
 
 def test_folding_model_yields_to_one_that_does_not_fold() -> None:
     # Strong barrel distortion seen only in the middle: k3 runs away at the corners.
-    lens = CameraModel(
-        fx_px=520.0,
-        fy_px=520.0,
-        cx_px=319.5,
-        cy_px=239.5,
-        distortion=np.array([-0.3, 0.11, 0, 0, 0]),
-        width_px=640,
-        height_px=480,
-    )
+    lens = plain_camera(520.0, (319.5, 239.5), (640, 480), [-0.3, 0.11, 0, 0, 0])
     scene = Scene(camera=lens, n_views=8, noise_px=0.2, distance_mm=450.0, reach=0.1)
     for seed in range(4):
         fit = solved(make_views(scene, seed)[0])

@@ -24,6 +24,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard, TargetView
 from rigs.camera_scene import Scene, make_views, normalised_error
+from rigs.plain_scanner import plain_camera
 
 VIEWS = 8
 RIPPLE = np.array([0.98, 1.01, 1.0, 1.02, 0.99, 1.0, 1.01, 0.99])
@@ -125,16 +126,11 @@ def lens(rng: np.random.Generator) -> CameraModel:
     """A lens with all of the usual coefficients."""
     first, second = rng.uniform(-0.1, -0.02), rng.uniform(-0.5, 0.5)
     square = 0.25 * (1280**2 + 1024**2) / 1800.0**2
-    return CameraModel(
-        fx_px=1800.0,
-        fy_px=1801.0,
-        cx_px=650.0,
-        cy_px=500.0,
-        distortion=np.array(
-            [first / square, first * second / square**2, *rng.normal(0.0, 7e-4, 2), 0.0]
-        ),
-        width_px=1280,
-        height_px=1024,
+    return plain_camera(
+        (1800.0, 1801.0),
+        (650.0, 500.0),
+        (1280, 1024),
+        np.array([first / square, first * second / square**2, *rng.normal(0.0, 7e-4, 2), 0.0]),
     )
 
 

@@ -21,8 +21,8 @@ from armscan.geometry.features import (
     moved,
     parameter_names,
 )
-from armscan.storage.formats.reference_sets import read_reference_pair, shape_error
 from rigs.reference_features import reference_set
+from rigs.reference_sets import read_reference_pair, shape_error
 
 LENGTH_MM, ANGLE_RAD = 1e-8, 1e-9
 """What a fit may be off a certified one, for arcs of 30 degrees and more."""

@@ -12,7 +12,6 @@ from armscan.calibration.sheets.stripes_on_board import (
 )
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Board, Pose, Sensor
-from armscan.models.camera import CameraModel
 from armscan.records.profile import Profile
 from armscan.vision.targets.target import (
     Charuco,
@@ -22,16 +21,9 @@ from armscan.vision.targets.target import (
     Target,
     TargetView,
 )
+from rigs.plain_scanner import plain_camera
 
-CAMERA = CameraModel(
-    fx_px=1000.0,
-    fy_px=1000.0,
-    cx_px=500.0,
-    cy_px=400.0,
-    distortion=np.zeros(5),
-    width_px=1001,
-    height_px=801,
-)
+CAMERA = plain_camera(1000.0, (500.0, 400.0), (1001, 801))
 HERE: Pose[Sensor, Board] = Pose(np.eye(3), np.array([-50.0, -40.0, 500.0]))
 """A board square to the camera at 2 px/mm, its origin at pixel (400, 320)."""
 WIDTH_PX = 1.5
@@ -162,15 +154,7 @@ def test_squares_behind_the_camera_are_left_out() -> None:
 
 def test_edges_beyond_the_fold_of_the_lens_are_no_phantoms() -> None:
     """R (1 - 0.5 r^2) is largest at r = 0.816: what lies further out comes back into the image."""
-    lens = CameraModel(
-        fx_px=1000.0,
-        fy_px=1000.0,
-        cx_px=500.0,
-        cy_px=400.0,
-        distortion=np.array([-0.5, 0, 0, 0, 0]),
-        width_px=1001,
-        height_px=801,
-    )
+    lens = plain_camera(1000.0, (500.0, 400.0), (1001, 801), [-0.5, 0, 0, 0, 0])
     board = Chessboard(5, 4, 200.0)
     near: Pose[Sensor, Board] = Pose(np.eye(3), np.array([-400.0, -300.0, 500.0]))
     edges = find_target_edges(view_of(board), board, near, lens)

@@ -7,15 +7,10 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from rigs.plain_scanner import plain_camera
 
-CAMERA = CameraModel(
-    fx_px=1430.0,
-    fy_px=1425.0,
-    cx_px=478.0,
-    cy_px=642.0,
-    distortion=np.array([-0.2, 0.08, 6e-4, -4e-4, 0.01]),
-    width_px=960,
-    height_px=1280,
+CAMERA = plain_camera(
+    (1430.0, 1425.0), (478.0, 642.0), (960, 1280), [-0.2, 0.08, 6e-4, -4e-4, 0.01]
 )
 TELE_PX_OF_DOUBLE = 1e-9
 """Rounding of a pixel coordinate after a few dozen operations at 2000 px."""
@@ -37,15 +32,7 @@ def test_projection_is_that_of_opencv() -> None:
 
 
 def test_pixel_zero_is_the_centre_of_the_first_pixel() -> None:
-    centred = CameraModel(
-        fx_px=100.0,
-        fy_px=100.0,
-        cx_px=0.0,
-        cy_px=0.0,
-        distortion=np.zeros(5),
-        width_px=10,
-        height_px=8,
-    )
+    centred = plain_camera(100.0, (0.0, 0.0), (10, 8))
     assert centred.project(np.array([[0.0, 0.0, 5.0]])).tolist() == [[0.0, 0.0]]
     edges = np.array([[-0.5, -0.5], [-0.51, 0.0], [9.5, 7.5], [9.51, 0.0], [0.0, 7.51]])
     assert centred.is_inside(edges).tolist() == [True, False, True, False, False]
@@ -114,15 +101,7 @@ def test_points_behind_the_camera_have_no_pixel() -> None:
 
 
 def test_fold_inside_the_image_is_found() -> None:
-    folding = CameraModel(
-        fx_px=500.0,
-        fy_px=500.0,
-        cx_px=319.5,
-        cy_px=239.5,
-        distortion=np.array([-0.6, 0, 0, 0, 0]),
-        width_px=640,
-        height_px=480,
-    )
+    folding = plain_camera(500.0, (319.5, 239.5), (640, 480), [-0.6, 0, 0, 0, 0])
     border = folding.folded_border()
     assert len(border) > 0
     assert np.abs(border - [319.5, 239.5]).max() > 200

@@ -10,23 +10,15 @@ from armscan.errors import InputError
 from armscan.models.calibration import (
     SHEET_PARAMETER_NAMES,
     SensorCalibration,
-    SheetCalibration,
 )
 from armscan.models.light_sheet import LightSheet
+from rigs.plain_scanner import stored_sheet
 from rigs.sheet_rig import PROVENANCE, thesis_rig
 
 SHEET = LightSheet(
     origin_mm=np.array([0.0, 0.0, 135.0]), axes=np.eye(3), scale_mm=20.0, bow_mm=np.zeros(5)
 )
-ENTRY = SheetCalibration(
-    name="A",
-    sheet=SHEET,
-    rms_mm=0.01,
-    n_boards=6,
-    n_points=600,
-    depth_range_mm=(120.0, 150.0),
-    is_redundant=True,
-)
+ENTRY = stored_sheet("A", SHEET, (120.0, 150.0))
 RIG = thesis_rig()
 CAMERA = RIG.calibration(RIG.camera)
 

@@ -20,6 +20,7 @@ from armscan.models.two_views import (
     triangulate_points,
 )
 from armscan.thesis.two_cameras import triangulate_directly
+from rigs.plain_scanner import plain_camera
 from rigs.stereo_rig import CONVERGING, LEFT, RIGHT, project_right
 
 VIEWS = TwoViews(LEFT, RIGHT, CONVERGING)
@@ -106,15 +107,7 @@ def test_epipolar_constraint_in_pixels_free_of_distortion() -> None:
 
 def test_parallel_cameras_differ_in_height_alone() -> None:
     """With equal cameras side by side the epipolar lines are rows of the image."""
-    camera = CameraModel(
-        fx_px=1000.0,
-        fy_px=1000.0,
-        cx_px=320.0,
-        cy_px=240.0,
-        distortion=np.zeros(5),
-        width_px=640,
-        height_px=480,
-    )
+    camera = plain_camera(1000.0, (320.0, 240.0), (640, 480))
     beside: Pose[CameraRight, Sensor] = Pose(np.eye(3), np.array([-50.0, 0.0, 0.0]))
     left, right = np.array([[300.0, 200.0]]), np.array([[220.0, 203.0]])
     in_left, in_right = epipolar_distances_px(TwoViews(camera, camera, beside), left, right)
@@ -163,18 +156,7 @@ def test_noise_gives_sampson_distances_of_its_own_size() -> None:
 def test_the_closed_form_is_equation_4_7_as_printed() -> None:
     """Cameras without lens and principal point: the thesis's symbols by hand."""
     f_l, f_r = 1200.0, 1300.0
-    left, right = (
-        CameraModel(
-            fx_px=f,
-            fy_px=f,
-            cx_px=0.0,
-            cy_px=0.0,
-            distortion=np.zeros(5),
-            width_px=640,
-            height_px=480,
-        )
-        for f in (f_l, f_r)
-    )
+    left, right = (plain_camera(f, (0.0, 0.0), (640, 480)) for f in (f_l, f_r))
     views = TwoViews(left, right, CONVERGING)
     truth = points(6)
     (u_l, v_l), u_r = left.project(truth).T, project_right(views, truth)[:, 0]
@@ -254,15 +236,7 @@ def test_points_follow_the_parameters(number: int) -> None:
 
 
 def test_rays_that_do_not_meet_ahead_give_no_point() -> None:
-    camera = CameraModel(
-        fx_px=1000.0,
-        fy_px=1000.0,
-        cx_px=320.0,
-        cy_px=240.0,
-        distortion=np.zeros(5),
-        width_px=640,
-        height_px=480,
-    )
+    camera = plain_camera(1000.0, (320.0, 240.0), (640, 480))
     beside: Pose[CameraRight, Sensor] = Pose(np.eye(3), np.array([-50.0, 0.0, 0.0]))
     views = TwoViews(camera, camera, beside)
     left = np.array([[300.0, 200.0], [300.0, 200.0], [300.0, 200.0]])

@@ -5,19 +5,11 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.models.camera import CameraModel
 from armscan.pipeline.instants import check_sizes, pair_exposures
 from armscan.records.exposure import Exposure, SensorWindow
+from rigs.plain_scanner import plain_camera
 
-CAMERA = CameraModel(
-    fx_px=100.0,
-    fy_px=100.0,
-    cx_px=20.0,
-    cy_px=15.0,
-    distortion=np.zeros(5),
-    width_px=40,
-    height_px=30,
-)
+CAMERA = plain_camera(100.0, (20.0, 15.0), (40, 30))
 
 
 def image(source: str, shape: tuple[int, int] = (30, 40), **more: SensorWindow) -> Exposure:

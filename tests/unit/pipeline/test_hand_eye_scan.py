@@ -18,13 +18,12 @@ from armscan.models.calibration import (
     CameraCalibration,
     Provenance,
     SensorCalibration,
-    SheetCalibration,
 )
-from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.pipeline.hand_eye import ObservedStripes, _left_out, observe_stripes
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
+from rigs.plain_scanner import plain_camera, stored_sheet
 from rigs.plate_rig import SHEET, SILENT, TOOL_FROM_SENSOR, PlateRig, Surface, good_postures
 
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 1000.0
@@ -39,15 +38,7 @@ RIG = PlateRig(good_postures(8, np.random.default_rng(1)), SILENT)
 
 
 def _sensor() -> SensorCalibration:
-    model = CameraModel(
-        fx_px=FOCAL_PX,
-        fy_px=FOCAL_PX,
-        cx_px=319.5,
-        cy_px=239.5,
-        distortion=np.zeros(5),
-        width_px=WIDTH,
-        height_px=HEIGHT,
-    )
+    model = plain_camera(FOCAL_PX, (319.5, 239.5), (WIDTH, HEIGHT))
     covered = np.array([0.0, 0.0, WIDTH - 1.0, HEIGHT - 1.0])
     camera = CameraCalibration(
         camera=model,
@@ -67,15 +58,7 @@ def _sensor() -> SensorCalibration:
     middle -= (normal @ middle + SHEET[3] / np.linalg.norm(SHEET[:3])) * normal
     axes = np.stack([along, np.cross(normal, along), normal])
     sheet = LightSheet(origin_mm=middle, axes=axes, scale_mm=30.0, bow_mm=np.zeros(5))
-    calibrated = SheetCalibration(
-        name="A",
-        sheet=sheet,
-        rms_mm=0.0,
-        n_boards=6,
-        n_points=999,
-        depth_range_mm=(110.0, 175.0),
-        is_redundant=True,
-    )
+    calibrated = stored_sheet("A", sheet, (110.0, 175.0), rms_mm=0.0, n_points=999)
     return SensorCalibration(
         camera=camera, sheets=(calibrated,), covariance=1e-12 * np.eye(17), provenance=BY_HAND
     )

@@ -8,8 +8,7 @@ import pytest
 
 from armscan.calibration.sheets.result import LaserFit
 from armscan.errors import EstimationError, InputError
-from armscan.models.calibration import SensorCalibration, SheetCalibration
-from armscan.models.camera import CameraModel
+from armscan.models.calibration import SensorCalibration
 from armscan.models.light_sheet import LightSheet
 from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_pairs
 from armscan.pipeline.measure import MeasureOptions, reconstruct
@@ -18,19 +17,12 @@ from armscan.reconstruction.labels import PointStatus
 from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.target import Chessboard
+from rigs.plain_scanner import plain_camera, stored_sheet
 from rigs.sheet_rig import PROVENANCE
 from rigs.true_scanner import certain_camera
 
 WIDTH, HEIGHT = 320, 240
-CAMERA = CameraModel(
-    fx_px=400.0,
-    fy_px=400.0,
-    cx_px=159.5,
-    cy_px=119.5,
-    distortion=np.zeros(5),
-    width_px=WIDTH,
-    height_px=HEIGHT,
-)
+CAMERA = plain_camera(400.0, (159.5, 119.5), (WIDTH, HEIGHT))
 CALIBRATION = certain_camera(CAMERA, PROVENANCE)
 LINE_SIGMA_PX = 2.0
 DEPTH_MM = 200.0
@@ -52,15 +44,7 @@ def sensor() -> SensorCalibration:
     sheet = LightSheet(
         origin_mm=np.array([0.0, 0.0, DEPTH_MM]), axes=axes, scale_mm=40.0, bow_mm=np.zeros(5)
     )
-    entry = SheetCalibration(
-        name="A",
-        sheet=sheet,
-        rms_mm=0.01,
-        n_boards=4,
-        n_points=99,
-        depth_range_mm=(190.0, 210.0),
-        is_redundant=True,
-    )
+    entry = stored_sheet("A", sheet, (190.0, 210.0), n_boards=4, n_points=99)
     return SensorCalibration(
         camera=CALIBRATION, sheets=(entry,), covariance=np.zeros((17, 17)), provenance=PROVENANCE
     )

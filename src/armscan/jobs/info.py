@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -337,8 +338,8 @@ def _line(key: str, value: Any) -> str:
     return f"{key.replace('_', ' ')}: {f'{value:.6g}' if isinstance(value, float) else value}"
 
 
-CLOUDS = tuple(suffix for suffix in BY_SUFFIX if suffix not in (".ply", ".csv"))
-"""Suffixes of files that are read as clouds, whatever is in them."""
+CLOUDS = tuple(suffix for suffix in BY_SUFFIX if suffix not in (".ply", ".csv", ".txt"))
+"""Suffixes of files that are clouds; what the others hold tells it."""
 
 
 def _file(path: Path) -> dict[str, Any]:
@@ -370,6 +371,9 @@ def _text(path: Path, data: bytes) -> dict[str, Any]:
         return describe_points(path)
     if path.suffix.lower() in (".json", ".yaml", ".yml", ".xml"):
         return _camera(read_camera_calibration(path), "camera calibration of another program")
+    if path.suffix.lower() == ".txt":
+        with suppress(FileFormatError):
+            return _cloud(read_cloud(path))
     raise FileFormatError(
         "armscan does not know this kind of file",
         where=str(path),

@@ -108,7 +108,7 @@ def test_touches_probe_arm_and_probed_points(tmp_path: Path) -> None:
 
 def test_clouds_as_text_are_described_as_clouds(tmp_path: Path) -> None:
     """A table that armscan wrote of a cloud is no list of probed points."""
-    plain, own = tmp_path / "cloud.xyz", tmp_path / "cloud.csv"
+    plain, own = tmp_path / "cloud.txt", tmp_path / "cloud.csv"
     plain.write_text("1 2 3\n4 -5 6\n")
     assert described(plain)["what"] == "point cloud, 2 points"
     assert described(plain)["y_range"] == [-5.0, 2.0]

@@ -321,8 +321,10 @@ def next_stripes(
                 best = min(best, dx * dx + dy * dy + dz * dz)
         nearer = 0
         for n in range(len(points)):
-            dx, dy, dz = points[n, 0] - x, points[n, 1] - y, points[n, 2] - z
-            nearer += 1 if dx * dx + dy * dy + dz * dz < best else 0
+            # no other one is nearer than the nearest other one
+            if exposure[n] == own:
+                dx, dy, dz = points[n, 0] - x, points[n, 1] - y, points[n, 2] - z
+                nearer += 1 if dx * dx + dy * dy + dz * dz < best else 0
         spacing[s] = math.sqrt(best) if nearer < looked_at else math.inf
 
 

@@ -299,7 +299,7 @@ class _PassSurfaces:
         self.radii_mm[number] = radius
         asked = self.points[rows]
         is_near = (asked >= points.min(axis=0) - radius) & (asked <= points.max(axis=0) + radius)
-        return rows[is_near.all(axis=1)]
+        return np.asarray(rows[is_near.all(axis=1)])
 
     def of(self, number: int) -> _PassSurface | None:
         """The surface of a pass; None if it has none."""

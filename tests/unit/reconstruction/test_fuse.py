@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.kernels.fusing import N_PARAMETERS, carry_fused
+from armscan.kernels.placing import propagate_points
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
@@ -323,3 +326,55 @@ def test_a_point_without_a_right_stripe_is_that_of_the_left_camera_alone() -> No
     assert not found.by_sensor[alone, :, 17:].any()
     assert found.noise_mm[1, :, 1].any()
     assert (found.sheet == SHEET).all()
+
+
+def test_placing_by_the_product_is_placing_by_the_whole_derivatives() -> None:
+    """More points than go through the kernel together, of two sheets in turn, in any pose."""
+    rng = np.random.default_rng(6)
+    n, n_sheets = 300, 2
+    points, shape = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    stripe = StripePoints(
+        row=np.arange(n),
+        points_mm=points,
+        noise_mm=rng.normal(size=(n, 3, 2)),
+        shape_mm=shape,
+        gain=rng.normal(size=(n, 3, 4)),
+        by_distance=rng.normal(size=(n, N_PARAMETERS)),
+        sheet=rng.integers(0, n_sheets, n),
+    )
+    assert stripe.gain is not None
+    assert stripe.by_distance is not None
+    errors = np.triu(rng.normal(size=(n_sheets, 38, 38)))
+    turn, shift = rotation_from_vector(np.array([0.3, -0.8, 0.5])), np.array([10.0, -20.0, 5.0])
+    carried = np.concatenate(
+        [np.column_stack([turn, shift]), rng.uniform(0.0, 1.0, (3, 3))], axis=None
+    )
+    placed, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    carry_fused(
+        points,
+        stripe.noise_mm.reshape(n, 6),
+        shape,
+        stripe.gain.reshape(n, 12),
+        stripe.by_distance,
+        stripe.sheet,
+        errors.reshape(-1, 38),
+        carried,
+        placed.reshape(-1),
+        covariance.reshape(-1),
+    )
+    expected_at, expected = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    for k in range(n_sheets):
+        propagate_points(
+            points,
+            stripe.noise_mm.reshape(n, 6),
+            shape,
+            stripe.by_sensor.reshape(n, 96),
+            np.ascontiguousarray(errors[k].T),
+            np.column_stack([turn, shift]),
+            carried[12:].reshape(3, 3),
+            np.flatnonzero(stripe.sheet == k),
+            expected_at,
+            expected.reshape(n, 9),
+        )
+    np.testing.assert_allclose(placed, expected_at, rtol=1e-12)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-9, atol=1e-9)

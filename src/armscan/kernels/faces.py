@@ -301,6 +301,33 @@ def _bound(
     return high
 
 
+@compiled()
+def next_stripes(
+    points: Table, exposure: Ints, sample: Ints, looked_at: int, spacing: FloatsOut
+) -> None:
+    """Distance of sampled points to the next one of another exposure, of those nearest to each.
+
+    ``points``, ``exposure``: (N, 3) and (N,). ``sample``: (S,) rows. ``looked_at``: points among
+    which it is sought, the sampled one counted. ``spacing``: (S,) output; infinite where none is
+    among these.
+    """
+    for s in range(len(sample)):
+        row = sample[s]
+        x, y, z, own = points[row, 0], points[row, 1], points[row, 2], exposure[row]
+        best = math.inf
+        for n in range(len(points)):
+            if exposure[n] != own:
+                dx, dy, dz = points[n, 0] - x, points[n, 1] - y, points[n, 2] - z
+                best = min(best, dx * dx + dy * dy + dz * dz)
+        nearer = 0
+        for n in range(len(points)):
+            # no other one is nearer than the nearest other one
+            if exposure[n] == own:
+                dx, dy, dz = points[n, 0] - x, points[n, 1] - y, points[n, 2] - z
+                nearer += 1 if dx * dx + dy * dy + dz * dz < best else 0
+        spacing[s] = math.sqrt(best) if nearer < looked_at else math.inf
+
+
 @compiled(error_model="numpy")
 def quadric_offsets(
     asked: Table,

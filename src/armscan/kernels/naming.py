@@ -458,11 +458,12 @@ def predict_residuals(
             explained += row[c] * steps[c]
         variance = 0.0
         for c in range(q):
-            products = covariance[sheet[i], c * q : (c + 1) * q]
+            # the products of two errors come twice
+            products = covariance[sheet[i], c * q : c * q + c]
             total = 0.0
-            for d in range(q):
+            for d in range(c):
                 total += products[d] * row[d]
-            variance += total * row[c]
+            variance += (2.0 * total + covariance[sheet[i], c * q + c] * row[c]) * row[c]
         found[i, 0] = explained
         found[i, 1] = variance
 

@@ -11,8 +11,6 @@ from armscan.kernels.arrays import FUSED, Floats, FloatsOut, Ints, Table, TableO
 from armscan.kernels.rays import (
     NEAREST_SOURCE,
     bow_and_slopes,
-    distort,
-    height_of,
     lens_slopes,
 )
 
@@ -160,7 +158,7 @@ def _along_ray(
 
 
 @compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
-def _add_square(x: float, y: float, z: float, i: int, rows: FloatsOut) -> None:
+def add_square(x: float, y: float, z: float, i: int, rows: FloatsOut) -> None:
     """Add a move's products to the sums of point ``i``."""
     rows[SUMS * LANES + i] += x * x
     rows[(SUMS + 1) * LANES + i] += x * y
@@ -203,7 +201,7 @@ def _spread_points(camera: Floats, factor: Table, rows: FloatsOut) -> None:
                 ray_y = rows[BY_XY * LANES + i] * u + rows[BY_YY * LANES + i] * v
                 away = rows[DEPTH_X * LANES + i] * ray_x + rows[DEPTH_Y * LANES + i] * ray_y
                 away += _along_ray(i, s0, s1, s2, s3, s4, s5, s6, s7, rows)
-                _add_square(
+                add_square(
                     x * away + pz * ray_x + h1 * pz - h2 * py + h3,
                     y * away + pz * ray_y + h2 * px - h0 * pz + h4,
                     away + h0 * py - h1 * px + h5,
@@ -216,7 +214,7 @@ def _spread_points(camera: Floats, factor: Table, rows: FloatsOut) -> None:
                 py = rows[POINT_Y * LANES + i]
                 pz = rows[POINT_Z * LANES + i]
                 away = _along_ray(i, s0, s1, s2, s3, s4, s5, s6, s7, rows)
-                _add_square(
+                add_square(
                     rows[RAY_X * LANES + i] * away + h1 * pz - h2 * py + h3,
                     rows[RAY_Y * LANES + i] * away + h2 * px - h0 * pz + h4,
                     away + h0 * py - h1 * px + h5,
@@ -228,7 +226,7 @@ def _spread_points(camera: Floats, factor: Table, rows: FloatsOut) -> None:
                 px = rows[POINT_X * LANES + i]
                 py = rows[POINT_Y * LANES + i]
                 pz = rows[POINT_Z * LANES + i]
-                _add_square(
+                add_square(
                     h1 * pz - h2 * py + h3,
                     h2 * px - h0 * pz + h4,
                     h0 * py - h1 * px + h5,
@@ -238,7 +236,7 @@ def _spread_points(camera: Floats, factor: Table, rows: FloatsOut) -> None:
 
 
 @compiled(error_model="numpy", fastmath=FUSED)
-def _turn_sums(carried: Floats, rows: Floats, turned: FloatsOut) -> None:
+def turn_sums(carried: Floats, rows: Floats, turned: FloatsOut) -> None:
     """Turn points and their sums to Base, and add what the arm errs.
 
     ``carried``: (21,) as for `carry_stripe`. ``turned``: (9 LANES,) output, places then sums.
@@ -284,6 +282,22 @@ def _turn_sums(carried: Floats, rows: Floats, turned: FloatsOut) -> None:
         turned[6 * LANES + i] = b0 * r3 + b1 * r4 + b2 * r5 + all_of - v1 * sy * sy - v2 * wy * wy
         turned[7 * LANES + i] = b0 * r6 + b1 * r7 + b2 * r8 - v1 * sy * sz - v2 * wy * wz
         turned[8 * LANES + i] = c0 * r6 + c1 * r7 + c2 * r8 + all_of - v1 * sz * sz - v2 * wz * wz
+
+
+@compiled(is_inlined=True)
+def write_turned(
+    turned: Floats, i: int, row: int, placed: FloatsOut, covariance: FloatsOut
+) -> None:
+    """Write what `turn_sums` made of point ``i`` as that of a row: (3 N,) and (9 N,) output."""
+    for a in range(3):
+        placed[3 * row + a] = turned[a * LANES + i]
+    at = 9 * row
+    covariance[at] = turned[3 * LANES + i]
+    covariance[at + 1] = covariance[at + 3] = turned[4 * LANES + i]
+    covariance[at + 2] = covariance[at + 6] = turned[5 * LANES + i]
+    covariance[at + 4] = turned[6 * LANES + i]
+    covariance[at + 5] = covariance[at + 7] = turned[7 * LANES + i]
+    covariance[at + 8] = turned[8 * LANES + i]
 
 
 @compiled(error_model="numpy", fastmath=FUSED)
@@ -333,17 +347,9 @@ def carry_stripe(
         _know_points(points[begin:end], camera, sheet, rows)
         _begin_sums(noise[begin:end], shape[begin:end], rows)
         _spread_points(camera, factor, rows)
-        _turn_sums(carried, rows, turned)
+        turn_sums(carried, rows, turned)
         for i in range(n):
-            for a in range(3):
-                placed[begin + 3 * i + a] = turned[a * LANES + i]
-            at = 9 * (first + i)
-            covariance[at] = turned[3 * LANES + i]
-            covariance[at + 1] = covariance[at + 3] = turned[4 * LANES + i]
-            covariance[at + 2] = covariance[at + 6] = turned[5 * LANES + i]
-            covariance[at + 4] = turned[6 * LANES + i]
-            covariance[at + 5] = covariance[at + 7] = turned[7 * LANES + i]
-            covariance[at + 8] = turned[8 * LANES + i]
+            write_turned(turned, i, first + i, placed, covariance)
 
 
 @compiled(fastmath=True)
@@ -466,214 +472,3 @@ def propagate_points(
                             total += arm[0, about] * (placed[i, c] - arm[about, c]) ** 2
                 covariance[i, 3 * a + b] = total
                 covariance[i, 3 * b + a] = total
-
-
-@compiled(error_model="numpy")
-def _weigh(
-    rest: Table, covariance: Table, along: Floats, scratch: TableOut, gain: TableOut
-) -> None:
-    """Least-squares change (3, 4) of a point by four distances, the first of which is exact.
-
-    ``rest``: (3, 3) derivatives of the three others by the point. ``covariance``: (3, 3) theirs.
-    ``along``: (3,) derivative of the first. Moving along the stripe changes the other distances
-    too, which the solution takes back. ``scratch``: (6, 3) is written to.
-    """
-    free, design, weighed = scratch[:2], scratch[2:4], scratch[4:]
-    size = along[0] * along[0] + along[1] * along[1] + along[2] * along[2]
-    for k in range(2):
-        other = rest[0] if k == 0 else free[0]
-        free[k, 0] = along[1] * other[2] - along[2] * other[1]
-        free[k, 1] = along[2] * other[0] - along[0] * other[2]
-        free[k, 2] = along[0] * other[1] - along[1] * other[0]
-        length = math.sqrt(free[k, 0] ** 2 + free[k, 1] ** 2 + free[k, 2] ** 2)
-        for a in range(3):
-            free[k, a] /= length
-    # Cholesky's factor of the covariance
-    l00 = math.sqrt(covariance[0, 0])
-    l10 = covariance[1, 0] / l00
-    l20 = covariance[2, 0] / l00
-    l11 = math.sqrt(covariance[1, 1] - l10 * l10)
-    l21 = (covariance[2, 1] - l20 * l10) / l11
-    l22 = math.sqrt(covariance[2, 2] - l20 * l20 - l21 * l21)
-    for k in range(2):
-        for r in range(3):
-            total = rest[r, 0] * free[k, 0] + rest[r, 1] * free[k, 1]
-            design[k, r] = total + rest[r, 2] * free[k, 2]
-        y0 = design[k, 0] / l00
-        y1 = (design[k, 1] - l10 * y0) / l11
-        y2 = (design[k, 2] - l20 * y0 - l21 * y1) / l22
-        weighed[k, 2] = y2 / l22
-        weighed[k, 1] = (y1 - l21 * weighed[k, 2]) / l11
-        weighed[k, 0] = (y0 - l10 * weighed[k, 1] - l20 * weighed[k, 2]) / l00
-    n00 = n01 = n11 = 0.0
-    for r in range(3):
-        n00 += weighed[0, r] * design[0, r]
-        n01 += weighed[0, r] * design[1, r]
-        n11 += weighed[1, r] * design[1, r]
-    det = n00 * n11 - n01 * n01
-    for a in range(3):
-        gain[a, 0] = along[a] / size
-    for r in range(3):
-        by_first = (n11 * weighed[0, r] - n01 * weighed[1, r]) / det
-        by_second = (n00 * weighed[1, r] - n01 * weighed[0, r]) / det
-        changed = (rest[r, 0] * along[0] + rest[r, 1] * along[1] + rest[r, 2] * along[2]) / size
-        for a in range(3):
-            gain[a, 1 + r] = free[0, a] * by_first + free[1, a] * by_second
-            gain[a, 0] -= gain[a, 1 + r] * changed
-
-
-@compiled(error_model="numpy", fastmath=FUSED)
-def _covariance_of_distances(
-    by_distance: Table, covariance: Floats, moved: FloatsOut, found: TableOut
-) -> None:
-    """(3, 3) of distances across the left stripe, the right stripe and from the sheet.
-
-    ``by_distance``: (4, 32) derivatives by the sensor, zero but for a distance's own parameters:
-    of the left camera, the second camera, the sheet. ``covariance``: (1024,) of these. ``moved``:
-    (32,) is written to.
-    """
-    left, right, own = by_distance[1], by_distance[2], by_distance[3]
-    for d in range(32):
-        moved[d] = 0.0
-    for c in range(9):
-        share = left[c]
-        row = covariance[32 * c : 32 * c + 32]
-        for d in range(32):
-            moved[d] += share * row[d]
-    both = beside = sheet = 0.0
-    for d in range(9):
-        both += moved[d] * left[d]
-    for d in range(8):
-        sheet += moved[9 + d] * own[9 + d]
-    for d in range(15):
-        beside += moved[17 + d] * right[17 + d]
-    found[0, 0] = both
-    found[0, 1] = found[1, 0] = beside
-    found[0, 2] = found[2, 0] = sheet
-    # of the other two distances only what is not known yet
-    for d in range(24):
-        moved[8 + d] = 0.0
-    for c in range(15):
-        share = right[17 + c]
-        row = covariance[32 * (17 + c) + 8 : 32 * (17 + c) + 32]
-        for d in range(24):
-            moved[8 + d] += share * row[d]
-    both = sheet = 0.0
-    for d in range(15):
-        both += moved[17 + d] * right[17 + d]
-    for d in range(8):
-        sheet += moved[9 + d] * own[9 + d]
-    found[1, 1] = both
-    found[1, 2] = found[2, 1] = sheet
-    for d in range(8):
-        moved[d] = 0.0
-    for c in range(8):
-        share = own[9 + c]
-        row = covariance[32 * (9 + c) + 9 : 32 * (9 + c) + 17]
-        for d in range(8):
-            moved[d] += share * row[d]
-    both = 0.0
-    for d in range(8):
-        both += moved[d] * own[9 + d]
-    found[2, 2] = both
-
-
-@compiled(error_model="numpy")
-def fuse_stripes(
-    chosen: Ints,
-    into: Ints,
-    at: Ints,
-    points: Table,
-    sheet: Ints,
-    normals: Table,
-    sigma: Table,
-    size_mm: Floats,
-    missed: Floats,
-    by_point: Table,
-    by_errors: Table,
-    camera: Floats,
-    sheets: Table,
-    covariance: Table,
-    fused: TableOut,
-    noise: TableOut,
-    shape: TableOut,
-    by_sensor: TableOut,
-) -> None:
-    """Points of which two cameras and the sheet each tell a distance, weighed against each other.
-
-    ``chosen``, ``into``: (M,) crossings whose points are asked for, and rows of the output. ``at``:
-    (F,) row of each crossing in ``points``, ``sheet`` and ``normals``: (H, 3), (H,) and (H, 2), of
-    left pixels on their sheets and across the left stripe. ``sigma``: (F, 2) of both stripes.
-    ``size_mm``: (S,) sigma of each sheet's shape. ``missed``: (F,)
-    distance across the right stripe. ``by_point``, ``by_errors``: (F, 3) and (F, 35) its
-    derivatives, from `cross_stripes`. ``camera``, ``sheets``: As for `meet_sheets`.
-    ``covariance``: (S, 1024) of the left camera, a sheet, and the second camera. ``fused``,
-    ``shape``: (N, 3) output, the latter the move by one sigma of the sheet's shape. ``noise``:
-    (N, 6) output, the rows' (3, 2) moves by one sigma of the left and of the right stripe.
-    ``by_sensor``: (N, 96) output, the rows' (3, 32).
-    """
-    second = N_CAMERA + N_SHEET
-    lens = np.zeros(7)
-    surface = np.zeros(12)
-    along = np.zeros(3)
-    rest = np.zeros((3, 3))
-    by_distance = np.zeros((4, 32))
-    joint = np.zeros((3, 3))
-    gain = np.zeros((3, 4))
-    scratch = np.zeros((6, 3))
-    moved = np.zeros(32)
-    for m in range(chosen.shape[0]):
-        f = chosen[m]
-        i = at[f]
-        o = into[m]
-        z = points[i, 2]
-        x = points[i, 0] / z
-        y = points[i, 1] / z
-        distort(x, y, camera, lens)
-        height_of(points[i, 0], points[i, 1], z, sheets[sheet[i]], surface)
-        r2 = x * x + y * y
-        u, v = normals[i, 0], normals[i, 1]
-        for k in range(2):
-            across_x = (-v if k == 0 else u) * camera[0]
-            across_y = (u if k == 0 else v) * camera[1]
-            by_x = (across_x * lens[2] + across_y * lens[3]) / z
-            by_y = (across_x * lens[3] + across_y * lens[4]) / z
-            row = along if k == 0 else rest[0]
-            row[0] = by_x
-            row[1] = by_y
-            row[2] = -(by_x * x + by_y * y)
-            by_distance[k, 0] = across_x / camera[0] * lens[0]
-            by_distance[k, 1] = across_y / camera[1] * lens[1]
-            by_distance[k, 2] = across_x / camera[0]
-            by_distance[k, 3] = across_y / camera[1]
-            radial = across_x * x + across_y * y
-            by_distance[k, 4] = radial * r2
-            by_distance[k, 5] = radial * r2 * r2
-            by_distance[k, 6] = across_x * 2.0 * x * y + across_y * (r2 + 2.0 * y * y)
-            by_distance[k, 7] = across_x * (r2 + 2.0 * x * x) + across_y * 2.0 * x * y
-            by_distance[k, 8] = radial * r2 * r2 * r2
-        for a in range(3):
-            rest[1, a] = by_point[f, a]
-            rest[2, a] = surface[1 + a]
-        for c in range(second, 32):
-            by_distance[2, c] = by_errors[f, c]
-        for c in range(N_SHEET):
-            by_distance[3, N_CAMERA + c] = -surface[4 + c]
-        _covariance_of_distances(by_distance, covariance[sheet[i]], moved, joint)
-        size = size_mm[sheet[i]]
-        joint[0, 0] += sigma[f, 0] * sigma[f, 0]
-        joint[1, 1] += sigma[f, 1] * sigma[f, 1]
-        joint[2, 2] += size * size
-        _weigh(rest, joint, along, scratch, gain)
-        for a in range(3):
-            fused[o, a] = points[i, a] - gain[a, 2] * missed[f]
-            noise[o, 2 * a] = gain[a, 1] * sigma[f, 0]
-            noise[o, 2 * a + 1] = gain[a, 2] * sigma[f, 1]
-            shape[o, a] = gain[a, 3] * size
-            for c in range(N_CAMERA):
-                change = gain[a, 0] * by_distance[0, c] + gain[a, 1] * by_distance[1, c]
-                by_sensor[o, 32 * a + c] = -change
-            for c in range(N_CAMERA, second):
-                by_sensor[o, 32 * a + c] = -gain[a, 3] * by_distance[3, c]
-            for c in range(second, 32):
-                by_sensor[o, 32 * a + c] = -gain[a, 2] * by_distance[2, c]

@@ -18,7 +18,7 @@ from typing import cast
 import numpy as np
 
 from armscan.errors import EstimationError, InputError, OptionError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.calibration import LaserColour, SensorCalibration
 from armscan.models.camera import CameraModel
 from armscan.pipeline.instants import (
@@ -399,8 +399,7 @@ def reconstruct(
         counts = [image.counts for image in images]
         raise nothing_measured(counts, is_by_thesis=options.is_by_thesis)
     depths = SheetDepths.of(sensor)
-    for k, counted in enumerate(depths):
-        counted.add(cloud.points_mm[cloud.sheet == k, 2])
+    SheetDepths.add(depths, cloud.sheet, cloud.points_mm[:, 2])
     counts = [image.counts for image in images]
     warnings = (*measurement_warnings(counts, depths, sensor), *summarised(weak))
     return Reconstruction(cloud, tuple(images), warnings)
@@ -489,13 +488,20 @@ class SheetDepths:
         """One a sheet of the sensor, without points."""
         return tuple(SheetDepths(sheet.depth_range_mm) for sheet in sensor.sheets)
 
-    def add(self, depths_mm: FloatArray) -> None:
-        """Count points by their Z in Sensor (N,)."""
-        low, high = self.range_mm
-        beyond = np.maximum(low - depths_mm, depths_mm - high)
-        self.n += len(depths_mm)
-        self.n_beyond += int((beyond > 0.0).sum())
-        self.most_beyond_mm = max(self.most_beyond_mm, float(beyond.max(initial=0.0)))
+    @staticmethod
+    def add(counted: Sequence[SheetDepths], sheet: IntArray, depths_mm: FloatArray) -> None:
+        """Count points (N,) by the index of their sheet and their Z in Sensor."""
+        low, high = np.array([one.range_mm for one in counted]).T
+        beyond = np.maximum(low[sheet] - depths_mm, depths_mm - high[sheet])
+        for one, n in zip(
+            counted, np.bincount(sheet, minlength=len(counted)).tolist(), strict=True
+        ):
+            one.n += n
+        outside = np.flatnonzero(beyond > 0.0)
+        for k in np.unique(sheet[outside]).tolist():
+            own = beyond[outside[sheet[outside] == k]]
+            counted[k].n_beyond += len(own)
+            counted[k].most_beyond_mm = max(counted[k].most_beyond_mm, float(own.max()))
 
 
 def measurement_warnings(

@@ -421,8 +421,7 @@ def _place(
     stripe, labelled = measured.points, measured.labelled
     cloud = propagate_to_base(stripe, labelled.profile, base_from_tool, transform)
     pixel_px = labelled.profile.points_px[stripe.row]
-    for k, depths in enumerate(found.depths):
-        depths.add(stripe.points_mm[stripe.sheet == k, 2])
+    SheetDepths.add(found.depths, stripe.sheet, stripe.points_mm[:, 2])
     n_all = len(cloud)
     if volume is not None:
         inside = volume.holds(cloud.points_mm)

@@ -37,7 +37,7 @@ from armscan.reconstruction.pass_agreement import (
     passes_of,
     thinned_rows,
 )
-from armscan.reconstruction.sync import ExposurePoses, poses_by_time
+from armscan.reconstruction.sync import ExposurePoses, largest_gap_ns, poses_at
 from armscan.reconstruction.triangulate import intersect_sheets
 
 WARNED_RATIO, WARNED_PAIR = 2.0, 3.0
@@ -298,12 +298,13 @@ def _late(scan: _Scan) -> Iterator[tuple[str, str, Stripes]]:
     arm = scan.source.arm
     if arm is None or len(arm) < 3 or float(np.median(np.diff(arm.t_ns))) > DENSE_NS:
         return
+    times_ns = np.array([scan.source.rows[row].t_ns for row in scan.rows], dtype=np.int64)
+    max_gap_ns = largest_gap_ns(arm)
 
     def at(lag_ms: float) -> tuple[float, Stripes] | None:
         lag_ns = scan.scanner.latency_ns + round(1e6 * lag_ms)
-        rows = [scan.source.rows[row] for row in scan.rows]
         try:
-            poses = poses_by_time(rows, arm, lag_ns)
+            poses = poses_at(times_ns + lag_ns, arm, max_gap_ns=max_gap_ns)
         except ArmscanError:
             return None
         has = poses.has_pose

@@ -10,15 +10,14 @@ a pass may have seen one face and another pass the next one: such points are not
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
-from armscan.kernels.faces import quadric_offsets
+from armscan.kernels.faces import next_stripes, quadric_offsets
 from armscan.reconstruction.place import NeighbourBins
 
 PAUSE_PERIODS = 4.0
@@ -35,6 +34,9 @@ quadric of six unknowns with something to check it."""
 SPACINGS = 2.4
 """The neighbourhood reaches so many times as far as the next stripe of the pass usually is: two
 stripes on either side of a point between them."""
+SAMPLED, LOOKED_AT = 100, 64
+"""Points of a pass whose distance to the next stripe is measured, and nearest points among which
+that stripe must be."""
 LEAST_RADIUS_MM, LARGEST_RADIUS_MM = 1.5, 40.0
 CELLS = 6.0
 """Cells to its radius: stripes then count alike however dense their points are."""
@@ -250,25 +252,64 @@ def pass_distances(stripes: Stripes) -> PassDistances | None:
         return None
     points, owner = stripes.points_base_mm, stripes.pass_of[stripes.exposure]
     chosen = np.arange(0, len(points), max(1, len(points) // MOST_QUERIES))
-    own_normal = np.full_like(points, np.nan)
+    surfaces = _PassSurfaces(stripes, points, owner)
     parts = []
-    for surface in range(n_passes):
-        own = np.flatnonzero(owner == surface)
-        is_own = owner[chosen] == surface
-        if len(own) < FEWEST_NEIGHBOURS or is_own.all():
-            continue
-        built = _PassSurface.of(stripes, points, own)
-        if built is not None:
-            parts.append(built.distances(chosen[~is_own], surface))
-            about = built.distances(chosen[is_own], surface)
-            own_normal[about.row] = about.normal
+    for number in range(n_passes):
+        near = surfaces.reached(number, chosen[owner[chosen] != number])
+        # where no other pass comes near, nobody asks what surface there is
+        surface = surfaces.of(number) if len(near) else None
+        if surface is not None:
+            parts.append(surface.distances(near, number))
     if not sum(len(part.row) for part in parts):
         return None
     names = [item.name for item in fields(PassDistances)]
     found = PassDistances(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
     # NaN, where a point's own pass shows no surface, is no other face
+    own_normal = np.full_like(points, np.nan)
+    for number in np.unique(owner[found.row]).tolist():
+        surface = surfaces.of(number)
+        if surface is not None:
+            rows = np.unique(found.row[owner[found.row] == number])
+            about = surface.distances(rows, number)
+            own_normal[about.row] = about.normal
     alike = np.abs(np.einsum("ni,ni->n", found.normal, own_normal[found.row]))
     return found.of_rows(~(alike < SAME_FACE))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PassSurfaces:
+    """The surfaces of passes, each built when it is first asked for.
+
+    ``points`` (M, 3) are in Base, ``owner`` (M,) the pass of each.
+    """
+
+    stripes: Stripes
+    points: FloatArray
+    owner: IntArray
+    radii_mm: dict[int, float] = field(default_factory=dict)
+    built: dict[int, _PassSurface | None] = field(default_factory=dict)
+
+    def reached(self, number: int, rows: IntArray) -> IntArray:
+        """Those of the rows that may lie within the radius of a point of the pass."""
+        own = np.flatnonzero(self.owner == number)
+        if len(own) < FEWEST_NEIGHBOURS or not len(rows):
+            return rows[:0]
+        points = self.points[own]
+        radius = _radius_mm(points, self.stripes.exposure[own])
+        self.radii_mm[number] = radius
+        asked = self.points[rows]
+        is_near = (asked >= points.min(axis=0) - radius) & (asked <= points.max(axis=0) + radius)
+        return np.asarray(rows[is_near.all(axis=1)])
+
+    def of(self, number: int) -> _PassSurface | None:
+        """The surface of a pass; None if it has none."""
+        if number not in self.built:
+            own, radius = np.flatnonzero(self.owner == number), self.radii_mm.get(number)
+            self.built[number] = None
+            if radius is not None:
+                surface = _PassSurface.of(self.stripes, self.points, own, radius)
+                self.built[number] = surface
+        return self.built[number]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -285,9 +326,10 @@ class _PassSurface:
     misfit_mm: float = 0.0
 
     @staticmethod
-    def of(stripes: Stripes, points: FloatArray, own: IntArray) -> _PassSurface | None:
+    def of(
+        stripes: Stripes, points: FloatArray, own: IntArray, radius: float
+    ) -> _PassSurface | None:
         """The surface of the points ``own``; None if its stripes do not lie side by side."""
-        radius = _radius_mm(points[own], stripes.exposure[own])
         rows = own[thinned_rows(points[own], stripes.exposure[own], radius / CELLS)]
         table = np.column_stack([points[rows], stripes.exposure[rows], rows])
         near = NeighbourBins.of(table, points[rows].min(axis=0), radius)
@@ -335,11 +377,9 @@ class _PassSurface:
 
 def _radius_mm(points: FloatArray, exposure: IntArray) -> float:
     """Reach that holds the next stripes of the same pass."""
-    sample = np.arange(0, len(points), max(1, len(points) // 100))
-    count = min(64, len(points))
-    distance, near = cKDTree(points).query(points[sample], k=np.arange(1, count + 1))
-    is_other = exposure[near] != exposure[sample, None]
-    spacing = np.where(is_other, distance, np.inf).min(axis=1)
+    sample = np.arange(0, len(points), max(1, len(points) // SAMPLED))
+    spacing = np.zeros(len(sample))
+    next_stripes(points, exposure, sample, LOOKED_AT, spacing)
     spacing = np.minimum(spacing, LARGEST_RADIUS_MM)
     wanted = SPACINGS * float(np.median(spacing))
     return float(np.clip(wanted, LEAST_RADIUS_MM, LARGEST_RADIUS_MM))

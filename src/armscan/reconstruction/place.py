@@ -18,6 +18,7 @@ from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.shapes import fit_plane
 from armscan.kernels.faces import sort_into_bins, tangent_normals
+from armscan.kernels.fusing import carry_fused
 from armscan.kernels.placing import carry_stripe, propagate_points
 from armscan.models.calibration import (
     ArmNoise,
@@ -140,6 +141,14 @@ class BaseTransform:
     def factors_in_sensor(self) -> tuple[FloatArray, ...]:
         """(Q + 6, K) the same, one error a column."""
         return tuple(np.ascontiguousarray(errors.T) for errors in self.errors_in_sensor)
+
+    @cached_property
+    def joint_errors(self) -> FloatArray:
+        """(S (Q + 6), Q + 6) `errors_in_sensor` of all sheets, filled up with rows of zeros."""
+        whole = np.zeros((len(self.factors), len(self.factors[0]), len(self.factors[0])))
+        for one, errors in zip(whole, self.errors_in_sensor, strict=True):
+            one[: len(errors)] = errors
+        return whole.reshape(-1, whole.shape[2])
 
     @property
     def sheet_names(self) -> tuple[str, ...]:
@@ -282,6 +291,20 @@ def propagate_to_base(
     arm = np.stack([hand_eye.arm_noise.variances, middle, base_from_tool.translation_mm])
     if stripe.dpoint_dsensor is None and stripe.sensor is not None and stripe.sensor.second is None:
         placed, covariance = _carried(stripe, stripe.sensor, base_from_sensor, arm, transform)
+    elif stripe.gain is not None and stripe.by_distance is not None:
+        placed, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+        carry_fused(
+            stripe.points_mm,
+            stripe.noise_mm.reshape(n, 3 * stripe.noise_mm.shape[2]),
+            stripe.shape_mm,
+            stripe.gain.reshape(n, 12),
+            stripe.by_distance,
+            stripe.sheet,
+            transform.joint_errors,
+            _carry_numbers(base_from_sensor, arm),
+            placed.reshape(-1),
+            covariance.reshape(-1),
+        )
     else:
         placed, covariance = _propagated(stripe, base_from_sensor, arm, transform)
     for array in (placed, covariance):
@@ -301,8 +324,7 @@ def _carried(
     """Points (N, 3) of one camera on their sheets, with covariances (N, 3, 3); ``arm`` (3, 3)."""
     n = len(stripe)
     placed, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    turn = np.column_stack([base_from_sensor.rotation, base_from_sensor.translation_mm])
-    carried = np.concatenate([turn, arm], axis=None)
+    carried = _carry_numbers(base_from_sensor, arm)
     lens, numbers = lens_numbers(sensor), sheet_numbers(sensor)
     for k, rows in sheet_rows(stripe.sheet):
         outputs = placed[rows], covariance[rows]
@@ -320,6 +342,12 @@ def _carried(
         if not isinstance(rows, slice):
             placed[rows], covariance[rows] = outputs
     return placed, covariance
+
+
+def _carry_numbers(base_from_sensor: Pose[Base, Sensor], arm: FloatArray) -> FloatArray:
+    """(21,) the pose and what the arm errs, (3, 3), as `carry_stripe` takes them."""
+    turn = np.column_stack([base_from_sensor.rotation, base_from_sensor.translation_mm])
+    return np.concatenate([turn, arm], axis=None)
 
 
 def _propagated(

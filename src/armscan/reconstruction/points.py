@@ -17,8 +17,8 @@ import numpy as np
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.rotations import skew
+from armscan.kernels.fusing import N_PARAMETERS, N_SENSOR, fuse_stripes
 from armscan.kernels.naming import mark_beside
-from armscan.kernels.placing import fuse_stripes
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import fold_radius
 from armscan.models.light_sheet import LightSheet
@@ -43,7 +43,6 @@ from armscan.reconstruction.triangulate import (
     gradients,
     lens_numbers,
     meet,
-    moved_by_shape,
     sensor_covariance,
     shapes_mm,
     sheet_numbers,
@@ -63,8 +62,6 @@ CONSISTENCY_SIGMAS = 5.0
 BESIDE_ROWS = 3
 """Where the right picture is larger, not every right point has a left one: this many between."""
 N_STRIPES = 2
-N_COLUMNS = 32
-"""Parameters that a point of two cameras depends on: 9, 8 of its sheet, 15 of the second one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,36 +289,37 @@ def _left_points(
     In the order of the profile; rows that are neither are left out.
     """
     left, right = profiles
-    chosen, alone = np.flatnonzero(is_fused), np.flatnonzero(is_alone)
-    is_kept = is_alone.copy()
-    is_kept[crossings.at[chosen]] = True
-    kept, place = np.flatnonzero(is_kept), np.cumsum(is_kept) - 1
-    shift = np.zeros(len(crossings.at))
+    chosen = np.flatnonzero(is_fused)
+    crossing = np.full(len(row), -1)
+    crossing[crossings.at[chosen]] = chosen
+    kept = np.flatnonzero(is_alone | (crossing >= 0))
+    crossing = crossing[kept]
+    missed = crossings.residual_px
     if offset.is_beyond_calibration:
-        shift -= crossings.by_errors[:, -N_DRIFT:] @ offset.drift
-    found = SpreadPoints.empty(len(kept))
-    into, into_alone = place[crossings.at[chosen]], place[alone]
-    sigma = np.column_stack([left.sigma_px[row[crossings.at]], right.sigma_px[crossings.row]])
-    fuse_points(
+        missed = missed + crossings.by_errors[:, -N_DRIFT:] @ offset.drift
+    length, other = left.noise_length, right.noise_length
+    is_pair = crossing >= 0
+    found = fuse_points(
         projected,
         crossings,
-        left.normals_px[row],
-        sigma,
+        np.column_stack([left.normals_px[row], left.sigma_px[row]]),
+        right.sigma_px[crossings.row],
         sensor=sensor,
-        shift_px=shift,
-        chosen=chosen,
-        into=into,
-        found=found,
+        missed_px=missed,
+        rows=kept,
+        crossing=crossing,
     )
-    _spread_alone(row[alone], projected.select(alone), left, sensor, into_alone, found=found)
-    length = None
-    if left.noise_length is not None and (right.noise_length is not None or not len(chosen)):
-        length = left.noise_length[row[kept]]
-        if right.noise_length is not None and len(chosen):
-            pair = right.noise_length[crossings.row[chosen]]
-            length[into] = _mean_length(length[into], pair, found.noise_mm[into])
+    if length is not None and other is None and is_pair.any():
+        length = None
+    if length is not None:
+        length = length[row[kept]]
+        if other is not None and is_pair.any():
+            pair = other[crossings.row[crossing[is_pair]]]
+            length[is_pair] = _mean_length(length[is_pair], pair, found.noise_mm[is_pair])
         length.setflags(write=False)
-    return found.stripe_points(row[kept], projected.sheet[kept], length)
+    row = row[kept]
+    row.setflags(write=False)
+    return replace(found, row=row, noise_length=length)
 
 
 def _mean_length(left: FloatArray, right: FloatArray, noise_mm: FloatArray) -> FloatArray:
@@ -331,64 +329,17 @@ def _mean_length(left: FloatArray, right: FloatArray, noise_mm: FloatArray) -> F
     return np.asarray(total / variance.sum(axis=1))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SpreadPoints:
-    """Points of two cameras with what moves them, as `StripePoints` has them; they are written to.
-
-    Parameters
-    ----------
-    points_mm, shape_mm
-        (M, 3).
-    noise_mm
-        (M, 3, 2) by the left stripe and by the right stripe.
-    by_sensor
-        (M, 3, 32).
-    """
-
-    points_mm: FloatArray
-    noise_mm: FloatArray
-    shape_mm: FloatArray
-    by_sensor: FloatArray
-
-    @staticmethod
-    def empty(n: int) -> SpreadPoints:
-        """Nothing is known of ``n`` points yet."""
-        return SpreadPoints(
-            points_mm=np.zeros((n, 3)),
-            noise_mm=np.zeros((n, 3, N_STRIPES)),
-            shape_mm=np.zeros((n, 3)),
-            by_sensor=np.zeros((n, 3, N_COLUMNS)),
-        )
-
-    def stripe_points(
-        self, row: IntArray, sheet: IntArray, noise_length: FloatArray | None
-    ) -> StripePoints:
-        """All of them, which are not written to any more."""
-        for array in (self.points_mm, self.noise_mm, self.shape_mm, self.by_sensor, row, sheet):
-            array.setflags(write=False)
-        return StripePoints(
-            row=row,
-            points_mm=self.points_mm,
-            noise_mm=self.noise_mm,
-            shape_mm=self.shape_mm,
-            dpoint_dsensor=self.by_sensor,
-            sheet=sheet,
-            noise_length=noise_length,
-        )
-
-
 def fuse_points(
     projected: Projections,
     crossings: Crossings,
-    normals_px: FloatArray,
-    sigma_px: FloatArray,
+    left: FloatArray,
+    right_sigma_px: FloatArray,
     *,
     sensor: SensorCalibration,
-    shift_px: FloatArray,
-    chosen: IntArray,
-    into: IntArray,
-    found: SpreadPoints,
-) -> None:
+    missed_px: FloatArray,
+    rows: IntArray,
+    crossing: IntArray,
+) -> StripePoints:
     """Weigh left stripe, right stripe and sheet against each other (eqs. 4.7, 4.11, 4.17).
 
     A point has three unknowns. Its place along the left stripe is a choice of where to sample, so
@@ -404,41 +355,58 @@ def fuse_points(
         (H,) left points on their sheets.
     crossings
         (F,) the right stripes beside them.
-    normals_px
-        (H, 2) across the left stripe.
-    sigma_px
-        (F, 2) of the left stripe's point and of the right stripe's.
+    left
+        (H, 3) normals across the left stripe, and sigma of its points.
+    right_sigma_px
+        (F,) of the right stripe's points.
     sensor
         Both cameras and all sheets, with their joint covariance.
-    shift_px
-        (F,) known part of the residuals, to be taken off: of a camera that has moved.
-    chosen
-        (M,) crossings whose points are asked for.
-    into
-        (M,) their places in ``found``.
-    found
-        Receives them.
+    missed_px
+        (F,) distances across the right stripe, without the known part of a camera that has moved.
+    rows
+        (M,) left points that are asked for.
+    crossing
+        (M,) the crossing of each; -1 for a point that stays on its sheet.
+
+    Returns
+    -------
+    StripePoints
+        In the order asked; ``row`` is ``rows``.
     """
-    n = len(found.points_mm)
+    n = len(rows)
+    points, noise, shape = np.zeros((n, 3)), np.zeros((n, 3, N_STRIPES)), np.zeros((n, 3))
+    gain, by_distance = np.zeros((n, 3, 4)), np.zeros((n, N_PARAMETERS))
     fuse_stripes(
-        chosen,
-        into,
-        crossings.at,
+        rows,
+        crossing,
         projected.points_mm,
         projected.sheet,
-        normals_px,
-        sigma_px,
-        np.maximum(shapes_mm(sensor), 1e-6),
-        crossings.residual_px - shift_px,
+        left,
+        right_sigma_px,
+        shapes_mm(sensor),
+        missed_px,
         crossings.by_point,
         crossings.by_errors,
         lens_numbers(sensor),
         sheet_numbers(sensor),
         _covariances(sensor),
-        found.points_mm,
-        found.noise_mm.reshape(n, 3 * N_STRIPES),
-        found.shape_mm,
-        found.by_sensor.reshape(n, 3 * N_COLUMNS),
+        points,
+        noise.reshape(n, 3 * N_STRIPES),
+        shape,
+        gain.reshape(n, 12),
+        by_distance,
+    )
+    sheet = projected.sheet[rows]
+    for array in (points, noise, shape, gain, by_distance, sheet):
+        array.setflags(write=False)
+    return StripePoints(
+        row=rows,
+        points_mm=points,
+        noise_mm=noise,
+        shape_mm=shape,
+        gain=gain,
+        by_distance=by_distance,
+        sheet=sheet,
     )
 
 
@@ -446,27 +414,6 @@ def fuse_points(
 def _covariances(sensor: SensorCalibration) -> FloatArray:
     """(S, 1024) covariance of what the points of each sheet depend on."""
     return np.stack([sensor_covariance(sensor, k).ravel() for k in range(len(sensor.sheets))])
-
-
-def _spread_alone(
-    row: IntArray,
-    projected: Projections,
-    left: Profile,
-    sensor: SensorCalibration,
-    into: IntArray,
-    *,
-    found: SpreadPoints,
-) -> None:
-    """Points (M,) on their sheet by the left camera alone (eq. 4.11), into places of ``found``."""
-    points, sheet = projected.points_mm, projected.sheet
-    by_px, by_sensor = differentiated(points, sheet, lens_numbers(sensor), sheet_numbers(sensor))
-    across = np.einsum("nij,nj->ni", by_px, left.normals_px[row])
-    found.points_mm[into] = points
-    found.noise_mm[into, :, 0] = across * left.sigma_px[row, None]
-    found.noise_mm[into, :, 1] = 0.0
-    found.shape_mm[into] = moved_by_shape(points, points, sheet, sensor)
-    found.by_sensor[into, :, : N_CAMERA + N_SHEET] = by_sensor
-    found.by_sensor[into, :, N_CAMERA + N_SHEET :] = 0.0
 
 
 def triangulate_right(
@@ -509,7 +456,7 @@ def triangulate_right(
     noise = np.zeros((n, 3, N_STRIPES))
     across = np.einsum("nij,nj->ni", by_px, profile.normals_px[row])
     noise[:, :, 1] = (across @ turn.T) * profile.sigma_px[row, None]
-    by_sensor, second = np.zeros((n, 3, N_COLUMNS)), N_CAMERA + N_SHEET
+    by_sensor, second = np.zeros((n, 3, N_SENSOR)), N_CAMERA + N_SHEET
     turned = turn @ by_right
     by_sensor[:, :, N_CAMERA:second] = turned[:, :, N_CAMERA:]
     by_sensor[:, :, second : second + N_CAMERA] = turned[:, :, :N_CAMERA]

@@ -13,6 +13,7 @@ import numpy as np
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
 from armscan.geometry.poses import Pose, Sensor
+from armscan.kernels.fusing import ACROSS, N_PARAMETERS, N_SENSOR, RIGHT, SHEET
 from armscan.kernels.placing import spread_stripe
 from armscan.kernels.rays import differentiate_sheets, meet_sheets, sheet_gradients
 from armscan.models.calibration import (
@@ -168,8 +169,12 @@ class StripePoints(RowRecord):
     dpoint_dsensor
         (M, 3, Q) derivative by the parameters that `sensor_columns` names for the point's sheet:
         the camera's 9, the sheet's 8, and the 15 of a second camera, if there is one. None where
-        it follows from the places alone: of points of the left camera or the only one that lie on
-        their sheets.
+        it follows from the places alone, of points of the only camera that lie on their sheets,
+        and where it is held as a product.
+    gain, by_distance
+        (M, 3, 4) moves of the point by the four distances that tell it, and (M, 41) derivatives
+        of these by the sensor, as `armscan.kernels.fusing.fuse_stripes` makes them. None if
+        ``dpoint_dsensor`` is given or follows from the places.
     sheet
         (M,) index into ``sensor.sheets``.
     noise_length
@@ -182,13 +187,15 @@ class StripePoints(RowRecord):
     noise_mm: FloatArray = floats("N", 3, None)
     shape_mm: FloatArray = floats("N", 3)
     dpoint_dsensor: FloatArray | None = floats("N", 3, None, default=None)
+    gain: FloatArray | None = floats("N", 3, 4, default=None)
+    by_distance: FloatArray | None = floats("N", N_PARAMETERS, default=None)
     sheet: IntArray = ints("N")
     noise_length: FloatArray | None = floats("N", default=None)
     sensor: SensorCalibration | None = None
 
     @property
     def by_sensor(self) -> FloatArray:
-        """(M, 3, Q) ``dpoint_dsensor``, found from the places where it is not held.
+        """(M, 3, Q) ``dpoint_dsensor``, found from the places or the product where it is not held.
 
         Raises
         ------
@@ -197,6 +204,14 @@ class StripePoints(RowRecord):
         """
         if self.dpoint_dsensor is not None:
             return self.dpoint_dsensor
+        if self.gain is not None and self.by_distance is not None:
+            second, own = N_CAMERA + N_SHEET, self.by_distance
+            by_sensor = np.zeros((len(self), 4, N_SENSOR))
+            by_sensor[:, 0, :N_CAMERA] = own[:, :ACROSS]
+            by_sensor[:, 1, :N_CAMERA] = own[:, ACROSS:RIGHT]
+            by_sensor[:, 2, second:] = own[:, RIGHT:SHEET]
+            by_sensor[:, 3, N_CAMERA:second] = own[:, SHEET:]
+            return np.asarray(-self.gain @ by_sensor)
         if self.sensor is None:
             raise InputError("points without derivatives and without the sensor that saw them")
         numbers = lens_numbers(self.sensor), sheet_numbers(self.sensor)
@@ -369,20 +384,6 @@ def shape_mm(sensor: SensorCalibration, sheet: int) -> float:
     """Standard deviation of a sheet's true surface about its model."""
     one = sensor.sheets[sheet]
     return OLD_SHAPE_SHARE * one.rms_mm if one.shape_mm is None else one.shape_mm
-
-
-def moved_by_shape(
-    points_mm: FloatArray, rays: FloatArray, sheet: IntArray, sensor: SensorCalibration
-) -> FloatArray:
-    """(M, 3) move of points along their rays (M, 3) by one standard deviation of a sheet's shape.
-
-    All in the Sensor frame; ``sheet`` (M,) is the index of each point's sheet.
-    """
-    along = np.sum(gradients(points_mm, sheet, sensor) * rays, axis=1)
-    size = shapes_mm(sensor)[sheet]
-    return np.asarray(
-        rays * np.divide(size, along, out=np.zeros_like(along), where=along != 0)[:, None]
-    )
 
 
 def gradients(points_mm: FloatArray, sheet: IntArray, sensor: SensorCalibration) -> FloatArray:

@@ -10,16 +10,22 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.kernels.fusing import N_PARAMETERS, carry_fused
+from armscan.kernels.placing import propagate_points
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
-from armscan.reconstruction.points import SpreadPoints, fuse_points, triangulate_right
+from armscan.reconstruction.points import fuse_points, triangulate_right
 from armscan.reconstruction.triangulate import (
     StripePoints,
+    differentiated,
+    lens_numbers,
     noise_size_mm,
     sensor_columns,
     sensor_covariance,
     shape_mm,
+    sheet_numbers,
 )
 from rigs.sheet_rig import make_profile
 from rigs.stereo_head import StereoHead
@@ -64,19 +70,16 @@ def fused(
     beside = find_crossings(there, normals, np.full(n, SIGMA_PX), right, sensor, reach_px=30.0)
     assert (beside.at == np.arange(n)).all()
     assert (beside.row == np.arange(n)).all()
-    found = SpreadPoints.empty(n)
-    fuse_points(
+    return fuse_points(
         there,
         beside,
-        normals,
-        np.column_stack([np.full(n, SIGMA_PX), np.full(n, right_sigma_px)]),
+        np.column_stack([normals, np.full(n, SIGMA_PX)]),
+        np.full(n, right_sigma_px),
         sensor=sensor,
-        shift_px=np.zeros(n),
-        chosen=np.arange(n),
-        into=np.arange(n),
-        found=found,
+        missed_px=beside.residual_px,
+        rows=np.arange(n),
+        crossing=np.arange(n),
     )
-    return found.stripe_points(np.arange(n), there.sheet, None)
 
 
 def test_a_pair_without_points_has_none() -> None:
@@ -87,19 +90,17 @@ def test_a_pair_without_points_has_none() -> None:
         there, normals, np.full(len(left), SIGMA_PX), right, sensor, reach_px=3.0
     )
     assert len(beside.at) == len(beside.by_errors) == 0
-    none, found = np.zeros(0, dtype=np.int64), SpreadPoints.empty(0)
-    fuse_points(
+    none = np.zeros(0, dtype=np.int64)
+    points = fuse_points(
         there,
         beside,
-        normals,
-        np.zeros((0, 2)),
+        np.column_stack([normals, np.full(len(left), SIGMA_PX)]),
+        np.zeros(0),
         sensor=sensor,
-        shift_px=np.zeros(0),
-        chosen=none,
-        into=none,
-        found=found,
+        missed_px=beside.residual_px,
+        rows=none,
+        crossing=none,
     )
-    points = found.stripe_points(none, none, None)
     assert points.points_mm.shape == (0, 3)
     assert noise_size_mm(points.noise_mm).shape == (0,)
 
@@ -287,3 +288,93 @@ def test_fusing_solves_the_weighted_equations_with_the_place_along_the_stripe_he
         expected = -gain @ by_sensor
         size = np.abs(expected).max(axis=0)
         assert np.all(np.abs(found.by_sensor[i] - expected) <= 1e-7 * size + 1e-12)
+
+
+def test_a_point_without_a_right_stripe_is_that_of_the_left_camera_alone() -> None:
+    """One kernel for both: against the derivatives of a point on its sheet."""
+    sensor = head().drawn_calibration(np.random.default_rng(3))
+    left, normals, right = pixels()
+    n, sigma = len(left), np.array([0.05, 0.07, 0.09, 0.11])
+    there = project_on_sheets(left, np.full(n, SHEET), sensor)
+    stripes = RightStripes.of(make_profile("right", [(right, normals)], SIGMA_PX))
+    beside = find_crossings(there, normals, sigma, stripes, sensor, reach_px=30.0)
+    rows = np.array([3, 0, 2])
+    found = fuse_points(
+        there,
+        beside,
+        np.column_stack([normals, sigma]),
+        np.full(n, SIGMA_PX),
+        sensor=sensor,
+        missed_px=beside.residual_px,
+        rows=rows,
+        crossing=np.array([-1, 0, -1]),
+    )
+    alone, sheet = np.array([0, 2]), sensor.sheets[SHEET].sheet
+    points = there.points_mm[rows[alone]]
+    by_px, by_sensor = differentiated(
+        points, np.full(2, SHEET), lens_numbers(sensor), sheet_numbers(sensor)
+    )
+    np.testing.assert_array_equal(found.points_mm[alone], points)
+    across = np.einsum("nij,nj->ni", by_px, normals[rows[alone]]) * sigma[rows[alone], None]
+    np.testing.assert_allclose(found.noise_mm[alone, :, 0], across, rtol=1e-9, atol=1e-12)
+    assert not found.noise_mm[alone, :, 1].any()
+    _, gradient, _ = sheet.height_with_jacobian(points)
+    slide = shape_mm(sensor, SHEET) / np.sum(gradient * points, axis=1)
+    np.testing.assert_allclose(found.shape_mm[alone], points * slide[:, None], rtol=1e-9)
+    size = np.abs(by_sensor).max(axis=(0, 1))
+    assert (np.abs(found.by_sensor[alone, :, :17] - by_sensor) <= 1e-9 * size).all()
+    assert not found.by_sensor[alone, :, 17:].any()
+    assert found.noise_mm[1, :, 1].any()
+    assert (found.sheet == SHEET).all()
+
+
+def test_placing_by_the_product_is_placing_by_the_whole_derivatives() -> None:
+    """More points than go through the kernel together, of two sheets in turn, in any pose."""
+    rng = np.random.default_rng(6)
+    n, n_sheets = 300, 2
+    points, shape = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    stripe = StripePoints(
+        row=np.arange(n),
+        points_mm=points,
+        noise_mm=rng.normal(size=(n, 3, 2)),
+        shape_mm=shape,
+        gain=rng.normal(size=(n, 3, 4)),
+        by_distance=rng.normal(size=(n, N_PARAMETERS)),
+        sheet=rng.integers(0, n_sheets, n),
+    )
+    assert stripe.gain is not None
+    assert stripe.by_distance is not None
+    errors = np.triu(rng.normal(size=(n_sheets, 38, 38)))
+    turn, shift = rotation_from_vector(np.array([0.3, -0.8, 0.5])), np.array([10.0, -20.0, 5.0])
+    carried = np.concatenate(
+        [np.column_stack([turn, shift]), rng.uniform(0.0, 1.0, (3, 3))], axis=None
+    )
+    placed, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    carry_fused(
+        points,
+        stripe.noise_mm.reshape(n, 6),
+        shape,
+        stripe.gain.reshape(n, 12),
+        stripe.by_distance,
+        stripe.sheet,
+        errors.reshape(-1, 38),
+        carried,
+        placed.reshape(-1),
+        covariance.reshape(-1),
+    )
+    expected_at, expected = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    for k in range(n_sheets):
+        propagate_points(
+            points,
+            stripe.noise_mm.reshape(n, 6),
+            shape,
+            stripe.by_sensor.reshape(n, 96),
+            np.ascontiguousarray(errors[k].T),
+            np.column_stack([turn, shift]),
+            carried[12:].reshape(3, 3),
+            np.flatnonzero(stripe.sheet == k),
+            expected_at,
+            expected.reshape(n, 9),
+        )
+    np.testing.assert_allclose(placed, expected_at, rtol=1e-12)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-9, atol=1e-9)

@@ -8,10 +8,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import FloatArray
-from armscan.kernels.faces import quadric_offsets
+from armscan.kernels.faces import next_stripes, quadric_offsets
 from armscan.reconstruction.pass_agreement import (
     Stripes,
     pass_agreement,
+    pass_distances,
     passes_of,
     thinned_rows,
 )
@@ -163,3 +164,24 @@ def test_passes_end_at_pauses() -> None:
 def test_thinning_keeps_one_point_a_cell_and_exposure() -> None:
     points = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [0.9, 0.0, 0.0], [0.1, 0.0, 0.0]])
     assert thinned_rows(points, np.array([0, 0, 0, 1])).tolist() == [0, 2, 3]
+
+
+def test_spacings_of_stripes_are_those_of_a_tree() -> None:
+    """The next stripe counts only if it is among the nearest points, as where stripes are dense."""
+    rng = np.random.default_rng(9)
+    stripes = ball_passes(np.zeros(3))
+    points = stripes.points_base_mm + rng.normal(0.0, 0.05, (1600, 3))
+    sample = np.arange(0, 1600, 13)
+    for looked_at in (3, 1600):
+        found = np.zeros(len(sample))
+        next_stripes(points, stripes.exposure, sample, looked_at, found)
+        distance, near = cKDTree(points).query(points[sample], k=looked_at)
+        is_other = stripes.exposure[near] != stripes.exposure[sample, None]
+        expected = np.where(is_other, distance, np.inf).min(axis=1)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        assert np.isinf(found).any() == (looked_at < 1600)
+
+
+def test_passes_that_lie_far_apart_say_nothing_of_each_other() -> None:
+    assert pass_distances(ball_passes(np.zeros(3))) is not None
+    assert pass_distances(ball_passes(np.array([90.0, 0.0, 0.0]))) is None

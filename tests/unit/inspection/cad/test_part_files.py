@@ -189,6 +189,19 @@ def test_a_step_file_keeps_its_faces_and_says_its_unit(tmp_path: Path, unit: str
     assert 8.0 - 0.01 <= middle.min() < 8.0 - 0.001
 
 
+def test_a_step_file_in_a_wrong_unit_is_refused_before_it_fills_the_memory(tmp_path: Path) -> None:
+    """A bracket of 80 mm that calls itself 80 m: its triangles took six gigabytes."""
+    path = step_file(tmp_path)
+    milli = b"SI_UNIT(.MILLI.,.METRE.)"
+    assert milli in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(milli, b"SI_UNIT($,.METRE.)"))
+    with pytest.raises(InputError, match=r"measures 96,437 mm across.*--chord-mm 0\.042"):
+        read_part(path)
+    # a coarse chord is the way to read what is so large
+    found = read_part(path, chord=ChordError(chord_mm=1.0))
+    assert np.allclose(found.high_mm, [80e3, 50e3, 20e3])
+
+
 def test_a_step_file_cut_short_is_refused(tmp_path: Path) -> None:
     path = step_file(tmp_path)
     whole = path.read_bytes()

@@ -110,6 +110,18 @@ def test_an_open_surface_and_a_turned_triangle_are_noticed() -> None:
     assert "opposite sides" in part_of(bent, source="a.stl").notes[0]
 
 
+def test_a_closed_surface_turned_inside_out_is_turned_back() -> None:
+    """Its scans were called those of another part: every distance had the wrong sign."""
+    found = part_of(PART.corners_mm[:, ::-1] + 500.0, source="a.stl")
+    assert "inside out" in found.notes[0]
+    outward = np.einsum("ij,ij->i", found.normals, found.corners_mm.mean(axis=1))
+    plain = np.einsum("ij,ij->i", PART.normals, PART.corners_mm.mean(axis=1) + 500.0)
+    np.testing.assert_allclose(outward, plain, atol=1e-9)
+    assert part_of(PART.corners_mm, source="a.stl").notes == ()
+    # what does not close tells no inside
+    assert "open" in part_of(PART.corners_mm[1:, ::-1], source="a.stl").notes[0]
+
+
 def test_degenerate_triangles_are_left_out_and_counted() -> None:
     flat = np.repeat(PART.corners_mm[:2, :1], 3, axis=1)
     line = PART.corners_mm[:1, [0, 1, 1]]

@@ -62,6 +62,7 @@ def test_a_model_becomes_the_same_triangles_as_stl(tmp_path: Path, suffix: str) 
     told = convert_file(source, target)
     assert told.what == "model to STL" and "names of faces" in told.losses
     written = trimesh.load(target)
+    assert isinstance(written, trimesh.Trimesh)
     assert len(written.faces) == 12 and written.is_watertight
     assert written.volume == pytest.approx(6000.0, rel=1e-6)
     with pytest.raises(OutputError, match="exists"):

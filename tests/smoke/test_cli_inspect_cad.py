@@ -141,6 +141,27 @@ def test_what_cannot_be_done_is_one_sentence(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("name", ["cloud.ply", "part.ply", "limits.csv"])
+def test_what_is_read_is_never_replaced(
+    name: str, files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beside the page goes a file of the same stem, which may be the cloud or the model."""
+    mesh = trimesh.Trimesh(PART.vertices_mm, PART.triangles, process=False)
+    contents = {
+        "cloud.ply": (files / "good.ply").read_bytes(),
+        "part.ply": mesh.export(file_type="ply"),
+        "limits.csv": b"face,tolerance_mm\n*,0.05\n",
+    }
+    for one, content in contents.items():
+        (tmp_path / one).write_bytes(content)
+    cloud, part, limits = (str(tmp_path / one) for one in contents)
+    page = (tmp_path / name).with_suffix(".html")
+    words = ("--align", "none", "--tolerance", limits, "-o", str(page), "--force")
+    assert main(["inspect", "cad", cloud, part, *words]) == 2
+    assert f"{name} is read" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == contents
+
+
 def test_a_cloud_without_points_is_not_blamed_on_a_region(
     files: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
-from armscan.errors import FileFormatError, OptionError, OutputError
-from armscan.storage.clouds import convert_file
+from armscan.errors import ArmscanError, FileFormatError, OptionError, OutputError
+from armscan.storage.clouds import convert_file, write_cloud
 from armscan.storage.documents import read_camera_calibration, read_sensor_calibration
+from rigs.inspection_clouds import cloud_of
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -50,6 +52,30 @@ def test_no_such_way(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="no conversion"):
         convert_file(documents("camera")[0], tmp_path / "camera.xyz")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
+def test_a_model_becomes_the_same_triangles_as_stl(tmp_path: Path, suffix: str) -> None:
+    box = trimesh.creation.box((30.0, 20.0, 10.0))
+    source, target = tmp_path / f"box{suffix}", tmp_path / "out.stl"
+    box.export(source)
+    told = convert_file(source, target)
+    assert told.what == "model to STL" and "names of faces" in told.losses
+    written = trimesh.load(target)
+    assert isinstance(written, trimesh.Trimesh)
+    assert len(written.faces) == 12 and written.is_watertight
+    assert written.volume == pytest.approx(6000.0, rel=1e-6)
+    with pytest.raises(OutputError, match="exists"):
+        convert_file(source, target)
+
+
+def test_a_cloud_becomes_no_stl(tmp_path: Path) -> None:
+    cloud = cloud_of(np.random.default_rng(1).uniform(size=(50, 3)))
+    for name, word in (("cloud.ply", "no faces"), ("cloud.pcd", "armscan mesh")):
+        write_cloud(tmp_path / name, cloud)
+        with pytest.raises(ArmscanError, match=word):
+            convert_file(tmp_path / name, tmp_path / "out.stl")
+    assert not (tmp_path / "out.stl").exists()
 
 
 def test_nothing_is_replaced_or_half_written(tmp_path: Path) -> None:

@@ -50,15 +50,15 @@ def convert(
         Path,
         typer.Argument(
             help="A cloud: .ply, .e57, .laz, .las, .pcd, .csv, .xyz, .asc, .txt; vertices of .stl, "
-            ".obj; a calibration; or a recording: its folder or .mcap.",
+            ".obj; a model of a part; a calibration; or a recording: its folder or .mcap.",
             show_default=False,
         ),
     ],
     output: Annotated[
         Path,
         typer.Argument(
-            help="A cloud: the same but .stl; of a calibration .yaml (ROS camera_info); "
-            "of a recording .mcap or a new folder.",
+            help="A cloud: the same but .stl; of a model (.stl, .ply, .obj, .step) its triangles, "
+            ".stl; of a calibration .yaml (ROS camera_info); of a recording .mcap or a new folder.",
             show_default=False,
         ),
     ],
@@ -73,7 +73,7 @@ def convert(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a cloud, a recording or a camera in another format."""
+    """Write a cloud, a model, a recording or a camera in another format."""
     from armscan.report.quantity import Summary
     from armscan.storage.clouds import convert_file
 

@@ -141,6 +141,10 @@ def select(
         If fewer than ``min_points`` are left, or the cloud looks like metres.
     """
     extent = float(np.linalg.norm(np.ptp(cloud.points_mm, axis=0))) if len(cloud) else 0.0
+    if len(cloud) >= min_points and extent == 0.0:
+        raise InputError(
+            f"all {len(cloud)} points lie in one place", remedy="give a cloud that was measured"
+        )
     if len(cloud) >= min_points and extent < SMALLEST_EXTENT_MM:
         raise InputError(
             f"all {len(cloud)} points lie within {extent:.3g} mm: these look like metres",

@@ -85,7 +85,13 @@ class Job:
             return None
         return DetectionCache.beside(self.output)
 
-    def places(self, *suffixes: str, beside: Sequence[str] = (), hint: str = "") -> list[Path]:
+    def places(
+        self,
+        *suffixes: str,
+        beside: Sequence[str] = (),
+        hint: str = "",
+        reads: Sequence[Path] = (),
+    ) -> list[Path]:
         """Check where files go before anything is read; none if there is no output.
 
         Parameters
@@ -96,13 +102,15 @@ class Job:
             Suffixes of the files beside it.
         hint
             Behind the remedy of a wrong suffix.
+        reads
+            Files that the job reads, and so must not replace.
 
         Raises
         ------
         OptionError
             If the document's name ends in something else.
         OutputError
-            If a file exists or could not be written.
+            If a file exists, could not be written, or is one that the job reads.
         """
         if self.output is None:
             return []
@@ -113,9 +121,15 @@ class Job:
                 remedy=f"end it in {' or '.join(suffixes)}{hint}",
             )
         files = [self.output, *(self.output.with_suffix(suffix) for suffix in beside)]
-        check_outputs(
-            (*files, *(() if self.pdf is None else (self.pdf,))), is_overwriting=self.is_overwriting
-        )
+        written = (*files, *(() if self.pdf is None else (self.pdf,)))
+        for path in written:
+            if path.exists() and any(one.exists() and path.samefile(one) for one in reads):
+                raise OutputError(
+                    f"{path.name} is read, and would be replaced beside the page",
+                    where=f"-o {self.output}",
+                    remedy=f"give another name: -o {self.output.stem}-inspection.html",
+                )
+        check_outputs(written, is_overwriting=self.is_overwriting)
         if self.pdf is not None:
             require_pdf()
         return files

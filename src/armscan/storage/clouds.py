@@ -34,6 +34,9 @@ from armscan.storage.formats.ply import (
     read_ply,
 )
 from armscan.storage.formats.text import SIGMA_LOSS, XYZ_LOSES, xyz_bytes
+from armscan.storage.parts.meshes import MESH_SUFFIXES, read_part
+from armscan.storage.parts.step import STEP_SUFFIXES, ChordError
+from armscan.storage.parts.surfaces import encoded_surface
 
 __all__ = (
     "CLOUD_SUFFIXES",
@@ -181,10 +184,12 @@ def cloud_bytes(points: PointCloud | CloudPiece, path: Path) -> bytes:
     """
     known = BY_SUFFIX.get(path.suffix.lower())
     if known is None or known.write is None:
-        fact = f"the output's name ends in '{path.suffix}'"
+        fact, way = f"the output's name ends in '{path.suffix}'", ""
         if known is not None:
             fact = f"{known.name} files hold triangles, and a cloud has none"
-        raise OptionError(fact, where=str(path), remedy=f"end it in {', '.join(CLOUD_SUFFIXES)}")
+            way = "draw them with `armscan mesh`, or "
+        remedy = f"{way}end it in {', '.join(CLOUD_SUFFIXES)}"
+        raise OptionError(fact, where=str(path), remedy=remedy)
     return known.write(points if isinstance(points, CloudPiece) else CloudPiece(points))
 
 
@@ -289,15 +294,16 @@ class Conversion:
 
 
 def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) -> Conversion:
-    """Write a calibration's camera as ROS ``camera_info``, or a cloud in another format.
+    """Write a calibration's camera as ROS ``camera_info``, or a cloud or mesh in another format.
 
     Parameters
     ----------
     source
-        A cloud in any of `FORMATS`, or any calibration that armscan reads: its own camera or
-        sensor document, OpenCV's YAML, XML or JSON, ROS.
+        A cloud in any of `FORMATS`, a model of a part, or any calibration that armscan reads: its
+        own camera or sensor document, OpenCV's YAML, XML or JSON, ROS.
     output
-        ``.yaml`` for a camera, one of `CLOUD_SUFFIXES` for a cloud.
+        ``.yaml`` for a camera, ``.stl`` for the triangles of a model, one of `CLOUD_SUFFIXES` for a
+        cloud, or for the corners of a mesh.
     is_overwriting
         Replace a file that exists.
 
@@ -307,15 +313,19 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         If there is no way from the one kind of file to the other.
     FileFormatError
         If the source cannot be read.
+    InputError
+        If a mesh is wanted and the source holds no triangles.
     OutputError
         If the output exists or cannot be written.
     """
     suffix = output.suffix.lower()
+    if suffix == ".stl" and source.suffix.lower() in (*MESH_SUFFIXES, *STEP_SUFFIXES):
+        return _convert_model(source, output, is_overwriting=is_overwriting)
     is_cloud = source.suffix.lower() in BY_SUFFIX
     if is_cloud is not (suffix in BY_SUFFIX) or not (is_cloud or suffix in (".yaml", ".yml")):
         raise OptionError(
             f"there is no conversion from {source.name} to {output.name}",
-            remedy="convert a calibration to .yaml, or a cloud to one of "
+            remedy="convert a calibration to .yaml, a part's model to .stl, or a cloud to one of "
             + ", ".join(CLOUD_SUFFIXES),
         )
     check_outputs((output,), is_overwriting=is_overwriting)
@@ -335,6 +345,18 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         conversion = Conversion("camera to ROS camera_info", YAML_LOSES, (), forced)
     write_files({output: content}, is_overwriting=is_overwriting)
     return conversion
+
+
+def _convert_model(source: Path, output: Path, *, is_overwriting: bool) -> Conversion:
+    """Write the triangles of a part's model as STL."""
+    check_outputs((output,), is_overwriting=is_overwriting)
+    part = read_part(source)
+    content = encoded_surface(".stl", part.vertices_mm, part.triangles, f"{source.name}, mm")
+    write_files({output: content}, is_overwriting=is_overwriting)
+    is_step = source.suffix.lower() in STEP_SUFFIXES
+    losses = ("names of faces", "digits beyond single precision")
+    drawn = (f"faces are triangles within {ChordError().chord_mm:g} mm of the model",)
+    return Conversion("model to STL", losses, (*part.notes, *(drawn if is_step else ())))
 
 
 def _camera(path: Path) -> tuple[CameraModel, tuple[str, ...]]:

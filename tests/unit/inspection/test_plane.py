@@ -121,6 +121,8 @@ def test_a_curved_surface_is_no_flat_face_but_may_be_compared_with_a_plane() -> 
 def test_input_without_a_plane_is_refused_in_words() -> None:
     with pytest.raises(InputError, match="the cloud holds 0 points; an inspection needs 30"):
         inspect_plane(cloud_of(np.zeros((0, 3))))
+    with pytest.raises(InputError, match="all 60 points lie in one place"):
+        inspect_plane(cloud_of(np.full((60, 3), 7.0)))
     line = np.outer(np.arange(50.0), [1.0, 2.0, 3.0])
     failure = inspect_plane(cloud_of(line))
     assert isinstance(failure, FitFailure)

@@ -20,6 +20,7 @@ from armscan.simulation.arm.hand import (
 from armscan.simulation.head import sheet_middle_mm
 from armscan.simulation.instrument import SAMPLE_NS
 from armscan.simulation.twin import build_twin
+from rigs.traced_workpiece import BORE_AT, NAMES, seen
 
 TWIN = build_twin(seed=2)
 TOOLS = TWIN.instrument
@@ -136,3 +137,33 @@ def test_the_ball_is_seen_from_many_sides():
     assert between.max() > 45.0
     tilt = np.degrees(np.arccos(-axes[:, 2]))
     assert 40.0 < tilt.max() < 65.0
+
+
+def test_the_bore_is_seen_by_many_exposures_from_all_sides():
+    """A diameter of the few that happen to look in errs by what the arm errs at each of them."""
+    twin = build_twin("thesis-single", seed=3)
+    scan, part = twin.scan("workpiece"), twin.truth.base_from_workpiece.inverse()
+    light = scan.head.lasers[0]
+    fan = light.rays(np.linspace(-light.half_angle_rad, light.half_angle_rad, 400))
+    sides = []
+    for row in scan.rows:
+        pose = part @ scan.true_pose(row.index)
+        points, what = seen(
+            pose.apply(light.source_mm[None])[0], pose.translation_mm, pose.rotate(fan)
+        )
+        wall = points[what == NAMES.index("bore"), :2] - BORE_AT
+        if len(wall) >= 5:
+            sides.append(np.degrees(np.arctan2(wall[:, 1], wall[:, 0])) % 360.0 // 45.0)
+    assert len(sides) >= 30
+    n_side = np.bincount(np.concatenate(sides).astype(np.int64), minlength=8)
+    assert n_side.min() > 30, n_side
+
+
+def test_short_ways_over_a_bore_are_those_of_the_workpiece_alone():
+    """A part in its place has no bore there, and is scanned in lanes as before."""
+    block = np.array([[[0, 0, 0], [60, 0, 0], [60, 40, 0]], [[0, 0, 9], [60, 0, 9], [60, 40, 9]]])
+    for part_mm, n_short in ((None, 4), (block.astype(float), 0)):
+        tools = build_twin("thesis-single", seed=3, part_mm=part_mm).instrument
+        lengths = [one.length_mm for one in scan_passes("workpiece", tools.head, tools.fixtures)]
+        assert sum(length < 20.0 for length in lengths) == n_short
+        assert len(lengths) == 5 + n_short

@@ -141,6 +141,10 @@ def part_of(
         )
     vertices, triangles = _welded(corners, SAME_PLACE * diagonal)
     notes = list(_odd_edges(triangles, source))
+    if not notes and _signed_volume(corners) < 0.0:
+        # closed, and every triangle looks into the part: there is one way to mend it
+        corners, triangles = corners[:, ::-1], triangles[:, ::-1]
+        notes.append(f"{source}: the surface was turned inside out; its triangles are turned back")
     if n_flat:
         notes.append(f"{source}: {n_flat:,} triangles have no area and are left out")
     if face is None:
@@ -170,6 +174,12 @@ def edges_of(triangles: IntArray) -> tuple[IntArray, IntArray]:
 def _crosses(corners: FloatArray) -> FloatArray:
     """(F, 3) cross products of both sides at the first corner."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _signed_volume(corners: FloatArray) -> float:
+    """Of a closed surface, negative if its triangles look inward (divergence theorem)."""
+    here = corners - corners.mean(axis=(0, 1))
+    return float(np.einsum("ij,ij->", here[:, 0], np.cross(here[:, 1], here[:, 2]))) / 6.0
 
 
 def _welded(corners: FloatArray, tolerance: float) -> tuple[FloatArray, IntArray]:

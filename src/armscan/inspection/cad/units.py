@@ -45,7 +45,13 @@ def scale_mismatch(surface: PartSurface, points_mm: FloatArray) -> FitFailure | 
     ours, theirs = across_mm(points_mm), surface.diagonal_mm
     if TOO_SMALL * theirs < ours < TOO_LARGE * theirs:
         return None
-    ratio = max(ours, np.finfo(np.float64).tiny) / theirs
+    if UNITS[0][2] * ours < LIKELY_SMALL * theirs:
+        return FitFailure(
+            f"all points of the cloud lie within {ours:.2g} mm, and the part measures "
+            f"{theirs:.4g} mm: in no unit they show anything of it",
+            "scan more of the part",
+        )
+    ratio = ours / theirs
     unit = min(UNITS, key=lambda one: abs(abs(math.log(ratio)) - math.log(one[2])))
     return _refusal(unit, ours, theirs, is_model=ratio > 1.0)
 

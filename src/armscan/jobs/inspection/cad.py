@@ -110,7 +110,8 @@ def inspect_cad(
     """
     how, options = part_options or PartOptions(), options or CadOptions()
     _check_options(how)
-    job.places(".html", beside=(".csv", ".ply"))
+    reads = (cloud_path, part_path, *map(Path, filter(None, (tolerance, how.points, how.measured))))
+    job.places(".html", beside=(".csv", ".ply"), reads=reads)
     box = region_of(region)
     _tell(job, 0, part_path.name)
     part = read_part(part_path, unit=how.unit, chord=chord)

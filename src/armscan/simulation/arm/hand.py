@@ -455,9 +455,13 @@ def scan_passes(scene: SweptScene, head: Head, fixtures: Fixtures) -> list[ScanP
         pose = fixtures.base_from_plate if is_plate else fixtures.base_from_waves
         ways = _over_face(pose, 0.0, plan)
     profile = BURST if head.kind == "crossed" else UNHURRIED
+    counted = [(way, plan["n_exposures"]) for way in ways]
+    if scene == "workpiece" and fixtures.bore_mm is not None and "bore" in plan:
+        into = _into_bore(fixtures.base_from_workpiece, fixtures.bore_mm, plan)
+        counted += [(way, plan["bore"]["n_exposures"]) for way in into]
     return [
-        ScanPass(face, start, end, first.turned(*angles), speed, plan["n_exposures"], profile)
-        for face, start, end, angles, speed in ways
+        ScanPass(face, start, end, first.turned(*angles), speed, n_exposures, profile)
+        for (face, start, end, angles, speed), n_exposures in counted
     ]
 
 
@@ -506,6 +510,15 @@ def _over_workpiece(fixtures: Fixtures, plan: dict[str, Any], is_stereo: bool) -
                 pose.apply(np.array([x, y, height])) for x in (bounds[0, 0], bounds[1, 0])
             )
             yield face, start, end, [plan["tilt_deg"], 0.0, 0.0], speed
+
+
+def _into_bore(pose: Pose[Base, Any], middle_mm: FloatArray, plan: dict[str, Any]) -> Iterator[Way]:
+    """Short ways over a bore, the head leant so that it looks at one part of the wall each time."""
+    half = np.array([0.5 * plan["bore"]["way_mm"], 0.0, 0.0])
+    for tilt, azimuth, speed in plan["bore"]["passes"]:
+        face = pose.rotation @ leaning(tilt, azimuth) @ quarter_turn()
+        start, end = pose.apply(middle_mm - half), pose.apply(middle_mm + half)
+        yield face, start, end, [plan["tilt_deg"], 0.0, 0.0], speed
 
 
 def still_step(fixtures: Fixtures, head: Head) -> tuple[FloatArray, FloatArray, HeadOrientation]:

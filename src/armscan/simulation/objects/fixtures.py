@@ -121,6 +121,8 @@ _PLATE_MM = (620.0, -160.0, -6.4)
 _BALL_MM = (610.0, -140.0, 60.0)
 _PART_MM = (610.0, -150.0, 20.0)
 _WORKPIECE_MM = (610.0, -150.0, 4.0)
+_BORE_MM = (-18.0, 12.0, 2.0)
+"""Middle of the workpiece's bore, in the frame of its CAD model."""
 _WAVES_MM = (612.0, -150.0, 10.0)
 _MARKED_MM = (612.0, -152.0, 6.0)
 _MARKED_AFTER_MOVE_MM = (585.0, 95.0, 21.0)
@@ -161,6 +163,8 @@ class Fixtures:
         From Base to what Base is after the arm was put down in another place.
     workpiece, base_from_workpiece
         The part as it was made, in the frame of its CAD model, and where it stands.
+    bore_mm
+        (3,) middle of its bore in that frame; None of another part.
     """
 
     plate: FlatPlate
@@ -177,6 +181,7 @@ class Fixtures:
     moved_from_base: Pose[Base, Base]
     workpiece: Mesh
     base_from_workpiece: Pose[Base, Part]
+    bore_mm: FloatArray | None
 
     @staticmethod
     def build(
@@ -213,6 +218,7 @@ class Fixtures:
             moved_from_base=moved_from_marked @ base_from_marked.inverse(),
             workpiece=workpiece,
             base_from_workpiece=_put_down(_WORKPIECE_MM, rng) @ _from_foot(workpiece.bounds_mm),
+            bore_mm=np.array(_BORE_MM) if part_mm is None else None,
         )
 
     @property

@@ -19,6 +19,8 @@ from armscan.storage.files import path_text, read_bytes
 
 STEP_SUFFIXES = (".step", ".stp")
 LEAST_CHORD_MM = 1e-5
+MOST_CHORDS = 2.5e6
+"""Size of a part over the chord error, 5 m at 0.002 mm: a ball has eight million triangles then."""
 QUOTED = re.compile(rb"'[^']*'")
 KINDS = {
     "surfaceofextrusion": "extruded",
@@ -71,7 +73,9 @@ def read_step(path: Path, chord: ChordError) -> PartModel:
     OptionError
         If the extra ``cad`` is not installed.
     FileFormatError
-        If the file is cut short or holds no faces.
+        If the file is cut short.
+    InputError
+        If it holds no faces, or a part so large that its triangles would be too many.
     """
     where = path_text(path)
     data = read_bytes(path)
@@ -90,6 +94,7 @@ def read_step(path: Path, chord: ChordError) -> PartModel:
             remedy="copy the file again",
         )
     shape = _shape(data, path.name, where)
+    _check_size(shape, chord, where)
     corners, kinds = _triangles_of_faces(shape, chord)
     if not corners:
         raise InputError("the STEP file holds no faces", where=where, remedy="export a solid")
@@ -133,6 +138,24 @@ def _shape(data: bytes, name: str, where: str) -> Any:
             "the STEP file is not understood", where=where, remedy="export it again"
         )
     return reader.OneShape()
+
+
+def _check_size(shape: Any, chord: ChordError, where: str) -> None:
+    """Refuse what has too many triangles for any memory: most likely its unit is a wrong one."""
+    from OCP.Bnd import Bnd_Box
+    from OCP.BRepBndLib import BRepBndLib
+
+    box = Bnd_Box()
+    BRepBndLib.Add_s(shape, box)
+    across = 0.0 if box.IsVoid() else math.sqrt(box.SquareExtent())
+    if across > MOST_CHORDS * chord.chord_mm:
+        raise InputError(
+            f"the model measures {across:,.0f} mm across: triangles within {chord.chord_mm:g} mm "
+            "of it would be too many",
+            where=where,
+            remedy="if the part is smaller, export it with its right unit; if it is so large, give "
+            f"--chord-mm {1.1 * across / MOST_CHORDS:.2g}",
+        )
 
 
 def _raise_interrupt(error: BaseException) -> None:

@@ -189,6 +189,15 @@ def test_too_few_points_are_refused() -> None:
     assert isinstance(found, FitFailure)
 
 
+def test_points_in_one_place_are_not_called_metres() -> None:
+    """The same point many times, and a heap of a tenth of a micrometre, are in no unit a part."""
+    for size in (0.0, 1e-4):
+        heap = 5.0 + size * np.random.default_rng(3).normal(size=(5000, 3))
+        found = align_best(WEDGE, cloud_of(heap), True)
+        assert isinstance(found, FitFailure)
+        assert "all points of the cloud lie within" in found.reason
+
+
 def noisy_trials(n_trials: int) -> tuple[list[float], list[float]]:
     """Normalised squares of the pose's errors, and face means over their U, of many scans.
 

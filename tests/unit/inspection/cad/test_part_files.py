@@ -110,6 +110,18 @@ def test_an_open_surface_and_a_turned_triangle_are_noticed() -> None:
     assert "opposite sides" in part_of(bent, source="a.stl").notes[0]
 
 
+def test_a_closed_surface_turned_inside_out_is_turned_back() -> None:
+    """Its scans were called those of another part: every distance had the wrong sign."""
+    found = part_of(PART.corners_mm[:, ::-1] + 500.0, source="a.stl")
+    assert "inside out" in found.notes[0]
+    outward = np.einsum("ij,ij->i", found.normals, found.corners_mm.mean(axis=1))
+    plain = np.einsum("ij,ij->i", PART.normals, PART.corners_mm.mean(axis=1) + 500.0)
+    np.testing.assert_allclose(outward, plain, atol=1e-9)
+    assert part_of(PART.corners_mm, source="a.stl").notes == ()
+    # what does not close tells no inside
+    assert "open" in part_of(PART.corners_mm[1:, ::-1], source="a.stl").notes[0]
+
+
 def test_degenerate_triangles_are_left_out_and_counted() -> None:
     flat = np.repeat(PART.corners_mm[:2, :1], 3, axis=1)
     line = PART.corners_mm[:1, [0, 1, 1]]
@@ -187,6 +199,19 @@ def test_a_step_file_keeps_its_faces_and_says_its_unit(tmp_path: Path, unit: str
     assert np.allclose(np.linalg.norm(corners, axis=2), 8.0, atol=1e-6)
     middle = np.linalg.norm((corners + np.roll(corners, 1, axis=1)) / 2.0, axis=2)
     assert 8.0 - 0.01 <= middle.min() < 8.0 - 0.001
+
+
+def test_a_step_file_in_a_wrong_unit_is_refused_before_it_fills_the_memory(tmp_path: Path) -> None:
+    """A bracket of 80 mm that calls itself 80 m: its triangles took six gigabytes."""
+    path = step_file(tmp_path)
+    milli = b"SI_UNIT(.MILLI.,.METRE.)"
+    assert milli in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(milli, b"SI_UNIT($,.METRE.)"))
+    with pytest.raises(InputError, match=r"measures 96,437 mm across.*--chord-mm 0\.042"):
+        read_part(path)
+    # a coarse chord is the way to read what is so large
+    found = read_part(path, chord=ChordError(chord_mm=1.0))
+    assert np.allclose(found.high_mm, [80e3, 50e3, 20e3])
 
 
 def test_a_step_file_cut_short_is_refused(tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ def test_faults_are_told_and_nothing_wrong_is_placed(is_wired: bool, tmp_path: P
     assert {("recovered", f"twin thesis-single {one}") for one in ("camera0", "arm")} <= words
     assert counts.n_jumps == 1
     jumps = [one.device for one in bench.told if "its clock jumped" in one.text]
-    assert jumps == ["twin thesis-single camera0"]
+    assert jumps.count("twin thesis-single camera0") == 1
     assert len(errors_mm) >= 30 and max(errors_mm) < NEAR_MM
     check_recording(bench, tmp_path, n_before)
 

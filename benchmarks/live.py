@@ -101,6 +101,8 @@ def serve(place: str, ring: str, pipes: Sequence[Connection], rate_hz: float) ->
 class RingCamera:
     """See `armscan.devices.protocols.Camera`: copies each image out of the ring when told of it."""
 
+    is_simulated = True
+
     def __init__(self, camera: int, slots: Any, pipe: Connection) -> None:
         self.name, self.settings = f"ring camera {camera}", CameraSettings()
         height, width = slots.shape[-2:]
@@ -257,9 +259,7 @@ def run(given: argparse.Namespace, folder: Path, place: str, shape: tuple[int, .
     description = replace(description, is_common_trigger=not given.by_time)
     rig = Rig(cameras, arm, None, description)
     path = folder / "scan.mcap"
-    recorder = CountingRecorder(
-        path, rig, is_simulated=True, options=WriterOptions(compression=given.compression)
-    )
+    recorder = CountingRecorder(path, rig, options=WriterOptions(compression=given.compression))
     recorder.begin()
     screen = Screen(cameras[0].taken_ns)
     session = LiveSession(rig, scanner, recorder=recorder, keep_cloud=screen.keep)

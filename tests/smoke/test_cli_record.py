@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -56,6 +57,13 @@ def test_a_rig_is_recorded_whole(rig: Path, capsys: pytest.CaptureFixture[str]) 
     assert set(ids) <= set(recorded.arm.trigger_ids.tolist())
     assert main(["record", str(rig), "-o", str(output)]) == 2
     assert "exists" in capsys.readouterr().err
+    # what is simulated stays so, however it is played
+    again = rig.parent / "again.mcap"
+    words = ["--camera", f"replay:{output}?loop=1", "--exposures", "3", "-o", str(again)]
+    assert main(["record", *words]) == 0
+    assert main(["info", str(again), "--json"]) == 0
+    told = capsys.readouterr().out
+    assert json.loads(told[told.index("{") :])["items"][0]["simulated"] is True
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
@@ -69,7 +77,7 @@ def test_ctrl_c_ends_a_recording_that_is_whole(rig: Path) -> None:
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert run.stderr is not None and run.stdout is not None
-    while "exposures" not in (line := run.stderr.readline()):
+    while not re.search("[1-9] exposures", line := run.stderr.readline()):
         assert line, "it ended by itself"
     run.send_signal(signal.SIGINT)
     out = run.communicate(timeout=60)[0]
@@ -99,12 +107,16 @@ def test_a_full_disk_ends_it_and_says_what_is_safe(
     assert extract_recording(output, rig.parent / "scan").n_exposures == 5
 
 
-def test_without_an_image_there_is_no_file(tmp_path: Path) -> None:
+def test_without_an_image_there_is_no_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "rig.toml").write_text(RIG.replace(f'lasers = "{TWIN}"\n', ""))
     output = tmp_path / "scan.mcap"
     start, n_before = time.monotonic(), threading.active_count()
     # nothing triggers the camera: the laser controller is missing
-    assert main(["record", str(tmp_path / "rig.toml"), "--seconds", "0.3", "-o", str(output)]) == 2
+    assert main(["record", str(tmp_path / "rig.toml"), "--seconds", "1.2", "-o", str(output)]) == 2
+    # how long the space lasts is not told of nothing
+    assert re.search(r"[0-9,]+ GB left$", capsys.readouterr().err, re.MULTILINE)
     assert not output.exists() and time.monotonic() - start < 60.0
     assert threading.active_count() <= n_before
 

@@ -48,7 +48,7 @@ class Bench:
         self.told: list[LiveEvent] = []
         self.live: dict[int, MatchedInstant] = {}
         self.errors_mm: list[float] = []
-        self.recorder = LiveRecorder(path, self.rig, is_simulated=True)
+        self.recorder = LiveRecorder(path, self.rig)
         self.acquisition = Acquisition(
             self.rig, self.take, self.told.append, latency_ns=self.twin.latency_ns
         )
@@ -97,15 +97,23 @@ def test_faults_are_told_and_nothing_wrong_is_placed(is_wired: bool, tmp_path: P
     bench.goes_on()
     bench.twin.inject("camera0", "unplug", 0.7)
     bench.until(
-        lambda: any(e.kind == "recovered" for e in bench.told), "the camera was not told of"
+        lambda: any("unplugged" in event.text for event in bench.told), "the camera was not told of"
     )
     bench.goes_on()
     n_told = len(bench.told)
     bench.twin.inject("arm", "stall", 2.5)
-    bench.until(lambda: len(bench.told) >= n_told + 2, "the arm's stall was not told of")
+    for kind in ("fault", "recovered"):
+        bench.until(
+            lambda kind=kind: any(
+                event.kind == kind and event.device.endswith("arm")
+                for event in bench.told[n_told:]
+            ),
+            f"of the arm's stall no {kind} was told",
+        )  # fmt: skip
     bench.goes_on()
     counts = bench.acquisition.matcher.cameras[0].counts
-    assert counts.n_missing >= 2 and counts.n_late == 1
+    # on a computer with too much to do, what arrived earlier is matched first
+    bench.until(lambda: counts.n_missing >= 2 and counts.n_late == 1, f"lost or late: {counts}")
     # the true time of an image is no more to be had from a clock that jumped: last of all
     errors_mm = list(bench.errors_mm)
     bench.twin.inject("camera0", "clock-jump", 7.0)
@@ -113,11 +121,15 @@ def test_faults_are_told_and_nothing_wrong_is_placed(is_wired: bool, tmp_path: P
     bench.acquisition.stop()
     bench.recorder.close()
     bench.rig.close()
-    words = [(one.kind, one.device) for one in bench.told]
-    assert words.count(("fault", "twin thesis-single camera0")) == 1
-    assert words.count(("fault", "twin thesis-single arm")) == 1
-    assert words.count(("recovered", "twin thesis-single arm")) == 1
+    # on a computer with too much to do, more devices are silent for seconds than those that fail
+    told = [one.text for one in bench.told if one.kind == "fault"]
+    assert sum("camera0: it was unplugged" in text for text in told) == 1
+    assert any("arm has delivered nothing" in text for text in told)
+    words = {(one.kind, one.device) for one in bench.told}
+    assert {("recovered", f"twin thesis-single {one}") for one in ("camera0", "arm")} <= words
     assert counts.n_jumps == 1
+    jumps = [one.device for one in bench.told if "its clock jumped" in one.text]
+    assert jumps.count("twin thesis-single camera0") == 1
     assert len(errors_mm) >= 30 and max(errors_mm) < NEAR_MM
     check_recording(bench, tmp_path, n_before)
 

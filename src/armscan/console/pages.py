@@ -18,6 +18,7 @@ from urllib.parse import quote
 import numpy as np
 import viser
 
+from armscan.console.cards import GOOD, WRONG, overview, padded, result_card
 from armscan.console.journey import (
     BY_NAME,
     INSPECTIONS,
@@ -32,18 +33,12 @@ from armscan.console.journey import (
     sessions_in,
 )
 from armscan.console.panels import (
-    GOOD,
-    TINTS,
-    WORDS,
-    WRONG,
     Controls,
     PointsPanel,
     ScanPanel,
     SeeingPanel,
     TipPanel,
-    padded,
     put,
-    result_card,
 )
 from armscan.console.placements import Placement, drawing
 from armscan.console.quality import ModelWatch
@@ -169,14 +164,16 @@ class ConsolePage:
         self._view = self.controls.button(
             "Camera view", self.view, "V", "Show what the camera sees, lasers on where needed"
         )
-        self._take = self.controls.taking_button(
-            "Take", self.take_one, "T", "Record this placement", "teal"
+        button = self.controls.button
+        self._take = button(
+            "Take", self.take_one, "T", "Record this placement", "teal", is_alone=True
         )
-        self._take_all = self.controls.taking_button(
-            "Take all that is left (simulated)", self.take_all, "", "The twin shows them all"
-        )
-        self._take_back = self.controls.taking_button(
-            "Take back", self.take_back, "B", "Remove what was taken last"
+        self._take_all = button(
+            "Take all that is left (simulated)", self.take_all, "", "The twin shows them all",
+            is_alone=True,
+        )  # fmt: skip
+        self._take_back = button(
+            "Take back", self.take_back, "B", "Remove what was taken last", is_alone=True
         )
         self._start_over = self.controls.removing_button(
             "Start over", self.start_over, "Remove what was taken", self._what_goes
@@ -184,15 +181,13 @@ class ConsolePage:
         self.scanning.build(self.start_or_pause)
         self._inspecting()
         self.scanning.build_pictures()
-        self._calculate = self.controls.button(
-            "Calculate", self.calculate, "K", "Run this step's job", "teal"
-        )
+        self._calculate = button("Calculate", self.calculate, "K", "Run this step's job", "teal")
         self._working = gui.add_html("", visible=False)
         self._bar = gui.add_progress_bar(0.0, visible=False)
-        self._cancel = self.controls.button("Cancel", self.cancel, "", "End what runs", "red")
+        self._cancel = button("Cancel", self.cancel, "", "End what runs", "red")
         self._cancel.visible = False
+        self._next = button("Go on", self.go_on, "N", "To the next step", "teal")
         self._note = gui.add_html("")
-        self._next = self.controls.button("Go on", self.go_on, "N", "To the next step", "teal")
         self.seeing.build(has_exposure=self.bench is not None and not self.bench.has_operator)
         self.points.build(gui)
         with gui.add_folder("Sessions", expand_by_default=False):
@@ -300,14 +295,18 @@ class ConsolePage:
 
     def take_one(self) -> None:
         """Record the placement or touch that is drawn, and say what is seen in it."""
-        self.take()
         step = self.step
-        if BY_NAME[step].filling == "placements":
-            n_taken = self.journey.n_taken(step)
-            seen = self.worker.run(seen_in_take, self.journey.folder, step)
-            # of something else, if the person has gone on meanwhile
-            if self.step is step and self.journey.n_taken(step) == n_taken:
-                self._seen = seen
+        self._busy("Taking ...", can_end=False)
+        try:
+            self.take(step)
+            if BY_NAME[step].filling == "placements":
+                n_taken = self.journey.n_taken(step)
+                seen = self.worker.run(seen_in_take, self.journey.folder, step)
+                # of something else, if the person has gone on meanwhile
+                if self.step is step and self.journey.n_taken(step) == n_taken:
+                    self._seen = seen
+        finally:
+            self._busy("")
 
     def take_all(self) -> None:
         """Record all that is left, as the twin shows it."""
@@ -352,9 +351,13 @@ class ConsolePage:
         path, model = self.journey.new_file(step, scan), None
         if step is StepName.SCAN and now.part:
             model = ModelWatch(self.worker, self.journey.folder / now.part)
-        live = LiveScan(self._bench(), step, path, scanner, now.seeing)
-        live.open(lambda: None if scan else self.journey.start_over(step))
-        self.scanning.begin(live, scanner, model)
+        self._busy("Starting the devices ...", can_end=False)
+        try:
+            live = LiveScan(self._bench(), step, path, scanner, now.seeing)
+            live.open(lambda: None if scan else self.journey.start_over(step))
+            self.scanning.begin(live, scanner, model)
+        finally:
+            self._busy("")
         self.scan = scan or self.scan
 
     def finish(self) -> None:
@@ -392,10 +395,11 @@ class ConsolePage:
         words = f"{event.stage.capitalize()}: {event.done} of {event.total}"
         self._working.content = padded(paragraph(words, MUTED))
 
-    def _busy(self, words: str) -> None:
+    def _busy(self, words: str, *, can_end: bool = True) -> None:
         self._working.content = padded(paragraph(words, MUTED))
-        for handle in (self._working, self._bar, self._cancel):
-            handle.visible = bool(words)
+        self._working.visible = bool(words)
+        for handle in (self._bar, self._cancel):
+            handle.visible = bool(words) and can_end
         self._calculate.disabled = bool(words)
 
     def _open_chosen(self) -> None:
@@ -526,32 +530,16 @@ class ConsolePage:
             put(self._scan_choice, chosen)
 
     def _overview(self) -> str:
-        rows = []
-        for step in self.journey.steps:
-            state = self.journey.state(step.name, self._scan_of(step.name))
-            tint = TINTS.get(state.status, MUTED if state.status != "ready" else ACCENT)
-            weight = "600" if step.name is self.step else "400"
-            hollow = state.status in ("waiting", "open")
-            dot = (
-                f'<span style="display:inline-block;width:10px;height:10px;border-radius:50%;'
-                f"border:2px solid {tint};box-sizing:border-box;margin-right:8px;"
-                f'background:{"transparent" if hollow else tint}"></span>'
-            )
-            rows.append(
-                f'<div style="display:flex;align-items:center;font-weight:{weight};'
-                f'padding:1px 0">{dot}<span>{escape(step.title)}</span>'
-                f'<span style="margin-left:auto;color:{tint}">{WORDS[state.status]}</span></div>'
-            )
-        rig = self.journey.settings.rig if self.bench is not None else "no rig: looking only"
-        what = "Simulated rig: " if self.bench is not None and self.bench.is_simulated else "Rig: "
-        return (
-            f'<div style="font-size:14px;color:{INK};line-height:1.45">'
-            f'<div style="font-size:16px;font-weight:700">{escape(self._name())}</div>'
-            f'<div style="font-size:11px;color:{MUTED};overflow-wrap:anywhere;margin-bottom:6px">'
-            f"{escape(what + rig if self.bench is not None else rig)}</div>{''.join(rows)}"
-            f'<div style="margin-top:6px">{self._link(REPORT_FILE, "Report of the session")}</div>'
-            "</div>"
-        )
+        states = {
+            step.title: (self.journey.state(step.name, self._scan_of(step.name)).status,
+                         step.name is self.step)
+            for step in self.journey.steps
+        }  # fmt: skip
+        rig = "no rig: looking only"
+        if self.bench is not None:
+            what = "Simulated rig: " if self.bench.is_simulated else "Rig: "
+            rig = what + self.journey.settings.rig
+        return overview(self._name(), rig, states, self._link(REPORT_FILE, "Report of the session"))
 
     def _link(self, page: str, words: str) -> str:
         if not page or not (self.journey.folder / page).is_file():

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from html import escape
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -18,7 +17,8 @@ from typing import Any, Literal, cast
 import numpy as np
 import viser
 
-from armscan.console.journey import SeeingSettings, StepResult, StepState
+from armscan.console.cards import live_facts, padded
+from armscan.console.journey import SeeingSettings
 from armscan.console.quality import ModelWatch
 from armscan.console.scan import LiveScan
 from armscan.console.scene import (
@@ -36,9 +36,8 @@ from armscan.console.work import told
 from armscan.errors import ArmscanError, OptionError
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.live.exposure import ExposureMode, ExposureSettings, LaserTarget
-from armscan.pipeline.live.session import LiveSnapshot, LiveStatus
 from armscan.records.exposure import Exposure
-from armscan.report.drawing import ALERT, INK, LINE, MUTED
+from armscan.report.drawing import MUTED
 from armscan.report.quantity import sentence
 from armscan.storage.arm import ProbeTip, probe_tip_toml, read_probe_tip
 from armscan.storage.files import write_files
@@ -47,22 +46,12 @@ REFRESH_S, CLOUD_EVERY_S = 0.3, 1.0
 DETAILS = {"up to 100,000": 100_000, "up to 500,000": 500_000, "up to 2 million": MOST_POINTS}
 DETAIL = "up to 500,000"
 """Shown at first: a computer without graphics processor draws two million points once a second."""
-WINDOW_PX = 420.0
+WINDOW_PX, WINDOW_Y_PX = 420.0, 150.0
+"""Width, and below what the library says of a computer without graphics processor."""
 MODES: dict[str, ExposureMode] = {
     "as set": "fixed",
     "automatic": "automatic",
     "automatic, glints": "reflective",
-}
-GOOD, WRONG = "#3f7d2b", "#b3261e"
-TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": WRONG, "old": "#b07d12"}
-WORDS = {
-    "waiting": "waits",
-    "open": "to do",
-    "ready": "can be calculated",
-    "good": "good",
-    "doubtful": "with remarks",
-    "not good": "not good",
-    "old": "out of date",
 }
 START_BUTTON, UNDO_BUTTON = "0", "1"
 """Buttons of the arm: start or pause, and take the last pass back."""
@@ -94,8 +83,18 @@ class Controls:
         key: str,
         hint: str,
         colour: Literal["teal", "gray", "red"] = "gray",
+        *,
+        is_alone: bool = False,
     ) -> viser.GuiButtonHandle:
-        """A button, and a key for it, that tell a failure as its sentence."""
+        """A button, and a key for it, that tell a failure as its sentence.
+
+        Of those that are alone, as all that fill or empty a recording, one works at a time, and a
+        press meanwhile is passed over: one that waited would record the same posture twice.
+        """
+        if is_alone:
+            return self._kept_out_of(
+                self.button(label, lambda: self.alone(work), key, hint, colour)
+            )
         named = f"{label} ({key})" if key else label
         button = self.gui.add_button(named, hint=hint, color=colour)
         button.on_click(lambda _: self.tried(work))
@@ -104,26 +103,10 @@ class Controls:
             command.on_trigger(lambda _: self.tried(work) if _is_usable(button) else None)
         return button
 
-    def taking_button(
-        self,
-        label: str,
-        work: Callable[[], object],
-        key: str,
-        hint: str,
-        colour: Literal["teal", "gray", "red"] = "gray",
-    ) -> viser.GuiButtonHandle:
-        """A button that fills or empties a recording: a press meanwhile is passed over.
-
-        Presses that waited would record the same posture twice.
-        """
-        button = self.button(label, lambda: self._alone(work), key, hint, colour)
-        self._kept_out.append(button)
-        return button
-
     def removing_button(
         self, label: str, work: Callable[[], object], hint: str, question: Callable[[], str]
     ) -> viser.GuiButtonHandle:
-        """A `taking_button` that asks what it would remove, and does so when pressed again."""
+        """One that is alone, asks what it would remove, and does so when pressed again."""
 
         def ask_first() -> None:
             if self._asked is None:
@@ -131,10 +114,13 @@ class Controls:
                 button.label, button.color = question(), "red"
             else:
                 self.forget_question()
-                self._alone(work)
+                self.alone(work)
 
         button = self.gui.add_button(label, hint=hint, color="gray")
         button.on_click(lambda _: self.tried(ask_first, is_answer=True))
+        return self._kept_out_of(button)
+
+    def _kept_out_of(self, button: viser.GuiButtonHandle) -> viser.GuiButtonHandle:
         self._kept_out.append(button)
         return button
 
@@ -144,7 +130,8 @@ class Controls:
             (button, label), self._asked = self._asked, None
             button.label, button.color = label, "gray"
 
-    def _alone(self, work: Callable[[], object]) -> None:
+    def alone(self, work: Callable[[], object]) -> None:
+        """Do this unless something else that is alone is being done."""
         if not self._hand.acquire(blocking=False):
             return
         try:
@@ -421,7 +408,9 @@ class ScanPanel:
         """Add buttons and range bar to the column, and begin to show what runs."""
         self._range = self._controls.gui.add_html("", visible=False)
         button = self._controls.button
-        self.start_button = button("Start", start, "S", "Begin, pause, go on", "teal")
+        self.start_button = button(
+            "Start", start, "S", "Begin, pause, go on", "teal", is_alone=True
+        )
         self._undo = button("Undo last pass", self.undo, "U", "Take the last pass out")
         self._clear = button("Clear", self.clear, "C", "Take all passes out of the scan")
         self._finish = button(
@@ -438,7 +427,7 @@ class ScanPanel:
         self._window = gui.add_panel(visible=False)
         with self._window.add_tab("What the camera sees"):
             self._pictures = [gui.add_image(grey, label=None, visible=False) for _ in range(2)]
-        self._window.float(x=12.0, y=12.0, width=WINDOW_PX)
+        self._window.float(x=12.0, y=WINDOW_Y_PX, width=WINDOW_PX)
         self._thread.start()
 
     def close(self) -> None:
@@ -544,7 +533,7 @@ class ScanPanel:
                 handle.image = live_image(view, names, camera.setup.window)
                 self._window.visible = handle.visible = True
             self._range.content = padded(range_bar(shown.range_mm, *depths_mm(sensor)))
-        self._facts.content = padded(_live_facts(live, shown, self._model))
+        self._facts.content = padded(live_facts(live, shown, self._model))
         self._label()
         is_due = time.monotonic() - self._drawn_at > CLOUD_EVERY_S
         if shown.cloud_version != self._version and is_due:
@@ -574,87 +563,13 @@ class ScanPanel:
     def _hear(self, live: LiveScan) -> None:
         while live.events:
             event = live.events.popleft()
-            is_fault = event.kind == "fault" and bool(event.device)
             if event.kind == "button" and event.text == START_BUTTON:
-                self._controls.tried(self._start)
+                self._controls.tried(lambda: self._controls.alone(self._start))
             elif event.kind == "button" and event.text == UNDO_BUTTON:
                 self._controls.tried(self.undo)
             elif event.kind in ("fault", "warning"):
-                goes_on = " The scan goes on by itself when it answers again."
-                self._controls.problem = sentence(event.text) + (goes_on if is_fault else "")
+                self._controls.problem = sentence(event.words)
                 self._controls.refresh()
-            elif event.kind == "recovered":
-                self._controls.problem = ""
-                self._controls.refresh()
-
-
-def _live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) -> str:
-    drift = live.drift_mm()
-    late = "" if shown.latency_ms is None else f", shown after {shown.latency_ms[0]:.0f} ms"
-    lines = [
-        f"{live.n_recorded} exposures recorded, {shown.rate_hz:.2g} a second{late}",
-        f"passes: {shown.n_passes}, points: {shown.n_points:,}",
-        "passes do not meet yet"
-        if drift is None
-        else f"the last pass lies {drift:.3f} mm from the earlier ones (median)",
-    ]
-    for k, lines_seen in enumerate(shown.brightness):
-        camera = f"camera {k + 1}" if len(shown.brightness) > 1 else "exposure"
-        lines += [f"{camera}: {'; '.join(one.words for one in lines_seen)}"] if lines_seen else []
-    still = shown.counts.get(LiveStatus.STILL, 0)
-    lines += [f"{still} dropped while the hand was still"] if still else []
-    lost = [
-        f"{n} {status.value}"
-        for status, n in shown.counts.items()
-        if status not in (LiveStatus.PLACED, LiveStatus.STILL)
-    ]
-    lines += [", ".join(lost)] if lost else []
-    if live.bench.is_over:
-        lines.append("the simulated hand has come to its end: finish")
-    alerts = [model.problem] if model is not None and model.problem else []
-    if shown.state == "scanning" and not live.is_timed:
-        alerts.append(
-            "The devices' clocks are not known yet: what is recorded now cannot be placed. Wait; "
-            "if this stays, take more images a second."
-        )
-    if shown.state == "scanning" and not live.session.is_recording:
-        alerts.append("Nothing is recorded any more: finish, and see to the disk.")
-    return "".join(
-        [paragraph(text, ALERT, 14) for text in alerts]
-        + [paragraph(line, INK, 13) for line in lines]
-    )
-
-
-def result_card(state: StepState, link: str) -> str:
-    """HTML of what a step's job said."""
-    result = cast(StepResult, state.result)
-    tint = TINTS[state.status if state.status in TINTS else result.verdict]
-    title = WORDS[state.status] if state.status in TINTS else WORDS[result.verdict]
-    rows = "".join(
-        f'<tr><td style="color:{MUTED};padding:2px 8px 2px 0;vertical-align:top">'
-        f'{escape(label.strip())}</td><td style="padding:2px 0;white-space:pre-line">'
-        f"{escape(text)}</td></tr>"
-        for label, text in result.values
-    )
-    reasons = "".join(paragraph(text, INK, 13) for text in result.reasons)
-    old = state.status == "old"
-    why = paragraph(sentence(state.why), ALERT, 13) if state.why else ""
-    figures = (
-        f'<details open><summary style="cursor:pointer;color:{MUTED}">Figures</summary>'
-        f'<table style="font-size:12px;border-collapse:collapse">{rows}</table></details>'
-    )
-    return (
-        f'<div style="border:1px solid {LINE};border-left:5px solid {tint};border-radius:4px;'
-        f'padding:8px 10px;margin:6px 0;color:{INK};font-size:13px">'
-        f'<div style="font-size:15px;font-weight:700;color:{tint}">{title.capitalize()}</div>'
-        f"{why}{reasons}{paragraph('' if old else result.next_step, INK, 13)}"
-        f"{figures if rows else ''}{link}</div>"
-    )
-
-
-def padded(content: str) -> str:
-    """HTML as far from the column's edges as the controls."""
-    return f'<div style="padding:2px 18px 2px 10px">{content}</div>'
 
 
 def put(handle: Any, value: object) -> None:

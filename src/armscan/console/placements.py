@@ -19,7 +19,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.report.drawing import ACCENT, ALERT, INK, LINE, MUTED
 
-WIDTH, HEIGHT = 320.0, 214.0
+WIDTH, HEIGHT, SHOWN_PX = 320.0, 214.0, 250
 """Of a drawing, CSS pixels: as the image of a camera of 3 : 2."""
 BOARD = (1.0, 0.82)
 """Half-width of the target as a part of its distance, times 4; and its height over its width."""
@@ -186,8 +186,9 @@ def drawing(placement: Placement) -> str:
         body, caption = _target(placement), "as the camera's image shows it"
     return (
         f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT + 18:.0f}" width="100%" role="img" '
-        f'aria-label="{escape(placement.words)}" style="max-width:{WIDTH:.0f}px">{body}'
-        f'<text x="{WIDTH / 2:.0f}" y="{HEIGHT + 14:.0f}" text-anchor="middle" font-size="11" '
+        f'aria-label="{escape(placement.words)}" style="display:block;max-width:{SHOWN_PX}px">'
+        f"{body}"
+        f'<text x="{WIDTH / 2:.0f}" y="{HEIGHT + 14:.0f}" text-anchor="middle" font-size="13" '
         f'fill="{MUTED}" font-family="sans-serif">{caption}</text></svg>'
     )
 

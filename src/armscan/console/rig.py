@@ -171,6 +171,10 @@ class _HandCamera:
         return f"simulated camera {self.camera}"
 
     @property
+    def is_simulated(self) -> bool:
+        return self.hand.source.is_simulated
+
+    @property
     def setup(self) -> CameraSetup:
         return self.hand.source.session.cameras[self.camera]
 
@@ -446,7 +450,7 @@ class DeviceBench:
         self.rig, self.name = rig, name
         self.n_placements: dict[StepName, int] = {}
         self.is_over = self.has_operator = False
-        self.is_simulated = all(one.startswith(TWIN) for one in rig.description.cameras)
+        self.is_simulated = rig.is_simulated
         self._described, self._photo_us = rig.description, 0.0
         self._whole = [camera.settings for camera in rig.cameras]
         self._lock = threading.RLock()

@@ -22,7 +22,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.arm import axis_frames
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline.live.acquire import LiveEvent
+from armscan.pipeline.live.acquire import OWN_PARTS, LiveEvent
 from armscan.pipeline.live.recorder import LiveRecorder
 from armscan.pipeline.live.rig import Rig
 from armscan.pipeline.live.session import (
@@ -219,7 +219,7 @@ class ScanRecorder(LiveRecorder):
 
     Parameters
     ----------
-    path, rig, is_simulated
+    path, rig
         As of `LiveRecorder`.
     keeps_times
         Times are the devices' own, of one clock: a simulated hand arrives as fast as its images are
@@ -235,10 +235,8 @@ class ScanRecorder(LiveRecorder):
         Exposures that were taken back.
     """
 
-    def __init__(
-        self, path: Path, rig: Rig, *, is_simulated: bool, keeps_times: bool = False
-    ) -> None:
-        super().__init__(path, rig, is_simulated=is_simulated)
+    def __init__(self, path: Path, rig: Rig, *, keeps_times: bool = False) -> None:
+        super().__init__(path, rig)
         self.path, self._keeps_times = path, keeps_times
         self.pose_of: dict[int, Pose[Base, Tool] | None] = {}
         self.latest_joints_rad: FloatArray | None = None
@@ -330,9 +328,7 @@ class LiveScan:
     ) -> None:
         self.bench, self.step, self.path = bench, step, path
         self.rig = bench.scan_rig(step)
-        self.recorder = ScanRecorder(
-            path, self.rig, is_simulated=bench.is_simulated, keeps_times=bench.has_operator
-        )
+        self.recorder = ScanRecorder(path, self.rig, keeps_times=bench.has_operator)
         self.events: deque[LiveEvent] = deque(maxlen=50)
         self._scanner = scanner
         self._incidence = Incidence()
@@ -453,9 +449,8 @@ class LiveScan:
         return np.array([*axis_frames(model, joints).origins_mm[0], ends[1]])
 
     def _hear(self, event: LiveEvent) -> None:
-        # a simulated hand waits for its images to be rendered, and any hand may pause
-        is_silence = event.kind in ("fault", "recovered") and (
-            self.bench.has_operator or self.session.snapshot().state != "scanning"
-        )
-        if not is_silence:
+        is_of_device = bool(event.device) and event.device not in OWN_PARTS
+        # what does not answer is told while it lasts, and a simulated hand waits for its images
+        is_told = is_of_device and (event.kind != "warning" or self.bench.has_operator)
+        if event.kind == "button" or not is_told:
             self.events.append(event)

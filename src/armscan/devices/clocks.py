@@ -345,7 +345,7 @@ class StreamCounts:
     def words(self) -> str:
         """What was wrong; empty if nothing was."""
         parts = (
-            (self.n_missing, f"lost in {self.n_gaps} gaps"),
+            (self.n_missing, f"lost in {self.n_gaps} gap{'' if self.n_gaps == 1 else 's'}"),
             (self.n_duplicates, ElementStatus.DUPLICATE.label),
             (self.n_late, ElementStatus.LATE.label),
             (self.n_jumps, ElementStatus.JUMP.label),

@@ -100,7 +100,10 @@ class CameraSettings:
 
 
 class Camera(Protocol):
-    """A camera; its methods raise `DeviceError` where it does not answer."""
+    """A camera; its methods raise `DeviceError` where it does not answer.
+
+    A device of any kind whose data are made up says so by an attribute ``is_simulated = True``.
+    """
 
     @property
     def name(self) -> str:

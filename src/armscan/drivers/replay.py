@@ -353,6 +353,11 @@ class _Played:
         self._device = device
 
     @property
+    def is_simulated(self) -> bool:
+        """Whether what it plays is simulated."""
+        return self.rig.source.session.is_simulated
+
+    @property
     def name(self) -> str:
         """What messages call it."""
         return self._line.inbox.name

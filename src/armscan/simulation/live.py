@@ -140,7 +140,9 @@ class TwinRig:
         cameras = [f"camera{k}" for k in range(len(self.twin.instrument.head.cameras))]
         self.lines: dict[str, FaultyLine[Any]] = {}
         for name in (*cameras, "arm", "lasers"):
-            clock = _drawn_clock(rng, zero_ns, plan.has_shared_clock)
+            at_start, drift = rng.uniform(0.0, _UPTIME_S), _DRIFT * rng.standard_normal()
+            drawn = round(1e9 * at_start), drift, zero_ns
+            clock = DeviceClock(*(0, 0.0, 0) if plan.has_shared_clock else drawn)
             kind = name.rstrip("01")
             self.lines[name] = FaultyLine(
                 f"twin {plan.head} {name}",
@@ -151,10 +153,8 @@ class TwinRig:
                 rng=np.random.default_rng([plan.seed, _DRAWN, len(self.lines)]),
             )
         self._rng = np.random.default_rng([plan.seed, _DRAWN, 99])
-        self.settings = [
-            CameraSettings(1e6 * self.twin.instrument.mechanics.exposure_s, 0.0, plan.rate_hz)
-            for _ in cameras
-        ]
+        exposure_us = 1e6 * self.twin.instrument.mechanics.exposure_s
+        self.settings = [CameraSettings(exposure_us, 0.0, plan.rate_hz) for _ in cameras]
         self.modes: dict[int, TriggerMode] = {}
         self.laser_rate_hz: float | None = None
         self.are_lasers_started = False
@@ -237,6 +237,13 @@ class TwinRig:
             if not any(line.is_open for line in self.lines.values()):
                 self.end()
                 _RIGS.pop(self.plan, None)
+
+    def prepare(self, camera: int) -> None:
+        """Render an image, the first time in a process."""
+        known = self.plan.head, self.scene
+        if known not in _PREPARED:
+            self._image(self._stage, self._k, camera, self._lasers(self._k))
+        _PREPARED.add(known)
 
     def end(self) -> None:
         """Let the thread end: a process must not end while it renders."""
@@ -359,17 +366,14 @@ class TwinRig:
                 self._render_all(stage, cameras)
             images = {c: self._image(stage, k, c, lasers) for c in cameras}
             with self.lock:
-                self._wait_for(self._next_ns)
+                # any change ends the wait
+                self.lock.wait(1e-9 * max(self._next_ns - time.monotonic_ns(), 0))
                 is_same = stage is self._stage and k == self._k and lasers == self._lasers(k)
                 if is_same and self.is_running and cameras == tuple(self.modes):
                     now_ns = time.monotonic_ns()
                     self._next_ns = max(self._next_ns, now_ns - _LATE_NS)
                     if now_ns >= self._next_ns:
                         self._trigger(stage, k, lasers, images)
-
-    def _wait_for(self, t_ns: int) -> None:
-        """Under the lock; any change ends the wait."""
-        self.lock.wait(1e-9 * max(t_ns - time.monotonic_ns(), 0))
 
     def _render_all(self, stage: SceneStage, cameras: Sequence[int]) -> None:
         """Render what the schedule will want, before the first trigger, into memory."""
@@ -428,11 +432,6 @@ def _within(wanted: float | None, now: float | None, least: float, most: float) 
     return now if wanted is None else float(np.clip(wanted, least, most))
 
 
-def _drawn_clock(rng: np.random.Generator, zero_ns: int, is_shared: bool) -> DeviceClock:
-    offset_ns, drift = round(1e9 * rng.uniform(0.0, _UPTIME_S)), _DRIFT * rng.standard_normal()
-    return DeviceClock(0, 0.0, 0) if is_shared else DeviceClock(offset_ns, drift, zero_ns)
-
-
 class _TwinDevice:
     """What the twin's devices have in common.
 
@@ -441,6 +440,8 @@ class _TwinDevice:
     rig
         What stands behind it.
     """
+
+    is_simulated = True
 
     def __init__(self, rig: TwinRig, device: str) -> None:
         rig.take(device)
@@ -488,6 +489,8 @@ class TwinCamera(_TwinDevice):
     def __init__(self, rig: TwinRig, camera: int) -> None:
         super().__init__(rig, f"camera{camera}")
         self._camera = camera
+        # no trigger waits while loops are compiled
+        rig.prepare(camera)
 
     @property
     def setup(self) -> CameraSetup:
@@ -647,7 +650,7 @@ class TwinLasers(_TwinDevice):
 
 
 _RIGS: dict[_Plan, TwinRig] = {}
-_RIGS_LOCK = threading.Lock()
+_RIGS_LOCK, _PREPARED = threading.Lock(), set[tuple[str, TwinScene]]()
 
 
 @atexit.register
@@ -659,19 +662,16 @@ def _end_all() -> None:
 class TwinDriver:
     """Opens ``twin:HEAD?seed=1&preset=thesis&scene=plate&rate=10``.
 
-    Devices of one address are those of one instrument; ``camera=1`` is the right one of two.
-    Options: ``rate`` and ``arm`` triggers and samples a second, ``pause`` seconds between two
-    passes or postures, ``loop=1`` begins the scene anew at its end, ``ahead=1`` renders the whole
-    scene before the first trigger, ``wired=0`` leaves trigger ids out of frames and samples,
-    ``clock=shared`` gives all devices this computer's clock.
+    Devices of one address are those of one instrument; ``camera=1`` is the right one of two. The
+    page ``docs/reference/devices.md`` tells all options.
     """
 
     kinds: tuple[DeviceKind, ...] = ("camera", "arm", "lasers")
 
     def discover(self) -> tuple[DeviceInfo, ...]:
         """The devices of the head with one line: simulated ones are always there."""
-        kinds = self.kinds
-        return tuple(DeviceInfo("twin:thesis-single", one, f"simulated {one}") for one in kinds)
+        place = "twin:thesis-single"
+        return tuple(DeviceInfo(place, one, f"simulated {one}") for one in self.kinds)
 
     def open(self, kind: DeviceKind, place: str) -> Camera | Arm | LaserController:
         """Open one device of the instrument at an address.

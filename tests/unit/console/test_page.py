@@ -24,6 +24,7 @@ from armscan.console.journey import StepName
 from armscan.console.pages import ConsolePage
 from armscan.console.server import close_server, open_server
 from armscan.errors import DeviceError
+from armscan.pipeline.live.rig import Rig
 from armscan.storage.arm import PROBE_FILE, ProbeTip, probe_tip_toml, read_probe_tip
 from armscan.storage.recording import read_recording
 from rigs.console_rig import FailingArm, FailingBench, put_scanner, waited
@@ -71,6 +72,56 @@ def test_a_camera_is_unplugged_and_the_arm_stalls_while_scanning(tmp_path: Path)
     recorded = read_recording(page.journey.recording(StepName.SCAN, "scan-01"))
     ids = [row.trigger_id or 0 for row in recorded.rows]
     assert ids == sorted(set(ids)) and len(ids) > n_before + 5
+
+
+def test_what_does_not_answer_is_told_as_long_as_it_does_not(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    bench = FailingBench()
+    with opened(tmp_path / "s", bench) as page:
+        begin_scan(page)
+        bench.arm.is_stalled = True
+        waited(lambda: "arm has delivered nothing for 2" in text_of(page))
+        bench.cameras[0].is_gone = True
+        waited(lambda: "it was unplugged. The scan goes on by itself" in text_of(page))
+        bench.cameras[0].is_gone = False
+        waited(lambda: "unplugged" not in text_of(page))
+        page.controls.tried(page.scanning.see_arm)
+        assert "arm has delivered nothing for 2" in text_of(page)
+        # and what fails while nothing is recorded is told when the scan goes on
+        page.controls.tried(page.start_or_pause)
+        bench.cameras[0].is_gone = True
+        waited(lambda: len(page.live.snapshot.faults) == 2)
+        waited(lambda: "unplugged" not in text_of(page))
+        page.controls.tried(page.start_or_pause)
+        waited(lambda: "it was unplugged. The scan goes on by itself" in text_of(page))
+
+
+def test_a_press_while_a_scan_begins_does_not_pause_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_scanner(tmp_path / "s")
+    bench = FailingBench()
+    begun, may_go_on, scan_rig = threading.Event(), threading.Event(), bench.scan_rig
+
+    def slow_rig(step: StepName) -> Rig:
+        begun.set()
+        assert may_go_on.wait(30.0)
+        return scan_rig(step)
+
+    monkeypatch.setattr(bench, "scan_rig", slow_rig)
+    with opened(tmp_path / "s", bench) as page:
+        page.choose(StepName.SCAN)
+        first = threading.Thread(target=pressed, args=(page.scanning.start_button,))
+        first.start()
+        assert begun.wait(30.0)
+        assert "Starting the devices" in page._working.content and page._working.visible
+        again = threading.Thread(target=pressed, args=(page.scanning.start_button,))
+        again.start()
+        again.join(10.0)
+        assert not again.is_alive()
+        may_go_on.set()
+        first.join()
+        assert page.live is not None and page.live.snapshot.state == "scanning"
 
 
 def test_a_closed_console_ends_its_scan_and_the_next_one_goes_on_there(tmp_path: Path) -> None:

@@ -365,7 +365,7 @@ def test_what_is_recorded_while_a_pass_is_taken_back_stays(
 
 def test_an_instant_that_is_recorded_after_it_was_taken_back_is_not_listed(tmp_path: Path) -> None:
     bench = FailingBench()
-    recorder = ScanRecorder(tmp_path / "s.mcap", bench.rig, is_simulated=True)
+    recorder = ScanRecorder(tmp_path / "s.mcap", bench.rig)
     recorder.begin()
     image = np.full((240, 320), 7, dtype=np.uint8)
     for k in range(5):
@@ -438,7 +438,7 @@ def test_an_image_that_is_rendered_when_the_scan_ends_has_its_pose(
 
 def test_both_cameras_of_an_instant_are_taken_back_together(tmp_path: Path) -> None:
     bench = FailingBench(n_cameras=2)
-    recorder = ScanRecorder(tmp_path / "s.mcap", bench.rig, is_simulated=True)
+    recorder = ScanRecorder(tmp_path / "s.mcap", bench.rig)
     recorder.begin()
     image = np.full((240, 320), 7, dtype=np.uint8)
     for k in range(4):

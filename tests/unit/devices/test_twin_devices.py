@@ -14,6 +14,7 @@ from armscan.devices.protocols import ArmFlag, ArmSample, CameraSettings, Frame,
 from armscan.devices.registry import open_device
 from armscan.errors import DeviceError, DeviceTakenError, OptionError
 from armscan.records.exposure import SensorWindow
+from armscan.simulation.live import TwinRig
 
 PLACE = "twin:thesis-cross?scene=plate&preset=clean&pause=0.2&rate=20"
 SMALL = CameraSettings(window=SensorWindow(1400, 1000), size_px=(300, 100))
@@ -231,3 +232,13 @@ def test_an_address_that_names_no_instrument_is_refused(place: str) -> None:
     with pytest.raises(OptionError) as caught:
         open_device("camera", place)
     assert caught.value.remedy
+
+
+def test_loops_are_compiled_before_the_first_trigger(monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered: list[int] = []
+    monkeypatch.setattr("armscan.simulation.live._PREPARED", set())
+    monkeypatch.setattr(TwinRig, "_image", lambda rig, stage, k, camera, on: rendered.append(k))
+    for _ in range(2):
+        open_device("camera", PLACE).close()
+    # once a process
+    assert rendered == [0]

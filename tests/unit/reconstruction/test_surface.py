@@ -18,7 +18,7 @@ from armscan.reconstruction.surface import (
     thinned_surface,
 )
 from armscan.records.cloud import PointCloud
-from armscan.storage.parts.surfaces import encoded_surface
+from armscan.storage.parts.meshes import encoded_surface
 
 SIGMA_MM = 0.01
 RADIUS_MM = 12.0

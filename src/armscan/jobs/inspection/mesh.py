@@ -21,7 +21,7 @@ from armscan.report.quantity import Quantity, Summary, sentences
 from armscan.storage.clouds import read_cloud
 from armscan.storage.files import path_text
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.parts.surfaces import SURFACE_SUFFIXES, encoded_surface
+from armscan.storage.parts.meshes import SURFACE_SUFFIXES, encoded_surface
 
 LEAST_TRIANGLES = 4
 FINE = 0.6

@@ -22,7 +22,7 @@ from armscan.pipeline.live.recorder import LiveRecorder
 from armscan.pipeline.live.rig import MOST_RATE_HZ, Rig, RigDescription, read_rig
 from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
 from armscan.pipeline.simulate import TwinName
-from armscan.report.quantity import Quantity, Summary
+from armscan.report.quantity import Quantity, Summary, plural
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.files import check_outputs
 from armscan.storage.recordings.write_mcap import WriterOptions, WriterStatus
@@ -173,6 +173,7 @@ def record_scan(
     check_outputs((output,), is_overwriting=is_overwriting)
     place = request.scanner or (Path(description.scanner) if description.scanner else None)
     scanner = None if place is None else read_scanner_calibration(place)
+    tell("opening the devices ...")
     with Rig.open(description, open_device) as rig:
         rig.set_windows()
         options = WriterOptions(is_stripe_band=request.is_stripe_band)
@@ -206,8 +207,7 @@ class _Recording:
         tell: tuple[Callable[[str], None], Callable[[str], None]],
     ) -> None:
         self._output, (self._tell, self._show_rate) = output, tell
-        simulated = all(one.startswith(TWIN) for one in rig.description.cameras)
-        self._recorder = LiveRecorder(output, rig, is_simulated=simulated, options=writer_options)
+        self._recorder = LiveRecorder(output, rig, options=writer_options)
         options = LiveOptions.of(rig.description)
         self._session = LiveSession(rig, scanner, options=options, recorder=self._recorder)
         self._session.add_listener(self._hear)
@@ -325,7 +325,7 @@ class _Recording:
         rate = (status.n_accepted - before.n_accepted) / max(seconds - then, 1e-3)
         free = shutil.disk_usage(self._output.parent).free
         # chunks are written now and then: how long the space lasts follows from the whole
-        lasts = f" ({free * seconds / status.n_bytes / 60.0:,.0f} min)" if status.n_bytes else ""
+        lasts = f" ({free * seconds / status.n_bytes / 60.0:,.0f} min)" if status.n_accepted else ""
         n_lost, n_late = self._losses()
         words = [
             f"{seconds:5.0f} s",
@@ -351,8 +351,7 @@ class _Recording:
     def _hear(self, event: LiveEvent) -> None:
         if event.kind in ("fault", "recovered", "warning"):
             self._n_faults += event.kind == "fault" and event.device not in OWN_PARTS
-            where = f"{event.device}: " if event.device and event.device not in event.text else ""
-            self._tell(f"{event.kind}: {where}{event.text}")
+            self._tell(f"{event.kind}: {event.words}")
         if event.kind in ("fault", "warning"):
             self._last_fault = event.text
 
@@ -395,7 +394,9 @@ class _Recording:
                 "the first trigger: they are listed, and get no pose",
             )
         if self._n_faults:
-            warnings.insert(0, f"devices failed {self._n_faults} times; the recording says when")
+            warnings.insert(
+                0, f"devices failed {plural(self._n_faults, 'time')}; the recording says when"
+            )
         cloud = self._output.with_suffix(".ply")
         next_step = (
             f"armscan info {self._output}"

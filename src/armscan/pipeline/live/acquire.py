@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from armscan.devices.clocks import ElementStatus
+from armscan.devices.clocks import ElementStatus, StreamMonitor
 from armscan.devices.matching import InstantMatcher, MatchedInstant, TimedSample
 from armscan.devices.protocols import ArmSample, Frame, LaserEvent
 from armscan.errors import ArmscanError
@@ -37,8 +37,13 @@ BEHIND_SHARE = 0.25
 SEEN_EVERY_NS = 20_000_000
 """So often a device that has nothing says so."""
 TOLD_EVERY_S = 10.0
-"""So often the same trouble of this computer is told again."""
+"""So often the same trouble of this computer or a clock is told again."""
 BEHIND = "this computer cannot keep up with the recording; the devices' own buffers must hold"
+
+JUMPED = (
+    "its clock jumped, or what it sends takes longer from now on; what is found by this clock's "
+    "time is placed again when the clock is known anew"
+)
 
 MOST_AHEAD = 16
 """Instants that wait where all are to be measured; further ones are recorded and not shown."""
@@ -68,6 +73,12 @@ class LiveEvent:
     kind: EventKind
     text: str
     device: str = ""
+
+    @property
+    def words(self) -> str:
+        """The text, with the device's name where it lacks it."""
+        is_named = not self.device or self.device in OWN_PARTS or self.device in self.text
+        return self.text if is_named else f"{self.device}: {self.text}"
 
 
 class Recorder(Protocol):
@@ -126,6 +137,11 @@ class Acquisition:
         Told of faults and buttons.
     latency_ns
         As `armscan.models.calibration.ScannerCalibration.latency_ns`.
+
+    Attributes
+    ----------
+    faults
+        What is wrong with the devices that do not answer now, by their names.
     """
 
     def __init__(
@@ -145,18 +161,27 @@ class Acquisition:
             latency_ns=latency_ns,
             arm=rig.arm_model,
         )
+        self.faults: dict[str, str] = {}
         self._recording: _Recording | None = None
         self._deliver, self._tell = deliver, tell
         self._arrived: queue.Queue[tuple[str, int, Any]] = queue.Queue(MOST_WAITING)
         self._to_keep: queue.Queue[_ToKeep | threading.Event] = queue.Queue(MOST_TO_KEEP)
         self._keeper: threading.Thread | None = None
+        self._devices: dict[tuple[str, int], tuple[Any, StreamMonitor]] = {
+            ("frame", k): both
+            for k, both in enumerate(zip(rig.cameras, self.matcher.cameras, strict=True))
+        }
+        if rig.arm is not None:
+            self._devices["samples", 0] = rig.arm, self.matcher.arm
+        if rig.lasers is not None:
+            self._devices["events", 0] = rig.lasers, self.matcher.controller
         self._streams: dict[tuple[str, int], _Stream] = {}
         self._stopping = threading.Event()
         self._stopped_ns = 0
         self._is_broken = threading.Event()
         self._threads: list[threading.Thread] = []
         self._buttons = 0
-        self._told_behind = -TOLD_EVERY_S
+        self._told_at: dict[str, float] = {}
 
     def start(self) -> None:
         """Start the rig and the threads.
@@ -167,15 +192,10 @@ class Acquisition:
             If a device does not answer; all are stopped then.
         """
         self.rig.start()
-        devices: dict[tuple[str, int], Any] = {
-            ("frame", k): camera for k, camera in enumerate(self.rig.cameras)
-        }
-        devices |= {} if self.rig.arm is None else {("samples", 0): self.rig.arm}
-        devices |= {} if self.rig.lasers is None else {("events", 0): self.rig.lasers}
-        self._streams = {key: _Stream() for key in devices}
+        self._streams = {key: _Stream() for key in self._devices}
         self._keeper = threading.Thread(target=self._keep, daemon=True)
         self._keeper.start()
-        for (what, k), device in devices.items():
+        for (what, k), (device, _) in self._devices.items():
             self._run(self._read, what, k, device)
         self._run(self._match)
 
@@ -207,6 +227,11 @@ class Acquisition:
         self._recording = None if recorder is None else _Recording(recorder)
         if recorder is None:
             self.wait_until_kept()
+
+    @property
+    def monitored(self) -> tuple[tuple[Any, StreamMonitor], ...]:
+        """Cameras, arm and laser controller, as far as there are, each with what watches it."""
+        return tuple(self._devices.values())
 
     @property
     def n_waiting(self) -> int:
@@ -255,6 +280,7 @@ class Acquisition:
                 return
             if found:
                 if is_silent:
+                    self.faults.pop(device.name, None)
                     self._tell(LiveEvent("recovered", f"{device.name} answers again", device.name))
                 last, is_silent = time.monotonic(), False
                 self._put(what, k, found)
@@ -265,6 +291,7 @@ class Acquisition:
             if not is_silent and (fault or time.monotonic() - last > SILENT_S):
                 is_silent = True
                 since = f"{device.name} has delivered nothing for {time.monotonic() - last:.1f} s"
+                self.faults[device.name] = fault or since
                 self._tell(LiveEvent("fault", fault or since, device.name))
 
     def _is_late(self, found: Any) -> bool:
@@ -291,11 +318,15 @@ class Acquisition:
             try:
                 self._arrived.put((what, k, found), timeout=READ_S)
             except queue.Full:
-                if time.monotonic() > self._told_behind + TOLD_EVERY_S:
-                    self._told_behind = time.monotonic()
-                    self._tell(LiveEvent("warning", BEHIND, RECORDER))
+                self._warn(BEHIND, RECORDER)
             else:
                 return
+
+    def _warn(self, text: str, device: str) -> None:
+        """Tell of trouble, of the same now and then."""
+        if time.monotonic() > self._told_at.get(device, -TOLD_EVERY_S) + TOLD_EVERY_S:
+            self._told_at[device] = time.monotonic()
+            self._tell(LiveEvent("warning", text, device))
 
     def _match(self) -> None:
         """Match until all is read; whatever ends it early is told, and no reader waits for it."""
@@ -325,7 +356,8 @@ class Acquisition:
         return min(read, default=now_ns)
 
     def _take_in(self, what: str, k: int, found: Any) -> None:
-        stream = self._streams[what, k]
+        stream, (device, monitor) = self._streams[what, k], self._devices[what, k]
+        n_jumps = monitor.counts.n_jumps
         if isinstance(found, int):
             stream.seen_ns = max(stream.seen_ns, found)
             return
@@ -339,6 +371,8 @@ class Acquisition:
         else:
             self.matcher.add_events(found)
             self._record(lambda recorder: recorder.add_events(found))
+        if monitor.counts.n_jumps > n_jumps:
+            self._warn(JUMPED, device.name)
         last = found[-1] if isinstance(found, tuple) else found
         stream.seen_ns = max(stream.seen_ns, last.t_host_ns)
 

@@ -43,8 +43,6 @@ class LiveRecorder:
         File to write; must not exist.
     rig
         Whose streams come; opened, its windows set.
-    is_simulated
-        Whether images are rendered.
     options
         How the file is written; defaults if None.
 
@@ -57,14 +55,7 @@ class LiveRecorder:
         listed, and get no pose.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        rig: Rig,
-        *,
-        is_simulated: bool = False,
-        options: WriterOptions | None = None,
-    ) -> None:
+    def __init__(self, path: Path, rig: Rig, *, options: WriterOptions | None = None) -> None:
         self.n_aside = self.n_untriggered = 0
         self._writer = RecordingWriter(path, options)
         self._rig, self._is_triggered = rig, rig.description.is_common_trigger
@@ -75,7 +66,7 @@ class LiveRecorder:
             tuple(camera.setup for camera in rig.cameras),
             clock="related",
             pose_form=self._form,
-            is_simulated=is_simulated,
+            is_simulated=rig.is_simulated,
         )
         self._index = 0
         self._last_ns = [0] * len(rig.cameras)

@@ -269,6 +269,12 @@ class Rig:
         self.close()
 
     @property
+    def is_simulated(self) -> bool:
+        """Whether one of its devices says that what it delivers is simulated."""
+        devices = (*self.cameras, self.arm, self.lasers)
+        return any(getattr(device, "is_simulated", False) for device in devices)
+
+    @property
     def can_show(self) -> bool:
         """Whether scenes can be put before it: a simulated rig."""
         return hasattr(self.cameras[0], "show")

@@ -165,7 +165,9 @@ class LiveSnapshot:
     n_waiting
         Elements that wait to be recorded.
     streams
-        What was wrong in each stream, in words: cameras, arm, laser controller.
+        What was lost, late or doubtful in the stream of each device, in words; empty where nothing.
+    faults
+        What is wrong now, in words: devices that do not answer.
     """
 
     state: SessionState
@@ -181,6 +183,7 @@ class LiveSnapshot:
     brightness: tuple[tuple[LineBrightness, ...], ...]
     n_waiting: int
     streams: tuple[str, ...]
+    faults: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -435,9 +438,7 @@ class LiveSession:
 
     @property
     def _monitors(self) -> tuple[StreamMonitor, ...]:
-        matcher = self._acquisition.matcher
-        arm = (matcher.arm,) if self._rig.arm is not None else ()
-        return (*matcher.cameras, *arm, *((matcher.controller,) if self._rig.lasers else ()))
+        return tuple(monitor for _, monitor in self._acquisition.monitored)
 
     def snapshot(self) -> LiveSnapshot:
         """What there is to show now."""
@@ -445,8 +446,6 @@ class LiveSession:
             views = tuple(self._view(k) for k in sorted(self._frames))
             times, late = list(self._arrivals), list(self._latencies)
             span = (times[-1] - times[0]) * 1e-9 if len(times) > 1 else 0.0
-            matcher = self._acquisition.matcher
-            monitors = (*matcher.cameras, matcher.arm, matcher.controller)
             return LiveSnapshot(
                 state=self._state,
                 cameras=views,
@@ -462,7 +461,11 @@ class LiveSession:
                 else None,
                 brightness=tuple(one.brightness for one in self._controls),
                 n_waiting=self._acquisition.n_waiting,
-                streams=tuple(one.counts.words for one in monitors),
+                streams=tuple(
+                    f"{device.name}: {monitor.counts.words}" if monitor.counts.words else ""
+                    for device, monitor in self._acquisition.monitored
+                ),
+                faults=tuple(self._acquisition.faults.copy().values()),
             )
 
     def _view(self, camera: int) -> CameraView:

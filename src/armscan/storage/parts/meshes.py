@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes from STL (text and binary), PLY and OBJ files."""
+"""Triangle meshes from STL (text and binary), PLY and OBJ files, and as binary STL and PLY."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from armscan.storage.formats.ply import BYTE_ORDERS, TYPES, parse_ply
 from armscan.storage.formats.stl import stl_corners
 from armscan.storage.parts.step import STEP_SUFFIXES, ChordError, read_step
 
-MESH_SUFFIXES = (".stl", ".ply", ".obj")
+MESH_SUFFIXES, SURFACE_SUFFIXES = (".stl", ".ply", ".obj"), (".stl", ".ply")
+"""That are read, and that are written."""
+_HEADER_BYTES = 80
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 """Length of each unit that a mesh may be in; mesh files do not tell."""
 MOST_CORNERS = 1000
@@ -209,3 +211,44 @@ def _obj(data: bytes, where: str) -> tuple[FloatArray, IntArray | None, tuple[st
     face = np.repeat(np.array(found.group, dtype=np.int64), counts)
     used, face = np.unique(face, return_inverse=True)
     return corners, face.astype(np.int64), tuple(found.names[k] for k in used.tolist())
+
+
+def encoded_surface(suffix: str, vertices_mm: FloatArray, triangles: IntArray, title: str) -> bytes:
+    """Content of a file of triangles.
+
+    Parameters
+    ----------
+    suffix
+        ``.stl``: corners of each triangle in single precision, which is 0.06 um at a metre.
+        ``.ply``: vertices in double precision, each once.
+    vertices_mm, triangles
+        (V, 3) and (T, 3) rows of them, anticlockwise seen from outside.
+    title
+        What it is; STL keeps 80 letters of it.
+    """
+    if suffix == ".stl":
+        return _stl(vertices_mm, triangles, title)
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"comment {title}\n"
+        f"element vertex {len(vertices_mm)}\n"
+        "property double x\nproperty double y\nproperty double z\n"
+        f"element face {len(triangles)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.zeros(len(triangles), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+    rows["count"], rows["corners"] = 3, triangles
+    return header.encode("ascii", "replace") + vertices_mm.astype("<f8").tobytes() + rows.tobytes()
+
+
+def _stl(vertices: FloatArray, triangles: IntArray, title: str) -> bytes:
+    corners = vertices[triangles]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    rows = np.zeros(len(triangles), facet)
+    rows["normal"] = np.divide(across, length, out=np.zeros_like(across), where=length > 0.0)
+    rows["corners"] = corners
+    # a reader takes a file that begins with "solid" for text
+    head = title.encode("ascii", "replace")[:_HEADER_BYTES].ljust(_HEADER_BYTES)
+    return head + np.array(len(rows), "<u4").tobytes() + rows.tobytes()

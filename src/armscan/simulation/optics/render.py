@@ -236,13 +236,16 @@ class Region:
         return np.asarray(pixels + np.array([self.x_px, self.y_px]))
 
 
-def between_nodes(nodes: Image32, step_px: int) -> Image32:
-    """(step H, step W) pixels between nodes (H, W), each of which is the pixel of its block."""
+def between_nodes(nodes: Image32, step_px: int, size_px: tuple[int, int] | None = None) -> Image32:
+    """(step H, step W) pixels between nodes (H, W), each of which is the pixel of its block.
+
+    Only the first ``size_px``, width and height, of these if it is given.
+    """
     step = 1.0 / step_px
     pixels = cv2.warpAffine(
         nodes,
         np.array([[step, 0.0, 0.0], [0.0, step, 0.0]]),
-        (step_px * nodes.shape[1], step_px * nodes.shape[0]),
+        size_px or (step_px * nodes.shape[1], step_px * nodes.shape[0]),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
@@ -251,7 +254,7 @@ def between_nodes(nodes: Image32, step_px: int) -> Image32:
 
 def to_pixels(nodes: Image32, region: Region) -> Image32:
     """(H, W) values of a region's pixels between those of its coarse grid."""
-    return between_nodes(nodes, COARSE_STEP_PX)[: region.height_px, : region.width_px]
+    return between_nodes(nodes, COARSE_STEP_PX, (region.width_px, region.height_px))
 
 
 def enlarged(cells: NDArray[np.uint8], step_px: int) -> NDArray[np.uint8]:

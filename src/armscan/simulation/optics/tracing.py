@@ -97,11 +97,15 @@ def _meet(
     data: Floats,
     limbs: Floats,
     balls: Floats,
+    mesh: Floats | None,
     spare: Counts,
     start: Three,
     ray: Three,
 ) -> float:
-    """Distance to one surface along a ray of the scene; infinite for none."""
+    """Distance to one surface along a ray of the scene; infinite for none.
+
+    ``mesh`` are the numbers of meshes; where there are none, what would meet them is not compiled.
+    """
     sx, sy, sz = _into(row, start[0] - row[10], start[1] - row[11], start[2] - row[12])
     own, along = (sx, sy, sz), _into(row, ray[0], ray[1], ray[2])
     kind, at = int(row[_KIND]), int(row[_START])
@@ -117,20 +121,26 @@ def _meet(
         return meet_print(data, at, own, along)
     if kind == _FLOOR:
         return meet_floor(data, at, own, along)
-    if kind == _MESH:
-        return meet_mesh(data, at, own, along)
+    if mesh is not None and kind == _MESH:
+        return meet_mesh(mesh, at, own, along)
     stop = int(row[_STOP])
     return float(marched(own, along, limbs[at:stop], balls[at:stop], HIT_MM, spare[0]))
 
 
 @compiled
 def _first(
-    rows: Floats, data: Floats, limbs: Floats, balls: Floats, spare: Counts, ray: Three
+    rows: Floats,
+    data: Floats,
+    limbs: Floats,
+    balls: Floats,
+    mesh: Floats | None,
+    spare: Counts,
+    ray: Three,
 ) -> tuple[float, int]:
     """Distance from the camera to the first surface, and which; infinite and -1 for none."""
     nearest, index = np.inf, -1
     for k in range(rows.shape[0]):
-        reach = _meet(rows[k], data, limbs, balls, spare, (0.0, 0.0, 0.0), ray)
+        reach = _meet(rows[k], data, limbs, balls, mesh, spare, (0.0, 0.0, 0.0), ray)
         if reach < nearest:
             nearest, index = reach, k
     return nearest, index
@@ -138,10 +148,15 @@ def _first(
 
 @compiled
 def _normal(
-    row: Floats, data: Floats, limbs: Floats, spare: Counts, x: float, y: float, z: float
+    row: Floats,
+    data: Floats,
+    limbs: Floats,
+    mesh: Floats | None,
+    spare: Counts,
+    point: Three,
 ) -> Three:
     """Outward unit normal of a surface at a point of it, both in the scene."""
-    px, py, pz = _into(row, x - row[10], y - row[11], z - row[12])
+    px, py, pz = _into(row, point[0] - row[10], point[1] - row[11], point[2] - row[12])
     kind, at = int(row[_KIND]), int(row[_START])
     nx, ny, nz = 0.0, 0.0, 1.0
     if kind == _PLATE:
@@ -156,8 +171,6 @@ def _normal(
         nz = -1.0
     elif kind == _FLOOR:
         nx, ny, nz = data[at + 3], data[at + 4], data[at + 5]
-    elif kind == _MESH:
-        nx, ny, nz = mesh_normal(data, at, px, py, pz)
     elif kind == _BOX:
         pz -= 0.5 * data[at + 2]
         beyond_x, beyond_y = abs(px) - 0.5 * data[at], abs(py) - 0.5 * data[at + 1]
@@ -169,7 +182,7 @@ def _normal(
             ny = -1.0 if py < 0.0 else 1.0
         else:
             nz = -1.0 if pz < 0.0 else 1.0
-    else:
+    elif kind == _BODY:
         own, nz, d = limbs[at : int(row[_STOP])], 0.0, GRADIENT_STEP_MM
         every = spare[1, : own.shape[0]]
         a = distance(px + d, py - d, pz - d, own, every)
@@ -177,6 +190,8 @@ def _normal(
         c = distance(px - d, py + d, pz - d, own, every)
         e = distance(px + d, py + d, pz + d, own, every)
         nx, ny, nz = a - b - c + e, -a - b + c + e, -a + b - c + e
+    elif mesh is not None:
+        nx, ny, nz = mesh_normal(mesh, at, px, py, pz)
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     return _out_of(row, nx / length, ny / length, nz / length)
 
@@ -248,6 +263,7 @@ def _trace(
     data: Floats,
     limbs: Floats,
     balls: Floats,
+    mesh: Floats | None,
     spare: Counts,
     reach: Floats,
     surface: Counts,
@@ -257,7 +273,7 @@ def _trace(
     bend = (0.0, 0.0)
     for i in range(pixels.shape[0]):
         ray, bend = _ray(lens, pixels[i, 0], pixels[i, 1], tolerance, bend)
-        reach[i], surface[i] = _first(rows, data, limbs, balls, spare, ray)
+        reach[i], surface[i] = _first(rows, data, limbs, balls, mesh, spare, ray)
         for k in range(3):
             points[i, k] = reach[i] * ray[k] if surface[i] >= 0 else np.nan
 
@@ -268,6 +284,7 @@ def _is_seen(
     data: Floats,
     limbs: Floats,
     balls: Floats,
+    mesh: Floats | None,
     spare: Counts,
     own: int,
     source: Three,
@@ -285,7 +302,7 @@ def _is_seen(
     for k in range(rows.shape[0]):
         if k == own and not is_hollow:
             continue
-        if _meet(rows[k], data, limbs, balls, spare, source, ray) < away - SHADOW_MARGIN_MM:
+        if _meet(rows[k], data, limbs, balls, mesh, spare, source, ray) < away - SHADOW_MARGIN_MM:
             return False
     return True
 
@@ -366,6 +383,7 @@ def _shade(
     data: Floats,
     limbs: Floats,
     balls: Floats,
+    mesh: Floats | None,
     spare: Counts,
     pattern: Floats,
     lights: Floats,
@@ -378,12 +396,12 @@ def _shade(
     bend = (0.0, 0.0)
     for i in range(pixels.shape[0]):
         ray, bend = _ray(lens, pixels[i, 0], pixels[i, 1], tolerance, bend)
-        away, index = _first(rows, data, limbs, balls, spare, ray)
+        away, index = _first(rows, data, limbs, balls, mesh, spare, ray)
         if index < 0:
             continue
         point = (away * ray[0], away * ray[1], away * ray[2])
         row = rows[index]
-        normal = _normal(row, data, limbs, spare, point[0], point[1], point[2])
+        normal = _normal(row, data, limbs, mesh, spare, point)
         sheet = lights[_sheet_of(lights, borders, point[0], point[1], point[2])]
         if sheet[20] > 0.0:
             near, strength = _lit_by_spot(sheet, point, normal)
@@ -393,7 +411,7 @@ def _shade(
         if abs(near) >= far_sigmas or strength <= FAINTEST:
             continue
         source = (sheet[0], sheet[1], sheet[2])
-        if _is_seen(rows, data, limbs, balls, spare, index, source, point):
+        if _is_seen(rows, data, limbs, balls, mesh, spare, index, source, point):
             albedo = _reflectance(row, base, data, pattern, point[0], point[1], point[2])
             peak[i] = strength * (albedo + _glossy(row, source, point, normal))
 
@@ -407,6 +425,7 @@ def _room(
     data: Floats,
     limbs: Floats,
     balls: Floats,
+    mesh: Floats | None,
     spare: Counts,
     pattern: Floats,
     lamp: Floats,
@@ -418,14 +437,14 @@ def _room(
         if index < 0:
             continue
         row, point = rows[index], (points[i, 0], points[i, 1], points[i, 2])
-        normal = _normal(row, data, limbs, spare, point[0], point[1], point[2])
+        normal = _normal(row, data, limbs, mesh, spare, point)
         light = lamp[5] * normal[0] + lamp[6] * normal[1] + lamp[7] * normal[2]
         light = lamp[0] * (2.0 + light) / 3.0
         source = (lamp[2], lamp[3], lamp[4])
         x, y, z = source[0] - point[0], source[1] - point[1], source[2] - point[2]
         facing = x * normal[0] + y * normal[1] + z * normal[2]
         cosine = facing / math.sqrt(x * x + y * y + z * z)
-        if cosine > 0.0 and _is_seen(rows, data, limbs, balls, spare, index, source, point):
+        if cosine > 0.0 and _is_seen(rows, data, limbs, balls, mesh, spare, index, source, point):
             light += lamp[1] * cosine
         albedo = _reflectance(row, base, data, pattern, point[0], point[1], point[2])
         radiance[i] = light * albedo
@@ -463,8 +482,14 @@ class SceneNumbers:
         return np.stack([every, every])
 
     @property
-    def _shapes(self) -> tuple[Floats, ...]:
-        return self.rows, self.base, self.data, self.limbs, self.balls
+    def mesh(self) -> Floats | None:
+        """The data if there are meshes among it."""
+        return self.data if (self.rows[:, _KIND] == _MESH).any() else None
+
+    @property
+    def _shapes(self) -> tuple[Any, ...]:
+        bodies = (self.limbs, self.balls)
+        return self.rows, self.base, self.data, *bodies, self.mesh, self.spare
 
     @staticmethod
     def of(scene: Scene, finishes: tuple[Material, ...]) -> SceneNumbers | None:
@@ -494,14 +519,14 @@ class SceneNumbers:
         """First hits of the rays of pixels (N, 2); see `Scene.trace`."""
         n = len(pixels)
         reach, surface, points = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 3))
-        own = (self.rows, self.data, self.limbs, self.balls, self.spare)
+        own = (self.rows, self.data, self.limbs, self.balls, self.mesh, self.spare)
         _trace(_own(pixels), lens_of(camera), tolerance, *own, reach, surface, points)
         return Hits(reach, surface, points)
 
     def room_light(self, hits: Hits) -> FloatArray:
         """(N,) red light of hits under the lamp; see `Scene.room_light`."""
         light = np.zeros(len(hits.surface))
-        own = (*self._shapes, self.spare, texture_pattern())
+        own = (*self._shapes, texture_pattern())
         _room(_own(hits.points_mm), hits.surface, *own, self.lamp, light)
         return light
 
@@ -516,7 +541,7 @@ class SceneNumbers:
     ) -> tuple[FloatArray, FloatArray]:
         """Reach and peak (N,) of a light at pixels (N, 2)."""
         reach, peak = np.full(len(pixels), far_sigmas), np.zeros(len(pixels))
-        own = (*self._shapes, self.spare, texture_pattern())
+        own = (*self._shapes, texture_pattern())
         shone = (light.rows, light.borders, far_sigmas)
         _shade(_own(pixels), lens_of(camera), tolerance, *own, *shone, reach, peak)
         return reach, peak

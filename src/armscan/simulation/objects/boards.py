@@ -23,7 +23,7 @@ from armscan.simulation.kernels import (
     lay_over,
 )
 from armscan.simulation.optics.camera import RenderCamera, blur_image, blur_kernel
-from armscan.simulation.optics.render import camera_rays
+from armscan.simulation.optics.render import PixelBox, camera_rays
 from armscan.simulation.optics.scene import MISS, RoomLight
 
 
@@ -347,7 +347,7 @@ def render_flat_target(
     light = Lighting() if lighting is None else lighting
     board = _BoardPlane.of(camera, rotation, translation_mm, _Print(pattern, substrate))
     span = light.light_level - light.dark_level
-    whole = _Box(0, 0, camera.width_px, camera.height_px)
+    whole = PixelBox.of(camera)
     reflectance = _reflectance(board, light.surround, whole)
     levels = light.dark_level + span * reflectance.astype(np.float64)
     marks = pattern.marks_board_mm.copy()
@@ -377,7 +377,7 @@ class _Print:
     substrate: Substrate
 
 
-def _reflectance(board: _BoardPlane, surround: float, box: _Box) -> NDArray[np.float32]:
+def _reflectance(board: _BoardPlane, surround: float, box: PixelBox) -> NDArray[np.float32]:
     """(H, W) part of the light tone in each pixel of a box, blurred by the lens."""
     camera, pattern = board.camera, board.print_.pattern
     if isinstance(pattern, CirclePattern) and board.print_.substrate == FLAT:
@@ -386,11 +386,11 @@ def _reflectance(board: _BoardPlane, surround: float, box: _Box) -> NDArray[np.f
             return _discs(camera, pattern, board, box)
     fine = _fine_reflectance(board, surround)
     whole = _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
-    return np.ascontiguousarray(whole[box.slices])
+    return np.ascontiguousarray(whole[box.within(PixelBox.of(camera))])
 
 
 def _discs(
-    camera: RenderCamera, pattern: CirclePattern, board: _BoardPlane, box: _Box
+    camera: RenderCamera, pattern: CirclePattern, board: _BoardPlane, box: PixelBox
 ) -> NDArray[np.float32]:
     """As `_reflectance`, disc by disc, of a print whose ground goes on beyond its border."""
     tone = np.full(box.shape, not pattern.is_light_on_dark, np.float32)
@@ -406,16 +406,18 @@ def _discs(
     for centre, pixels in zip(centres, rims, strict=True):
         if not np.isfinite(pixels).all():
             continue
-        own = _Box.around(pixels, margin, camera)
+        own = PixelBox.around(pixels, margin, camera)
         height, width = own.shape
-        if height == 0 or width == 0:
+        inside = own.cut(box)
+        if inside.is_empty:
             continue
         cells = np.zeros((SUBPIXELS * height, SUBPIXELS * width), np.float32)
         disc = np.array([centre[0], centre[1], radius])
         disc_cells(disc, own.left, own.top, lens, knots_x, knots_y, board.board_from_ray, cells)
         blurred = cv2.sepFilter2D(cells, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
-        part = tone[box.within(own)]
-        join(part, _bin(np.asarray(blurred, dtype=np.float32)), out=part)
+        cover = _bin(np.asarray(blurred, dtype=np.float32))
+        part = tone[inside.within(box)]
+        join(part, cover[inside.within(own)], out=part)
     return tone
 
 
@@ -612,7 +614,9 @@ def render_board(
     plane = _BoardPlane.of(camera, pose.rotation, pose.translation_mm, print_)
     outline, kernel = outline_px(board, camera), blur_kernel(camera.blur_sigma_px)
     thickness = len(kernel) + 5
-    box = _Box.around(outline, 2 * thickness, camera)
+    box = PixelBox.around(outline, 2 * thickness, camera)
+    if box.is_empty:
+        return background
     mask, rim = np.zeros(box.shape, np.uint8), np.zeros(box.shape, np.uint8)
     corners = np.rint((outline - box.corner_px) * (1 << _OUTLINE_BITS)).astype(np.int32)
     cv2.fillPoly(mask, [corners], (255,), lineType=cv2.LINE_AA, shift=_OUTLINE_BITS)
@@ -620,47 +624,6 @@ def render_board(
     tone, lit = _reflectance(plane, 1.0, box), _lamp_on_board(board, camera, lamp)
     lay_over(background, box.corner_px, tone, lit, mask, rim, kernel, board.dark, board.light)
     return background
-
-
-@dataclass(frozen=True, slots=True)
-class _Box:
-    """A rectangle of an image."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    @staticmethod
-    def around(pixels_px: FloatArray, margin_px: int, camera: RenderCamera) -> _Box:
-        """The part of an image that holds pixels (N, 2) with a margin around them."""
-        left, top = (np.floor(pixels_px.min(axis=0)) - margin_px).astype(int)
-        right, bottom = (np.ceil(pixels_px.max(axis=0)) + margin_px + 1).astype(int)
-        left, top = min(max(int(left), 0), camera.width_px), min(max(int(top), 0), camera.height_px)
-        right, bottom = min(int(right), camera.width_px), min(int(bottom), camera.height_px)
-        return _Box(left, top, max(right, left), max(bottom, top))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width."""
-        return self.bottom - self.top, self.right - self.left
-
-    @property
-    def corner_px(self) -> IntArray:
-        """(2,) its first column and row."""
-        return np.array([self.left, self.top])
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        """Its rows and columns."""
-        return slice(self.top, self.bottom), slice(self.left, self.right)
-
-    def within(self, other: _Box) -> tuple[slice, slice]:
-        """Rows and columns of another, counted in this one."""
-        return (
-            slice(other.top - self.top, other.bottom - self.top),
-            slice(other.left - self.left, other.right - self.left),
-        )
 
 
 def outline_px(board: PrintedBoard, camera: RenderCamera) -> FloatArray:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
 from armscan.geometry.poses import Part, Pose, Sensor
-from armscan.simulation.kernels import Three
+from armscan.simulation.kernels import Three, compiled
 from armscan.simulation.optics.scene import OneColour
 
 LIMB_COLUMNS = 12
@@ -144,7 +144,7 @@ def marched(
     return np.inf
 
 
-@njit(types.void(_INPUT, _INPUT, _INPUT, types.float64, _RESULT), cache=True)
+@compiled
 def march(
     rays: NDArray[np.float64],
     limbs: NDArray[np.float64],

@@ -79,7 +79,8 @@ def test_scenes_that_nobody_waits_for_are_given_up(tmp_path: Path) -> None:
     before = time.monotonic()
     with pytest.raises(InputError, match="enough"):
         next(recorded_scenes({"ball": tmp_path / "ball"}, name, processes=2, meanwhile=refuse))
-    assert time.monotonic() - before < 30.0
+    # by two processes all six take three minutes
+    assert time.monotonic() - before < 120.0
     assert not (tmp_path / "ball").exists()
 
 

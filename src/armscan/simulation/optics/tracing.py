@@ -289,18 +289,20 @@ def _is_seen(
     own: int,
     source: Three,
     point: Three,
+    normal: Three,
 ) -> bool:
-    """Whether nothing stands between a source and a point of a surface that faces it.
+    """Whether nothing stands between a source and a point of a surface.
 
-    A surface without hollows does not shade its own.
+    Where a surface without hollows faces the source, it does not shade its own.
     """
     x, y, z = point[0] - source[0], point[1] - source[1], point[2] - source[2]
     away = math.sqrt(x * x + y * y + z * z)
     ray = (x / away, y / away, z / away)
     kind = int(rows[own, _KIND])
-    is_hollow = kind in (_WAVES, _BODY, _MESH)
+    is_clear = x * normal[0] + y * normal[1] + z * normal[2] < 0.0
+    is_clear = is_clear and kind not in (_WAVES, _BODY, _MESH)
     for k in range(rows.shape[0]):
-        if k == own and not is_hollow:
+        if k == own and is_clear:
             continue
         if _meet(rows[k], data, limbs, balls, mesh, spare, source, ray) < away - SHADOW_MARGIN_MM:
             return False
@@ -411,7 +413,7 @@ def _shade(
         if abs(near) >= far_sigmas or strength <= FAINTEST:
             continue
         source = (sheet[0], sheet[1], sheet[2])
-        if _is_seen(rows, data, limbs, balls, mesh, spare, index, source, point):
+        if _is_seen(rows, data, limbs, balls, mesh, spare, index, source, point, normal):
             albedo = _reflectance(row, base, data, pattern, point[0], point[1], point[2])
             peak[i] = strength * (albedo + _glossy(row, source, point, normal))
 
@@ -444,7 +446,9 @@ def _room(
         x, y, z = source[0] - point[0], source[1] - point[1], source[2] - point[2]
         facing = x * normal[0] + y * normal[1] + z * normal[2]
         cosine = facing / math.sqrt(x * x + y * y + z * z)
-        if cosine > 0.0 and _is_seen(rows, data, limbs, balls, mesh, spare, index, source, point):
+        if cosine > 0.0 and _is_seen(
+            rows, data, limbs, balls, mesh, spare, index, source, point, normal
+        ):
             light += lamp[1] * cosine
         albedo = _reflectance(row, base, data, pattern, point[0], point[1], point[2])
         radiance[i] = light * albedo

@@ -53,16 +53,8 @@ from armscan.simulation.optics.scene import (
 from armscan.simulation.optics.stray_light import CentreSpot
 
 _BOX, _PLATE, _SPHERE, _WAVES, _BODY, _PRINT, _FLOOR, _MESH = range(8)
-_KIND, _TEXTURE, _CELLS, _GLOSS, _GLOSS_WIDTH, _COLOUR, _START, _STOP = (
-    0,
-    13,
-    14,
-    15,
-    16,
-    17,
-    18,
-    19,
-)
+_KIND, _TEXTURE, _CELLS, _GLOSS = 0, 13, 14, 15
+_GLOSS_WIDTH, _COLOUR, _START, _STOP = 16, 17, 18, 19
 """Columns of a surface's row; 1 to 9 are its rotation in the scene, 10 to 12 its place there."""
 _FIXED_POINT_STEPS = 400
 _SLANT_X, _SLANT_Y = SLANT

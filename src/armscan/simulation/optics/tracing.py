@@ -483,7 +483,7 @@ class SceneNumbers:
         return self.data if (self.rows[:, _KIND] == _MESH).any() else None
 
     @property
-    def _shapes(self) -> tuple[Any, ...]:
+    def _shapes(self) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats | None, Counts]:
         bodies = (self.limbs, self.balls)
         return self.rows, self.base, self.data, *bodies, self.mesh, self.spare
 

@@ -522,8 +522,8 @@ class SceneNumbers:
     def room_light(self, hits: Hits) -> FloatArray:
         """(N,) red light of hits under the lamp; see `Scene.room_light`."""
         light = np.zeros(len(hits.surface))
-        own = (*self._shapes, texture_pattern())
-        _room(_own(hits.points_mm), hits.surface, *own, self.lamp, light)
+        own, pattern = self._shapes, texture_pattern()
+        _room(_own(hits.points_mm), hits.surface, *own, pattern, self.lamp, light)
         return light
 
     def shade(
@@ -537,9 +537,9 @@ class SceneNumbers:
     ) -> tuple[FloatArray, FloatArray]:
         """Reach and peak (N,) of a light at pixels (N, 2)."""
         reach, peak = np.full(len(pixels), far_sigmas), np.zeros(len(pixels))
-        own = (*self._shapes, texture_pattern())
+        own, pattern = self._shapes, texture_pattern()
         shone = (light.rows, light.borders, far_sigmas)
-        _shade(_own(pixels), lens_of(camera), tolerance, *own, *shone, reach, peak)
+        _shade(_own(pixels), lens_of(camera), tolerance, *own, pattern, *shone, reach, peak)
         return reach, peak
 
 

@@ -173,6 +173,8 @@ def test_a_kernel_is_loaded_when_it_is_first_asked_for(
     assert [len(one.overloads) for one in kernels] == [1, 1, 0]
     with pytest.raises(TypeError):
         module.mean(np.zeros((2, 2)))
+    assert load_kernels(without=("kernels_of_a_test",)) == {}
+    assert len(module.unused.overloads) == 0
     assert load_kernels() == {}
     assert len(module.unused.overloads) == 1
 

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from armscan.calibration.hand_eye.observations import PlateReference
-from armscan.devices.sources import Preset, Twin, TwinScene
+from armscan.devices.sources import Preset, ScanSource, Twin, TwinScene
 from armscan.errors import OptionError, OutputError
 from armscan.geometry.arrays import FloatArray
 from armscan.inspection.plane import inspect_plane
@@ -30,12 +31,13 @@ from armscan.jobs.reconstruct import StillPaths
 from armscan.jobs.reconstruct import reconstruct as reconstruct_files
 from armscan.jobs.sheets import SheetImages, calibrate_sheets
 from armscan.jobs.stereo import calibrate_stereo
+from armscan.kernels.arrays import load_kernels
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.adaptive_scan import record_adaptively
 from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.scan import ScanReconstruction, measure_scan
-from armscan.pipeline.simulate import TwinName, record_scenes, record_touches
+from armscan.pipeline.simulate import TwinName, record_touches, recorded_scenes
 from armscan.pipeline.truth import (
     HeadDemo,
     NamingErrors,
@@ -181,6 +183,7 @@ class _Run:
     progress: Progress
     command: tuple[str, ...]
     seconds: dict[str, float] = field(default_factory=dict)
+    _coming: list[Iterator[tuple[TwinScene, ScanSource]]] = field(default_factory=list)
 
     def timed(self, stage: str, work: Callable[[], Result]) -> Result:
         """Do the work and note how long it took; parts of one stage are added up."""
@@ -197,17 +200,40 @@ class _Run:
         """Folder of a recording."""
         return self.folder / RECORDINGS / scene
 
-    def record(self, scenes: Sequence[TwinScene]) -> None:
-        """Render scenes whose exposures are known before anything is calibrated."""
+    @contextmanager
+    def recording(self, *scenes: TwinScene) -> Iterator[None]:
+        """Render scenes whose exposures are known before anything is calibrated.
+
+        They come one after the other; see `recorded`.
+        """
         self.place("").mkdir()
-        record_scenes(
+        record_touches(self.place("probing"), self.twin)
+        coming = recorded_scenes(
             {scene: self.place(scene) for scene in scenes},
             self.request.twin,
             self.request.most_views,
             processes=self.request.processes,
             progress=self.progress,
+            meanwhile=partial(load_kernels, without=self._unused_kernels),
         )
-        record_touches(self.place("probing"), self.twin)
+        with closing(coming):
+            self._coming.append(coming)
+            yield
+            self.timed("render", lambda: deque(coming, 0))
+
+    @property
+    def _unused_kernels(self) -> tuple[str, ...]:
+        """Modules of kernels that the head's demo does not need."""
+        is_many = len(self.twin.truth.sheet_points_mm) > 1
+        return ("mesh_search",) if is_many else ("mesh_search", "naming")
+
+    def recorded(self, scene: TwinScene) -> Path:
+        """Wait until a scene is recorded; returns its folder."""
+        place = self.place(scene)
+        for coming in self._coming:
+            while not place.exists() and self.timed("render", partial(next, coming, None)):
+                pass
+        return place
 
     def scanned(self, scene: TwinScene, scanner: ScannerCalibration) -> FolderRecording:
         """Read a recording, or make it now, with lasers chosen by the labelling."""
@@ -282,8 +308,8 @@ def _check_head(request: DemoRequest) -> None:
 def calibrate_head(request: DemoRequest, folder: Path, progress: Progress = silent) -> Calibrated:
     """Record what the calibrations of a head rest on, and run their commands."""
     run = _Run(request, folder, request.twin.build(), progress, request.command("photos"))
-    run.record(CALIBRATION_SCENES)
-    return _calibrated(run)
+    with run.recording(*CALIBRATION_SCENES):
+        return _calibrated(run)
 
 
 def make_head_demo(
@@ -298,9 +324,9 @@ def make_head_demo(
     scans = (*SCANS, "waves") if is_many else SCANS
     # a head of several sources chooses its lasers while it scans; a still has all of them on
     known = () if len(twin.sources) > 1 else scans
-    run.timed("render", partial(run.record, (*CALIBRATION_SCENES, *known, "still-step")))
-    instrument = _calibrated(run)
-    demo = _measured(run, scans, instrument)
+    with run.recording(*CALIBRATION_SCENES, *known, "still-step"):
+        instrument = _calibrated(run)
+        demo = _measured(run, scans, instrument)
     return _written(run, demo, instrument.warnings), demo
 
 
@@ -319,14 +345,14 @@ def _calibrated(run: _Run) -> Calibrated:
     is_stereo = run.twin.truth.right_camera_parameters is not None
     camera = folder / ("stereo.json" if is_stereo else "camera.json")
     sensor, table, document = (folder / n for n in ("sensor.json", "plate.csv", "scanner.json"))
-    scan = run.place("camera")
+    scan = run.recorded("camera")
     calibrate = calibrate_stereo if is_stereo else calibrate_camera
     run.timed("calibrate_camera", partial(calibrate, run.job(camera), target, scan=scan))
-    images = SheetImages(scan=run.place("laser"))
+    images = SheetImages(scan=run.recorded("laser"))
     laser = partial(calibrate_sheets, run.job(sensor), camera, target, images)
     run.timed("calibrate_laser", laser)
     run.timed("probe_plate", partial(probe, run.job(table), run.place("probing")))
-    source = StripeSource(scans=(run.place("hand-eye"),), sensor=sensor)
+    source = StripeSource(scans=(run.recorded("hand-eye"),), sensor=sensor)
     hand_eye = partial(calibrate_hand_eye, run.job(document), source, Artefact(plate=table))
     found = run.timed("calibrate_hand_eye", hand_eye)
     plate, _ = read_plate(table, np.zeros(3))
@@ -340,6 +366,7 @@ def _measured(run: _Run, scenes: tuple[TwinScene, ...], instrument: Calibrated) 
     truth, sensor, scanner = run.twin.truth, instrument.sensor, instrument.scanner
     found: dict[TwinScene, ScanReconstruction] = {}
     for scene in scenes:
+        run.recorded(scene)
         source = run.timed(f"take_{scene}", partial(run.scanned, scene, scanner))
         measure = partial(measure_scan, source, scanner, progress=run.progress)
         found[scene] = run.timed(scene, measure)
@@ -347,6 +374,7 @@ def _measured(run: _Run, scenes: tuple[TwinScene, ...], instrument: Calibrated) 
         solved(inspect_step(found["steps"].cloud, height), "steps")
         for height in truth.step_heights_mm
     )
+    run.recorded("still-step")
     still, normal = run.timed("still_step", partial(_still_step, run, instrument, steps[0].normal))
     naming: dict[TwinScene, NamingErrors] = {}
     if len(truth.sheet_points_mm) > 1:
@@ -501,7 +529,8 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
     with demo_folder(request.folder) as folder:
         run = _Run(request, folder, twin, progress, request.command("photos"))
         write_files({folder / TRUTH: twin.truth.document()})
-        run.timed("render", partial(run.record, PHOTO_SCENES))
+        with run.recording(*PHOTO_SCENES):
+            pass
         boards, lines, still = (run.place(scene) / "images" for scene in PHOTO_SCENES)
         on, off, lit, dark = (
             *(lines / "on", lines / "off"),

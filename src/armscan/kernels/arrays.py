@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, cast
@@ -120,13 +120,16 @@ _WAITING: dict[str, Callable[[], Any]] = {}
 """What loads each kernel that was imported and is not loaded yet."""
 
 
-def load_kernels() -> dict[str, Exception]:
+def load_kernels(*, without: Collection[str] = ()) -> dict[str, Exception]:
     """Load, or compile, all kernels imported so far, for work that must not wait for them later.
 
-    Returns why a kernel failed, by its name; it fails again when it is called.
+    Those of the modules ``without`` are left, but what another kernel calls. Returns why a kernel
+    failed, by its name; it fails again when it is called.
     """
     failures = {}
     for name, load in list(_WAITING.items()):
+        if name.split(".")[-2] in without:
+            continue
         try:
             load()
         except Exception as error:

@@ -57,6 +57,8 @@ def in_processes(
     processes: int,
     prepare: Callable[..., None],
     given: tuple[Any, ...],
+    *,
+    meanwhile: Callable[[], object] | None = None,
 ) -> Generator[Result]:
     """Results of ``work`` on every item, in order.
 
@@ -73,6 +75,8 @@ def in_processes(
         How many share the work.
     prepare, given
         Called in every process first, with these arguments.
+    meanwhile
+        Called in this process when the others have begun, before their first result is waited for.
 
     Raises
     ------
@@ -87,6 +91,8 @@ def in_processes(
     try:
         with _deaf_children():
             waiting = deque(pool.submit(work, item) for item in items)
+        if meanwhile is not None:
+            meanwhile()
         while waiting:
             yield waiting.popleft().result()
     except BaseException as error:
@@ -121,8 +127,14 @@ def _deaf_children() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+_NICENESS = 5
+"""The process that calibrates from what others render is the one that must not wait for a core."""
+
+
 def _begin(listener: Connection, prepare: Callable[..., None], given: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform != "win32":
+        os.nice(_NICENESS)
     threading.Thread(target=_end_with, args=(listener,), daemon=True).start()
     # the processes share the cores already
     cv2.setNumThreads(1)
@@ -242,7 +254,12 @@ class Scenes:
         return encoded_png(source.exposure(row), setup)
 
 
-def rendered(name: TwinName, scenes: Scenes, processes: int) -> Generator[bytes]:
+def rendered(
+    name: TwinName,
+    scenes: Scenes,
+    processes: int,
+    meanwhile: Callable[[], object] | None = None,
+) -> Generator[bytes]:
     """PNG files of all rows of all scenes, in order.
 
     Processes take image after image, whatever scene it is of, so that none waits for another's
@@ -255,6 +272,8 @@ def rendered(name: TwinName, scenes: Scenes, processes: int) -> Generator[bytes]
         The twin, and what is wanted of it.
     processes
         Processes that render, if there are images enough; 1 renders in this one.
+    meanwhile
+        As for `in_processes`; not called where this process renders.
 
     Raises
     ------
@@ -268,7 +287,8 @@ def rendered(name: TwinName, scenes: Scenes, processes: int) -> Generator[bytes]
             yield scenes.png(scene, row)
         return
     given = (name, dict(scenes.most_views), get_context("spawn").Lock())
-    yield from in_processes(_render, rows, n_processes, _start_rendering, given)
+    start = (_start_rendering, given)
+    yield from in_processes(_render, rows, n_processes, *start, meanwhile=meanwhile)
 
 
 def _start_rendering(name: TwinName, most_views: MostViews, first: Lock) -> None:
@@ -286,7 +306,7 @@ def _render(row: tuple[TwinScene, int]) -> bytes:
 STAGE = "render images"
 
 
-def record_scenes(
+def recorded_scenes(
     folders: Mapping[TwinScene, Path],
     name: TwinName,
     most_views: MostViews | None = None,
@@ -294,10 +314,12 @@ def record_scenes(
     processes: int = 2,
     beside: Mapping[Path, bytes] | None = None,
     progress: Progress = silent,
-) -> dict[TwinScene, ScanSource]:
+    meanwhile: Callable[[], object] | None = None,
+) -> Generator[tuple[TwinScene, ScanSource]]:
     """Render scenes of a twin and write each as a recording: a folder, or one file ``NAME.mcap``.
 
-    Each recording is there complete or not at all.
+    Each recording is there complete or not at all. Those that come later are rendered while what is
+    there is worked with.
 
     Parameters
     ----------
@@ -314,11 +336,13 @@ def record_scenes(
         Files that belong to the recordings; they appear with the first one.
     progress
         Told of every image.
+    meanwhile
+        Called in this process when the others have begun; not where this one renders.
 
-    Returns
-    -------
-    dict
-        What was recorded, as the twin has it.
+    Yields
+    ------
+    tuple
+        Each scene when it is recorded, and what was recorded as the twin has it.
 
     Raises
     ------
@@ -335,14 +359,28 @@ def record_scenes(
     def report(done: int, _total: int, item: str) -> None:
         progress(ProgressEvent(STAGE, before + done, total, item))
 
-    with closing(rendered(name, scenes, processes)) as images:
+    with closing(rendered(name, scenes, processes, meanwhile)) as images:
         for scene, scan in scans.items():
             own = islice(images, len(scan.rows))
             files = beside if before == 0 else None
             write = record_source if _is_one_file(folders[scene]) else write_recording
             write(folders[scene], scan, report, encoded=own, beside=files)
             before += len(scan.rows)
-    return scans
+            yield scene, scan
+
+
+def record_scenes(
+    folders: Mapping[TwinScene, Path],
+    name: TwinName,
+    most_views: MostViews | None = None,
+    *,
+    processes: int = 2,
+    beside: Mapping[Path, bytes] | None = None,
+    progress: Progress = silent,
+) -> dict[TwinScene, ScanSource]:
+    """Record all scenes before going on, and tell what was recorded; see `recorded_scenes`."""
+    given = (folders, name, most_views)
+    return dict(recorded_scenes(*given, processes=processes, beside=beside, progress=progress))
 
 
 def record_touches(folder: Path, twin: Twin, beside: Mapping[Path, bytes] | None = None) -> int:

@@ -28,7 +28,7 @@ Three = tuple[float, float, float]
 compiled = njit(cache=True, error_model="numpy")
 
 
-@njit(types.void(_IMAGE_OUT, _IMAGE, _F32, _F32, _F32), cache=True)
+@njit(types.void(_IMAGE, _IMAGE_OUT, _F32, _F32, _F32), cache=True)
 def expose(
     light: NDArray[np.float32],
     noise: NDArray[np.float32],
@@ -36,7 +36,7 @@ def expose(
     read_square: float,
     full_scale: float,
 ) -> None:
-    """Turn light (H, W), parts of full scale, into grey levels, in place.
+    """Turn light (H, W), parts of full scale, into grey levels, in place of the noise.
 
     ``noise`` (H, W) is standard normal; shot noise has a variance of ``per_electron`` a level of an
     8-bit image, the rest of ``read_square``.
@@ -48,7 +48,7 @@ def expose(
             grey = light[v, u] * level
             sigma = np.sqrt(max(grey, nothing) * per_electron + read_square)
             found = np.rint((grey + sigma * noise[v, u]) * gain)
-            light[v, u] = min(max(found, nothing), full_scale)
+            noise[v, u] = min(max(found, nothing), full_scale)
 
 
 @njit(
@@ -160,49 +160,51 @@ def disc_cells(
                     cells[SUBPIXELS * i + b, SUBPIXELS * j + a] = share * np.float32(count)
 
 
-@njit(types.void(_BYTES, _BYTES, _FLOATS, _IMAGE_OUT), cache=True)
-def blur_where(
-    mask: NDArray[np.uint8],
-    wanted: NDArray[np.uint8],
-    kernel: NDArray[np.float64],
-    blurred: NDArray[np.float32],
-) -> None:
-    """Write a mask (H, W), 255 for 1, and where it is wanted its blur; borders repeat."""
-    height, width = mask.shape
-    reach = len(kernel) // 2
-    for v in range(height):
-        for u in range(width):
-            if not wanted[v, u]:
-                blurred[v, u] = np.float32(mask[v, u] * (1.0 / 255.0))
-                continue
-            total = 0.0
-            for b in range(-reach, reach + 1):
-                row = min(max(v + b, 0), height - 1)
-                along = 0.0
-                for a in range(-reach, reach + 1):
-                    along += kernel[a + reach] * mask[row, min(max(u + a, 0), width - 1)]
-                total += kernel[b + reach] * along
-            blurred[v, u] = np.float32(total / 255.0)
-
-
-@njit(types.void(_IMAGE_OUT, _IMAGE, _IMAGE, _IMAGE, _F32, _F32), cache=True)
+@njit(
+    types.void(_IMAGE_OUT, types.int64[::1], _IMAGE, _IMAGE, _BYTES, _BYTES, _FLOATS, _F32, _F32),
+    cache=True,
+)
 def lay_over(
     below: NDArray[np.float32],
+    corner: NDArray[np.int64],
     tone: NDArray[np.float32],
     lamp: NDArray[np.float32],
-    cover: NDArray[np.float32],
+    mask: NDArray[np.uint8],
+    rim: NDArray[np.uint8],
+    kernel: NDArray[np.float64],
     dark: float,
     light: float,
 ) -> None:
     """Lay a lit print over an image (H, W), in place.
 
-    ``tone`` is its part of the light tone, ``lamp`` the light on it, ``cover`` how much of a pixel
-    it covers.
+    ``corner`` are the first column and row of the box (h, w) that it lies in; there ``tone`` is its
+    part of the light tone, and ``mask``, 255 for 1, how much of a pixel it covers: blurred where
+    ``rim`` says so, borders repeated. ``lamp`` (H, W) is the light on it.
     """
-    for v in range(below.shape[0]):
-        for u in range(below.shape[1]):
-            lit = (dark + (light - dark) * tone[v, u]) * lamp[v, u]
-            below[v, u] = cover[v, u] * lit + (np.float32(1.0) - cover[v, u]) * below[v, u]
+    height, width = mask.shape
+    reach = len(kernel) // 2
+    n = 2 * reach + 1
+    along, known = np.zeros((n, width)), np.full((n, width), -1)
+    for v in range(height):
+        for u in range(width):
+            if rim[v, u]:
+                total = 0.0
+                for b in range(-reach, reach + 1):
+                    row = min(max(v + b, 0), height - 1)
+                    k = row % n
+                    if known[k, u] != row:
+                        added = 0.0
+                        for a in range(-reach, reach + 1):
+                            added += kernel[a + reach] * mask[row, min(max(u + a, 0), width - 1)]
+                        along[k, u], known[k, u] = added, row
+                    total += kernel[b + reach] * along[k, u]
+                cover = np.float32(total / 255.0)
+            else:
+                cover = np.float32(mask[v, u] * (1.0 / 255.0))
+            y, x = corner[1] + v, corner[0] + u
+            if cover > 0.0:
+                lit = (dark + (light - dark) * tone[v, u]) * lamp[y, x]
+                below[y, x] = cover * lit + (np.float32(1.0) - cover) * below[y, x]
 
 
 @njit(types.void(_IMAGE, _BYTES, _BYTES, _F32, types.Array(types.uint8, 2, "C")), cache=True)
@@ -333,14 +335,14 @@ def add_fine_light(
 ) -> None:
     """Add the light of a tile, ``peak * exp(-reach**2 / 2)``, on its fine grid (2 h, 2 w).
 
-    ``tile`` is its first row and column. Between pixels both are interpolated, but there is no
-    light beside a pixel whose reach is ``far`` or of which nothing is known; at edges, numbered
-    from 1, the light of the cells is known.
+    ``tile`` is its first row and column; there may be no reach of some of its rows. Between pixels
+    both are interpolated, but there is no light beside a pixel whose reach is ``far`` or of which
+    nothing is known; at edges, numbered from 1, the light of the cells is known.
     """
     height, width = reach.shape
     quarter, rest = np.float32(0.25), np.float32(0.75)
     top, left = tile[0], tile[1]
-    for row in range(light.shape[0] // 2):
+    for row in range(max(-top, 0), min(light.shape[0] // 2, height - top)):
         for column in range(light.shape[1] // 2):
             v, u = top + row, left + column
             edge = edges[v, u]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import cv2
@@ -29,9 +29,9 @@ from armscan.simulation.objects.boards import (
 )
 from armscan.simulation.objects.rings import Marked, RingMarker, draw_markers
 from armscan.simulation.objects.shapes import Placed
-from armscan.simulation.optics.camera import expose_mono, with_ghost, with_halo
+from armscan.simulation.optics.camera import expose_mono, halo_rows, with_ghost, with_halo
 from armscan.simulation.optics.lasers import LaserSource, LineLaser, in_sources
-from armscan.simulation.optics.render import Imaging, Region, find_stripe, to_pixels
+from armscan.simulation.optics.render import Image32, Imaging, Region, find_stripe, to_pixels
 from armscan.simulation.optics.scene import Material, RoomLight, Scene, SceneObject, Surface
 from armscan.simulation.optics.stray_light import stray_lights
 from armscan.simulation.optics.stripe_light import PosedView, band_light, lit_pixels, look
@@ -205,19 +205,45 @@ def exposure_light(
     poses = [_eye_pose(eye, pose) for pose in base_from_sensor]
     views = [_view(eye, station, pose, region) for pose in poses]
     light = np.zeros((window.height_px, window.width_px), np.float32)
-    inside = _inside(window, region)
+    inside, lit = _inside(window, region), slice(0, 0)
     middle = len(views) // 2
     for source in in_sources(_seen_lasers(head, eye, settings.lasers)):
         stray = stray_lights(source, station.things, poses[middle], imaging)
         # What is stray is wide or faint: motion over the exposure does not show in it.
         for one, seen in ((source, views), *((one, [views[middle]]) for one in stray)):
-            line = band_light(seen, eye.camera, one, region, speckle=imaging.speckle, rng=rng)
-            light += line[inside]
-    light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
-    light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
+            first, line = band_light(
+                seen, eye.camera, one, region, speckle=imaging.speckle, rng=rng
+            )
+            lit = _joined(lit, _added(light, line[:, inside[1]], first - inside[0].start))
+    if lit.start < lit.stop:
+        share, sigma_px = imaging.detector.halo_share, imaging.detector.halo_sigma_px
+        lit = halo_rows(lit, len(light), sigma_px)
+        light[lit] = with_halo(light[lit], share, sigma_px)
+    if imaging.ghost_share > 0.0:
+        light, lit = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px), slice(None)
     brightness = imaging.ambient if settings.room_light is None else settings.room_light
     room = _room(eye, station, poses, views, region)[inside]
-    return np.asarray(cv2.scaleAdd(np.ascontiguousarray(room), brightness / len(views), light))
+    share = brightness / len(views)
+    result = np.multiply(room, np.float32(share))
+    result[lit] = cv2.scaleAdd(room[lit], share, light[lit])
+    return result
+
+
+def _added(light: Image32, line: Image32, top: int) -> slice:
+    """Add rows (K, W) to light (H, W) from row ``top`` on, and tell which rows these are."""
+    rows = slice(max(top, 0), max(min(top + len(line), len(light)), 0))
+    if rows.start < rows.stop:
+        light[rows] += line[rows.start - top : rows.stop - top]
+    return rows
+
+
+def _joined(rows: slice, others: slice) -> slice:
+    """The least span of rows that holds both."""
+    if others.start >= others.stop:
+        return rows
+    if rows.start >= rows.stop:
+        return others
+    return slice(min(rows.start, others.start), max(rows.stop, others.stop))
 
 
 def true_stripes(
@@ -302,7 +328,7 @@ def _room(
     """
     if station.markers or station.target is not None:
         both = zip(poses, views, strict=True)
-        return np.asarray(sum(_drawn(eye, station, pose, view, region) for pose, view in both))
+        return reduce(np.add, (_drawn(eye, station, pose, view, region) for pose, view in both))
     return to_pixels(np.asarray(sum(_room_nodes(v.scene, v, region) for v in views)), region)
 
 
@@ -321,7 +347,7 @@ def _drawn(
     if station.target is None:
         return coarse
     board = board_seen_from(station.target, pose)
-    return render_board(board, camera, view.scene.lamp, np.array(coarse))
+    return render_board(board, camera, view.scene.lamp, coarse)
 
 
 def seen_from(station: Station, base_from_sensor: Pose[Base, Any]) -> Scene:

@@ -15,6 +15,7 @@ from armscan.simulation.objects.body import free_form_part
 from armscan.simulation.objects.fixtures import made_workpiece
 from armscan.simulation.objects.mesh import Mesh
 from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, Wave, WavyPlate
+from armscan.simulation.optics import stripe_light
 from armscan.simulation.optics.lasers import TracedLight, in_sources
 from armscan.simulation.optics.render import Region
 from armscan.simulation.optics.scene import (
@@ -27,7 +28,13 @@ from armscan.simulation.optics.scene import (
     Surface,
 )
 from armscan.simulation.optics.stray_light import CentreSpot
-from armscan.simulation.optics.stripe_light import PosedView, look, shade
+from armscan.simulation.optics.stripe_light import (
+    PosedView,
+    lit_pixels,
+    look,
+    shade,
+    trace_sheet,
+)
 from armscan.simulation.station import Station, Target, seen_from
 
 HEAD = build_head("thesis-multi", "thesis", 3)
@@ -103,3 +110,26 @@ def test_loops_see_a_print_and_its_discs() -> None:
     turned: Pose[Base, Board] = Pose(np.diag([1.0, -1.0, -1.0]), np.array([-12.0, 9.0, 0.3]))
     floor = Floor(np.array([0.0, 0.0, -9.0]), np.array([0.1, 0.0, 1.0]), (0.4, 0.4, 0.4))
     check(view_of(Station((SceneObject("table", floor),), Target(pattern, turned))))
+
+
+@pytest.mark.parametrize("name", ["blocks", "ball"])
+def test_rows_that_light_cannot_reach_change_nothing(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    things = tuple(SceneObject(str(k), surface) for k, surface in enumerate(SHAPES[name]))
+    view, light = view_of(Station(things)), LIGHTS["one line"]
+    is_lit = lit_pixels(view.nodes, light, REGION)
+    is_lit[: REGION.height_px // 2] = 0
+    eye = (view, HEAD.camera, light, REGION, is_lit)
+    part = trace_sheet(*eye)
+    assert part.edges.any()
+    assert part.top > 0
+    assert len(part.reach) < 0.7 * REGION.height_px
+    monkeypatch.setattr(stripe_light, "_rows_around", lambda lit: slice(0, len(lit)))
+    whole = trace_sheet(*eye)
+    rows = slice(part.top, part.top + len(part.reach))
+    for of in ("reach", "peak", "edges"):
+        wanted, found = getattr(whole, of), getattr(part, of)
+        np.testing.assert_array_equal(found, wanted[rows])
+        assert np.count_nonzero(wanted) == np.count_nonzero(found)
+    np.testing.assert_array_equal(part.edge_light, whole.edge_light)

@@ -9,13 +9,17 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.simulation.objects.boards import (
     CirclePattern,
     Lighting,
+    PrintedBoard,
     illumination,
+    render_board,
     render_flat_target,
 )
 from armscan.simulation.optics.camera import RenderCamera
+from armscan.simulation.optics.scene import RoomLight
 from rigs.flat_prints import ChessboardPattern
 
 CAMERA = RenderCamera(1000.0, 1000.0, 150.3, 99.8, width_px=300, height_px=200, blur_sigma_px=0.8)
@@ -102,3 +106,25 @@ def test_the_back_of_the_print_is_refused() -> None:
     flipped = np.diag([1.0, -1.0, -1.0])
     with pytest.raises(InputError, match="back"):
         render_flat_target(CAMERA, ChessboardPattern(4, 3, 3.0), flipped, np.array([0, 0, 100.0]))
+
+
+@pytest.mark.parametrize("aside_mm", [-6.0, 4.0, 60.0])
+def test_discs_that_a_board_cuts_are_as_those_of_a_larger_one(aside_mm: float) -> None:
+    """What is drawn is the box around the board: some of each disc lies beyond that."""
+    pose: Pose[Sensor, Board] = Pose(np.eye(3), np.array([aside_mm, -4.0, 100.0]))
+    background = np.zeros((CAMERA.height_px, CAMERA.width_px), np.float32)
+    images = [
+        render_board(
+            PrintedBoard(CirclePattern(2, 2, 10.0, 9.0, margin_mm=margin), pose, 0.8, 0.1),
+            CAMERA,
+            RoomLight(),
+            background.copy(),
+        )
+        for margin in (0.0, 10.0)
+    ]
+    left, top = np.array([150.3, 99.8]) + 10.0 * np.array([aside_mm, -4.0])
+    inside = (slice(int(top) + 9, int(top) + 92), slice(max(int(left) + 9, 0), int(left) + 92))
+    np.testing.assert_array_equal(images[0][inside], images[1][inside])
+    is_seen = left < CAMERA.width_px
+    assert (images[0][inside].size > 0 and np.ptp(images[0][inside]) > 0.1) == is_seen
+    assert images[0].any() == is_seen

@@ -7,8 +7,22 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.simulation.optics.camera import Detector, expose_mono, with_ghost, with_halo
-from armscan.simulation.optics.render import Image32, Region, Speckle, between_nodes, enlarged
+from armscan.simulation.optics.camera import (
+    Detector,
+    RenderCamera,
+    expose_mono,
+    halo_rows,
+    with_ghost,
+    with_halo,
+)
+from armscan.simulation.optics.render import (
+    Image32,
+    PixelBox,
+    Region,
+    Speckle,
+    between_nodes,
+    enlarged,
+)
 from armscan.simulation.optics.stripe_light import speckle_piece
 
 
@@ -31,6 +45,18 @@ def test_a_halo_moves_light_symmetrically_and_loses_none() -> None:
     spread = np.sqrt(column @ (rows - centre) ** 2 / column.sum())
     assert spread == pytest.approx(np.sqrt(0.2) * 8.0, rel=0.05)
     assert with_halo(light, 0.0, 8.0) is light
+
+
+@pytest.mark.parametrize(("row", "height"), [(80, 160), (2, 160), (157, 160), (81, 161)])
+def test_a_halo_of_the_rows_around_a_line_is_that_of_the_image(row: int, height: int) -> None:
+    light = np.zeros((height, 242), np.float32)
+    light[row, 60:180] = 1.0
+    rows = halo_rows(slice(row, row + 1), height, 8.0)
+    whole = with_halo(light, 0.2, 8.0)
+    np.testing.assert_array_equal(with_halo(light[rows], 0.2, 8.0), whole[rows])
+    whole[rows] = 0.0
+    assert not whole.any()
+    assert height % 4 or rows != slice(0, height)
 
 
 def test_a_ghost_lies_mirrored_at_the_centre() -> None:
@@ -97,5 +123,19 @@ def test_values_between_nodes_lie_on_straight_lines() -> None:
         y, x = np.indices((5 * step, 8 * step)) / step
         pixels = between_nodes(nodes, step)[: 5 * step, : 8 * step]
         np.testing.assert_allclose(pixels, 3.0 * y - 2.0 * x, atol=1e-5)
+        np.testing.assert_array_equal(between_nodes(nodes, step, (8 * step, 5 * step)), pixels)
     cells = np.array([[1, 2], [3, 4]], np.uint8)
     np.testing.assert_array_equal(enlarged(cells, 3), np.kron(cells, np.ones((3, 3), np.uint8)))
+
+
+def test_a_box_of_pixels_is_cut_at_the_image() -> None:
+    camera = RenderCamera(1000.0, 1000.0, 0.0, 0.0, width_px=300, height_px=200)
+    places = np.array([[-5.5, 20.2], [40.7, 150.0]])
+    box = PixelBox.around(places, 3, camera)
+    assert box == PixelBox(0, 17, 45, 154)
+    assert box.shape == (137, 45)
+    whole, part = np.arange(200 * 300).reshape(200, 300), PixelBox(10, 30, 20, 60).cut(box)
+    seen = whole[box.within(PixelBox.of(camera))][part.within(box)]
+    np.testing.assert_array_equal(seen, whole[30:60, 10:20])
+    assert PixelBox.around(places - [900.0, 0.0], 3, camera).is_empty
+    assert PixelBox.around(places * np.nan, 3, camera) == PixelBox.of(camera)

@@ -19,12 +19,11 @@ from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.simulation.kernels import (
     SAMPLES,
     SUBPIXELS,
-    blur_where,
     disc_cells,
     lay_over,
 )
 from armscan.simulation.optics.camera import RenderCamera, blur_image, blur_kernel
-from armscan.simulation.optics.render import camera_rays
+from armscan.simulation.optics.render import PixelBox, camera_rays
 from armscan.simulation.optics.scene import MISS, RoomLight
 
 
@@ -348,7 +347,8 @@ def render_flat_target(
     light = Lighting() if lighting is None else lighting
     board = _BoardPlane.of(camera, rotation, translation_mm, _Print(pattern, substrate))
     span = light.light_level - light.dark_level
-    reflectance = _reflectance(board, light.surround)
+    whole = PixelBox.of(camera)
+    reflectance = _reflectance(board, light.surround, whole)
     levels = light.dark_level + span * reflectance.astype(np.float64)
     marks = pattern.marks_board_mm.copy()
     marks[:, 2] += substrate.height_mm(pattern, marks[:, 0], marks[:, 1])
@@ -377,41 +377,47 @@ class _Print:
     substrate: Substrate
 
 
-def _reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32]:
-    """(H, W) part of the light tone in each pixel, blurred by the lens."""
+def _reflectance(board: _BoardPlane, surround: float, box: PixelBox) -> NDArray[np.float32]:
+    """(H, W) part of the light tone in each pixel of a box, blurred by the lens."""
     camera, pattern = board.camera, board.print_.pattern
     if isinstance(pattern, CirclePattern) and board.print_.substrate == FLAT:
         is_endless = surround == float(not pattern.is_light_on_dark)
         if is_endless:
-            return _discs(camera, pattern, board)
+            return _discs(camera, pattern, board, box)
     fine = _fine_reflectance(board, surround)
-    return _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
+    whole = _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
+    return np.ascontiguousarray(whole[box.within(PixelBox.of(camera))])
 
 
-def _discs(camera: RenderCamera, pattern: CirclePattern, board: _BoardPlane) -> NDArray[np.float32]:
+def _discs(
+    camera: RenderCamera, pattern: CirclePattern, board: _BoardPlane, box: PixelBox
+) -> NDArray[np.float32]:
     """As `_reflectance`, disc by disc, of a print whose ground goes on beyond its border."""
-    tone = np.full((camera.height_px, camera.width_px), not pattern.is_light_on_dark, np.float32)
-    sign = np.float32(1.0 if pattern.is_light_on_dark else -1.0)
+    tone = np.full(box.shape, not pattern.is_light_on_dark, np.float32)
+    join = np.add if pattern.is_light_on_dark else np.subtract
     margin = int(np.ceil(_BLUR_REACH * camera.blur_sigma_px)) + 2
     lens, knots_x, knots_y = _lens_knots(camera)
     angle = 2.0 * np.pi * np.arange(_RIM_STEPS) / _RIM_STEPS
     radius = 0.5 * pattern.diameter_mm
     rim = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(_RIM_STEPS)], axis=1)
-    for centre in pattern.marks_board_mm:
-        pixels = board.project(centre + rim)
+    centres = pattern.marks_board_mm
+    rims = board.project((centres[:, None, :] + rim).reshape(-1, 3)).reshape(-1, _RIM_STEPS, 2)
+    kernel = blur_kernel(SUBPIXELS * camera.blur_sigma_px)
+    for centre, pixels in zip(centres, rims, strict=True):
         if not np.isfinite(pixels).all():
             continue
-        left, top = np.floor(pixels.min(axis=0)).astype(int) - margin
-        right, bottom = np.ceil(pixels.max(axis=0)).astype(int) + margin + 1
-        left, top = max(int(left), 0), max(int(top), 0)
-        right, bottom = min(int(right), camera.width_px), min(int(bottom), camera.height_px)
-        if left >= right or top >= bottom:
+        own = PixelBox.around(pixels, margin, camera)
+        height, width = own.shape
+        inside = own.cut(box)
+        if inside.is_empty:
             continue
-        cells = np.zeros((SUBPIXELS * (bottom - top), SUBPIXELS * (right - left)), np.float32)
+        cells = np.zeros((SUBPIXELS * height, SUBPIXELS * width), np.float32)
         disc = np.array([centre[0], centre[1], radius])
-        disc_cells(disc, left, top, lens, knots_x, knots_y, board.board_from_ray, cells)
-        cover = _bin(blur_image(cells, SUBPIXELS * camera.blur_sigma_px))
-        tone[top:bottom, left:right] += sign * cover
+        disc_cells(disc, own.left, own.top, lens, knots_x, knots_y, board.board_from_ray, cells)
+        blurred = cv2.sepFilter2D(cells, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+        cover = _bin(np.asarray(blurred, dtype=np.float32))
+        part = tone[inside.within(box)]
+        join(part, cover[inside.within(own)], out=part)
     return tone
 
 
@@ -606,9 +612,17 @@ def render_board(
     pose = board.sensor_from_board
     print_ = _Print(board.pattern, board.substrate)
     plane = _BoardPlane.of(camera, pose.rotation, pose.translation_mm, print_)
-    tone = _reflectance(plane, 1.0)
-    lit, cover = _lamp_on_board(board, camera, lamp), _coverage(board, camera)
-    lay_over(background, tone, lit, cover, board.dark, board.light)
+    outline, kernel = outline_px(board, camera), blur_kernel(camera.blur_sigma_px)
+    thickness = len(kernel) + 5
+    box = PixelBox.around(outline, 2 * thickness, camera)
+    if box.is_empty:
+        return background
+    mask, rim = np.zeros(box.shape, np.uint8), np.zeros(box.shape, np.uint8)
+    corners = np.rint((outline - box.corner_px) * (1 << _OUTLINE_BITS)).astype(np.int32)
+    cv2.fillPoly(mask, [corners], (255,), lineType=cv2.LINE_AA, shift=_OUTLINE_BITS)
+    cv2.polylines(rim, [corners], True, (1,), thickness=thickness, shift=_OUTLINE_BITS)
+    tone, lit = _reflectance(plane, 1.0, box), _lamp_on_board(board, camera, lamp)
+    lay_over(background, box.corner_px, tone, lit, mask, rim, kernel, board.dark, board.light)
     return background
 
 
@@ -623,28 +637,12 @@ def outline_px(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
     return camera.project(rim @ pose.rotation[:, :2].T + pose.translation_mm)
 
 
-def _coverage(board: PrintedBoard, camera: RenderCamera) -> NDArray[np.float32]:
-    """(H, W) part of each pixel that the board covers, blurred by the lens."""
-    shape = (camera.height_px, camera.width_px)
-    mask, rim = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-    outline = np.rint(outline_px(board, camera) * (1 << _OUTLINE_BITS)).astype(np.int32)
-    cv2.fillPoly(mask, [outline], (255,), lineType=cv2.LINE_AA, shift=_OUTLINE_BITS)
-    kernel = blur_kernel(camera.blur_sigma_px)
-    cv2.polylines(rim, [outline], True, (1,), thickness=len(kernel) + 5, shift=_OUTLINE_BITS)
-    cover = np.zeros(shape, np.float32)
-    blur_where(mask, rim, kernel, cover)
-    return cover
-
-
 def _lamp_on_board(
     board: PrintedBoard, camera: RenderCamera, lamp: RoomLight
 ) -> NDArray[np.float32]:
     """(H, W) light on the board's plane, from a coarse grid: it changes slowly."""
     pose, up = board.sensor_from_board, -board.sensor_from_board.rotation[:, 2]
-    height, width = camera.height_px // _COARSE_STEP_PX, camera.width_px // _COARSE_STEP_PX
-    rows, columns = np.indices((height, width))
-    cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-    rays = camera_rays(camera, (cells + 0.5) * _COARSE_STEP_PX - 0.5, _KNOT_TOLERANCE)
+    rays, (height, width) = _coarse_rays(camera)
     with np.errstate(divide="ignore"):
         away = (pose.translation_mm @ up) / (rays @ up)
     to_lamp = lamp.position_mm - np.where(away > 0.0, away, 0.0)[:, None] * rays
@@ -654,3 +652,12 @@ def _lamp_on_board(
     size = (camera.width_px, camera.height_px)
     fine = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
     return np.asarray(fine, dtype=np.float32)
+
+
+@lru_cache(maxsize=8)
+def _coarse_rays(camera: RenderCamera) -> tuple[FloatArray, tuple[int, int]]:
+    """(N, 3) unit rays of the middles of coarse cells, and how many there are down and across."""
+    shape = (camera.height_px // _COARSE_STEP_PX, camera.width_px // _COARSE_STEP_PX)
+    rows, columns = np.indices(shape)
+    cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+    return camera_rays(camera, (cells + 0.5) * _COARSE_STEP_PX - 0.5, _KNOT_TOLERANCE), shape

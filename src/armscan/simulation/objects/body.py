@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
 from armscan.geometry.poses import Part, Pose, Sensor
+from armscan.simulation.kernels import Three, compiled
 from armscan.simulation.optics.scene import OneColour
 
 LIMB_COLUMNS = 12
@@ -28,8 +29,8 @@ LEAST_STRIDE_MM = 0.02
 _INPUT = types.Array(types.float64, 2, "C", readonly=True)
 _RESULT = types.float64[::1]
 _CROSSED_SIGNATURE = (
-    "Tuple((int64, float64, float64))(Array(float64, 1, 'C', True), Array(float64, 2, 'C', True), "
-    "Array(float64, 2, 'C', True), int64[::1])"
+    "Tuple((int64, float64, float64))(UniTuple(float64, 3), UniTuple(float64, 3), "
+    "Array(float64, 2, 'C', True), Array(float64, 2, 'C', True), int64[::1])"
 )
 
 
@@ -74,7 +75,8 @@ def distances(
 
 @njit(_CROSSED_SIGNATURE, cache=True)
 def _crossed(
-    ray: NDArray[np.float64],
+    start: Three,
+    ray: Three,
     limbs: NDArray[np.float64],
     balls: NDArray[np.float64],
     crossed: NDArray[np.int64],
@@ -82,8 +84,8 @@ def _crossed(
     """Write the limbs whose balls a ray crosses; count, first entry and last exit."""
     count, near, far = 0, np.inf, -np.inf
     for k in range(balls.shape[0]):
-        vx, vy, vz = balls[k, 0] - ray[0], balls[k, 1] - ray[1], balls[k, 2] - ray[2]
-        middle = vx * ray[3] + vy * ray[4] + vz * ray[5]
+        vx, vy, vz = balls[k, 0] - start[0], balls[k, 1] - start[1], balls[k, 2] - start[2]
+        middle = vx * ray[0] + vy * ray[1] + vz * ray[2]
         half2 = balls[k, 3] ** 2 - (vx * vx + vy * vy + vz * vz - middle * middle)
         if half2 > 0.0:
             crossed[count] = k
@@ -107,30 +109,31 @@ def _stride(gap: float, slope: float) -> float:
 
 
 @njit(
-    "float64(Array(float64, 1, 'C', True), Array(float64, 2, 'C', True), "
+    "float64(UniTuple(float64, 3), UniTuple(float64, 3), Array(float64, 2, 'C', True), "
     "Array(float64, 2, 'C', True), float64, int64[::1])",
     cache=True,
 )
 def marched(
-    ray: NDArray[np.float64],
+    start: Three,
+    ray: Three,
     limbs: NDArray[np.float64],
     balls: NDArray[np.float64],
     tolerance: float,
     room: NDArray[np.int64],
 ) -> float:
-    """Distance along a ray (6,), origin and unit direction, to the body; infinite for none.
+    """Distance along a ray, from a start in a unit direction, to the body; infinite for none.
 
     ``balls`` (K, 4), centre and radius, hold each limb and all that its blend reaches: a ray that
-    misses a ball need not ask that limb. ``room`` (K,) is written over.
+    misses a ball need not ask that limb. ``room`` (K,) or more is written over.
     """
-    count, t, far = _crossed(ray, limbs, balls, room)
+    count, t, far = _crossed(start, ray, limbs, balls, room)
     crossed = room[:count]
     t = max(t, 0.0)
     step, last_gap = 0.0, np.inf
     for _ in range(MAX_STEPS):
         if t > far:
             break
-        x, y, z = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
+        x, y, z = start[0] + t * ray[0], start[1] + t * ray[1], start[2] + t * ray[2]
         gap = distance(x, y, z, limbs, crossed)
         slope = (last_gap - gap) / step if step != 0.0 else 0.0
         last_gap = gap
@@ -141,7 +144,7 @@ def marched(
     return np.inf
 
 
-@njit(types.void(_INPUT, _INPUT, _INPUT, types.float64, _RESULT), cache=True)
+@compiled
 def march(
     rays: NDArray[np.float64],
     limbs: NDArray[np.float64],
@@ -152,7 +155,8 @@ def march(
     """Walk along rays (N, 6) until the body is ``tolerance`` near; see `marched`."""
     room = np.zeros(limbs.shape[0], np.int64)
     for i in range(rays.shape[0]):
-        travelled[i] = marched(rays[i], limbs, balls, tolerance, room)
+        start, ray = (rays[i, 0], rays[i, 1], rays[i, 2]), (rays[i, 3], rays[i, 4], rays[i, 5])
+        travelled[i] = marched(start, ray, limbs, balls, tolerance, room)
 
 
 HIT_MM = 1e-5

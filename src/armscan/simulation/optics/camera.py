@@ -179,6 +179,18 @@ def with_halo(light: Image32, share: float, sigma_px: float) -> Image32:
     return np.asarray(cv2.addWeighted(light, 1.0 - share, _wide(light, sigma_px), share, 0.0))
 
 
+def halo_rows(lit: slice, height: int, sigma_px: float) -> slice:
+    """Rows of an image that the halo of lit rows reaches; `with_halo` needs no others.
+
+    They hold whole cells of the halo's grid, or are all.
+    """
+    if lit.start >= lit.stop or height % _HALO_CELL_PX:
+        return slice(0, height)
+    cells = len(blur_kernel(sigma_px / _HALO_CELL_PX)) // 2 + 2
+    top, stop = lit.start // _HALO_CELL_PX - cells, -(-lit.stop // _HALO_CELL_PX) + cells
+    return slice(max(_HALO_CELL_PX * top, 0), min(_HALO_CELL_PX * stop, height))
+
+
 def with_ghost(light: Image32, share: float, sigma_px: float) -> Image32:
     """Add a share of light (H, W) mirrored at the image's centre and blurred."""
     if share == 0.0:
@@ -191,9 +203,9 @@ def expose_mono(light: Image32, detector: Detector, rng: np.random.Generator) ->
     """Grey levels of light (H, W), parts of full scale: shot and read noise, clipping, bits."""
     if not 1 <= detector.bits <= 16:
         raise InputError(f"{detector.bits} bits do not fit into 16")
-    levels = light.astype(np.float32)
-    noise, full_scale = rng.standard_normal(light.shape, np.float32), (1 << detector.bits) - 1
-    expose(levels, noise, 1.0 / detector.electrons_per_level, detector.read_noise**2, full_scale)
+    levels, full_scale = rng.standard_normal(light.shape, np.float32), (1 << detector.bits) - 1
+    shone = np.ascontiguousarray(light, dtype=np.float32)
+    expose(shone, levels, 1.0 / detector.electrons_per_level, detector.read_noise**2, full_scale)
     return levels.astype(np.uint8) if detector.bits <= 8 else levels.astype(np.uint16)
 
 

@@ -236,13 +236,67 @@ class Region:
         return np.asarray(pixels + np.array([self.x_px, self.y_px]))
 
 
-def between_nodes(nodes: Image32, step_px: int) -> Image32:
-    """(step H, step W) pixels between nodes (H, W), each of which is the pixel of its block."""
+@dataclass(frozen=True, slots=True)
+class PixelBox:
+    """A rectangle of an image, from its first column and row to those behind its last."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @staticmethod
+    def of(camera: RenderCamera) -> PixelBox:
+        """The whole image."""
+        return PixelBox(0, 0, camera.width_px, camera.height_px)
+
+    @staticmethod
+    def around(pixels_px: FloatArray, margin_px: int, camera: RenderCamera) -> PixelBox:
+        """The part of an image that holds pixels (N, 2) with a margin; all if one is not known."""
+        whole = PixelBox.of(camera)
+        if not np.isfinite(pixels_px).all():
+            return whole
+        left, top = (np.floor(pixels_px.min(axis=0)) - margin_px).astype(int)
+        right, bottom = (np.ceil(pixels_px.max(axis=0)) + margin_px + 1).astype(int)
+        return PixelBox(int(left), int(top), int(right), int(bottom)).cut(whole)
+
+    def cut(self, other: PixelBox) -> PixelBox:
+        """What lies in another too; empty if nothing does."""
+        left, top = max(self.left, other.left), max(self.top, other.top)
+        right, bottom = min(self.right, other.right), min(self.bottom, other.bottom)
+        return PixelBox(left, top, max(left, right), max(top, bottom))
+
+    @property
+    def is_empty(self) -> bool:
+        """True without a pixel."""
+        return 0 in self.shape
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.bottom - self.top, self.right - self.left
+
+    @property
+    def corner_px(self) -> IntArray:
+        """(2,) its first column and row."""
+        return np.array([self.left, self.top])
+
+    def within(self, other: PixelBox) -> tuple[slice, slice]:
+        """Rows and columns of an image of another that holds it."""
+        rows = slice(self.top - other.top, self.bottom - other.top)
+        return rows, slice(self.left - other.left, self.right - other.left)
+
+
+def between_nodes(nodes: Image32, step_px: int, size_px: tuple[int, int] | None = None) -> Image32:
+    """(step H, step W) pixels between nodes (H, W), each of which is the pixel of its block.
+
+    Only the first ``size_px``, width and height, of these if it is given.
+    """
     step = 1.0 / step_px
     pixels = cv2.warpAffine(
         nodes,
         np.array([[step, 0.0, 0.0], [0.0, step, 0.0]]),
-        (step_px * nodes.shape[1], step_px * nodes.shape[0]),
+        size_px or (step_px * nodes.shape[1], step_px * nodes.shape[0]),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
@@ -251,7 +305,7 @@ def between_nodes(nodes: Image32, step_px: int) -> Image32:
 
 def to_pixels(nodes: Image32, region: Region) -> Image32:
     """(H, W) values of a region's pixels between those of its coarse grid."""
-    return between_nodes(nodes, COARSE_STEP_PX)[: region.height_px, : region.width_px]
+    return between_nodes(nodes, COARSE_STEP_PX, (region.width_px, region.height_px))
 
 
 def enlarged(cells: NDArray[np.uint8], step_px: int) -> NDArray[np.uint8]:

@@ -119,10 +119,12 @@ class PosedView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetImage:
-    """One laser seen from one pose.
+    """One laser seen from one pose, in the rows of a region that its light may reach.
 
     Parameters
     ----------
+    top
+        The first of these rows.
     reach, peak
         (H, W) distance from the sheet's centre in sigmas, and light were it zero; both are zero
         where no light comes near, and no reach is beyond `FAR_SIGMAS`.
@@ -130,15 +132,13 @@ class SheetImage:
         (H, W) for pixels at edges the row of ``edge_light``, counted from 1, else 0.
     edge_light
         (E, SUBPIXELS, SUBPIXELS) light of these.
-    is_lit
-        (H, W) pixels that were traced.
     """
 
+    top: int
     reach: Image32
     peak: Image32
     edges: NDArray[np.int32]
     edge_light: Image32
-    is_lit: BoolArray
 
 
 def look(
@@ -155,31 +155,50 @@ def look(
 
 
 def trace_sheet(
-    view: PosedView, camera: RenderCamera, light: TracedLight, region: Region
+    view: PosedView, camera: RenderCamera, light: TracedLight, region: Region, is_lit: Bytes
 ) -> SheetImage:
-    """Trace what a light may reach in a region.
+    """Trace what a light may reach in a region: its `lit_pixels` (H, W).
 
     Every second pixel of every second row is traced, and each where interpolation will not do.
     """
-    eye = (view, camera, light)
-    is_lit = lit_pixels(view.nodes, light, region)
+    eye, rows = (view, camera, light), _rows_around(is_lit)
+    is_lit, corner = is_lit[rows], np.array([rows.start, 0])
+
+    def shaded(at: tuple[IntArray, ...], stride_px: int) -> tuple[FloatArray, FloatArray]:
+        v, u = (stride_px * k + first for k, first in zip(at, corner, strict=True))
+        return shade(*eye, region.pixels_px(v, u))
+
     near = _dilated(is_lit, _AROUND)
     known = np.ascontiguousarray(near[::STRIDE_PX, ::STRIDE_PX])
     half_reach, half_peak = np.zeros(known.shape, np.float32), np.zeros(known.shape, np.float32)
     at = np.nonzero(known.view(np.bool_))
-    half_reach[at], half_peak[at] = shade(*eye, region.pixels_px(*(STRIDE_PX * k for k in at)))
+    half_reach[at], half_peak[at] = shaded(at, STRIDE_PX)
     reach, peak = np.zeros(is_lit.shape, np.float32), np.zeros(is_lit.shape, np.float32)
     fill_between(half_reach, half_peak, known, FAR_SIGMAS, reach, peak)
     rough = enlarged(_rough(half_reach, half_peak, known, STRIDE_PX), STRIDE_PX)
     traced = _dilated(rough, _SQUARE) & _dilated(is_lit, _SQUARE)
     at = np.nonzero(traced.view(np.bool_))
-    reach[at], peak[at] = shade(*eye, region.pixels_px(*at))
+    reach[at], peak[at] = shaded(at, 1)
     found = _rough(reach, peak, near, 1) & cv2.erode(is_lit, _SQUARE).astype(np.uint8, copy=False)
     at = np.nonzero(found.view(np.bool_))
     edges = np.zeros(is_lit.shape, np.int32)
     edges[at] = np.arange(1, len(at[0]) + 1)
-    cells = _cells_light(view, camera, light, region.pixels_px(*at))
-    return SheetImage(reach, peak, edges, cells, is_lit.view(np.bool_))
+    pixels = region.pixels_px(at[0] + rows.start, at[1])
+    cells = _cells_light(view, camera, light, pixels)
+    return SheetImage(rows.start, reach, peak, edges, cells)
+
+
+def _rows_around(is_lit: Bytes) -> slice:
+    """Rows of an image (H, W) with what is lit in it, and more than is asked around that.
+
+    They begin and end where the coarse samples do.
+    """
+    lit = np.flatnonzero(is_lit.any(axis=1))
+    if len(lit) == 0:
+        return slice(0, STRIDE_PX)
+    step = 2 * STRIDE_PX
+    top, bottom = int(lit[0]) - 2 * _RIM_PX, int(lit[-1]) + 1 + 2 * _RIM_PX
+    return slice(max(top // step * step, 0), min(-(-bottom // step) * step, len(is_lit)))
 
 
 def _dilated(marks: Bytes, around: Bytes) -> Bytes:
@@ -257,13 +276,27 @@ def band_light(
     *,
     speckle: Speckle,
     rng: np.random.Generator,
-) -> Image32:
-    """Light (H, W) of one source in a region, parts of full scale, blurred; mean over the views."""
-    sheets = [trace_sheet(view, camera, source, region) for view in views]
-    is_lit = np.logical_or.reduce([sheet.is_lit for sheet in sheets])
-    light = np.zeros(is_lit.shape, np.float32)
+) -> tuple[int, Image32]:
+    """Light (H, W) of one source in a region, parts of full scale, blurred; mean over the views.
+
+    Of the rows that it reaches, and the first of them.
+    """
+    lit = [lit_pixels(view.nodes, source, region) for view in views]
+    sheets = [
+        trace_sheet(view, camera, source, region, own) for view, own in zip(views, lit, strict=True)
+    ]
+    is_lit = np.bitwise_or.reduce(lit).view(np.bool_)
     margin = int(np.ceil(BLUR_REACH * camera.blur_sigma_px)) + 1
-    for top in range(0, region.height_px, _TILE_ROWS):
+    rows = np.flatnonzero(is_lit.any(axis=1))
+    if len(rows) == 0:
+        return 0, np.zeros((0, region.width_px), np.float32)
+    first = max(int(rows[0]) - margin, 0) // _TILE_ROWS * _TILE_ROWS
+    stop = min(int(rows[-1]) + 1 + margin, region.height_px)
+    light = np.zeros(
+        (min(-(-stop // _TILE_ROWS) * _TILE_ROWS, region.height_px) - first, region.width_px),
+        np.float32,
+    )
+    for top in range(first, stop, _TILE_ROWS):
         for left in range(0, region.width_px, _TILE_COLUMNS):
             inner = _slices(is_lit, top, left, 0)
             outer = _slices(is_lit, top, left, margin)
@@ -275,9 +308,9 @@ def band_light(
             size = (fine.shape[1] // SUBPIXELS, fine.shape[0] // SUBPIXELS)
             tile = cv2.resize(blurred, size, interpolation=cv2.INTER_AREA)
             y, x = inner[0].start - outer[0].start, inner[1].start - outer[1].start
-            rows, columns = light[inner].shape
-            light[inner] = tile[y : y + rows, x : x + columns]
-    return light
+            own = light[inner[0].start - first : inner[0].stop - first, inner[1]]
+            own[:] = tile[y : y + own.shape[0], x : x + own.shape[1]]
+    return first, light
 
 
 def _slices(image: BoolArray, top: int, left: int, margin: int) -> tuple[slice, slice]:
@@ -290,8 +323,8 @@ def _fine(sheets: Sequence[SheetImage], where: tuple[slice, slice]) -> Image32:
     """Light of all sheets on the fine grid of a tile, added up."""
     rows, columns = (part.stop - part.start for part in where)
     light = np.zeros((SUBPIXELS * rows, SUBPIXELS * columns), np.float32)
-    tile = np.array([where[0].start, where[1].start])
     for sheet in sheets:
+        tile = np.array([where[0].start - sheet.top, where[1].start])
         add_fine_light(
             *(sheet.reach, sheet.peak, sheet.edges, sheet.edge_light, tile, FAR_SIGMAS, light)
         )

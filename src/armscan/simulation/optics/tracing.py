@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -52,20 +53,14 @@ from armscan.simulation.optics.scene import (
 from armscan.simulation.optics.stray_light import CentreSpot
 
 _BOX, _PLATE, _SPHERE, _WAVES, _BODY, _PRINT, _FLOOR, _MESH = range(8)
-_KIND, _TEXTURE, _CELLS, _GLOSS, _GLOSS_WIDTH, _COLOUR, _START, _STOP = (
-    0,
-    13,
-    14,
-    15,
-    16,
-    17,
-    18,
-    19,
-)
+_KIND, _TEXTURE, _CELLS, _GLOSS = 0, 13, 14, 15
+_GLOSS_WIDTH, _COLOUR, _START, _STOP = 16, 17, 18, 19
 """Columns of a surface's row; 1 to 9 are its rotation in the scene, 10 to 12 its place there."""
 _FIXED_POINT_STEPS = 400
 _SLANT_X, _SLANT_Y = SLANT
 _N_LENS, _N_SHEET = 9, 22
+
+Counts = NDArray[np.int64]
 
 
 @compiled
@@ -90,9 +85,19 @@ def _out_of(row: Floats, x: float, y: float, z: float) -> Three:
 
 @compiled
 def _meet(
-    row: Floats, data: Floats, limbs: Floats, balls: Floats, start: Three, ray: Three
+    row: Floats,
+    data: Floats,
+    limbs: Floats,
+    balls: Floats,
+    mesh: Floats | None,
+    spare: Counts,
+    start: Three,
+    ray: Three,
 ) -> float:
-    """Distance to one surface along a ray of the scene; infinite for none."""
+    """Distance to one surface along a ray of the scene; infinite for none.
+
+    ``mesh`` are the numbers of meshes; where there are none, what would meet them is not compiled.
+    """
     sx, sy, sz = _into(row, start[0] - row[10], start[1] - row[11], start[2] - row[12])
     own, along = (sx, sy, sz), _into(row, ray[0], ray[1], ray[2])
     kind, at = int(row[_KIND]), int(row[_START])
@@ -108,31 +113,42 @@ def _meet(
         return meet_print(data, at, own, along)
     if kind == _FLOOR:
         return meet_floor(data, at, own, along)
-    if kind == _MESH:
-        return meet_mesh(data, at, own, along)
-    line = np.array([own[0], own[1], own[2], along[0], along[1], along[2]])
+    if mesh is not None and kind == _MESH:
+        return meet_mesh(mesh, at, own, along)
     stop = int(row[_STOP])
-    room = np.zeros(stop - at, np.int64)
-    return float(marched(line, limbs[at:stop], balls[at:stop], HIT_MM, room))
+    return float(marched(own, along, limbs[at:stop], balls[at:stop], HIT_MM, spare[0]))
 
 
 @compiled
 def _first(
-    rows: Floats, data: Floats, limbs: Floats, balls: Floats, start: Three, ray: Three
+    rows: Floats,
+    data: Floats,
+    limbs: Floats,
+    balls: Floats,
+    mesh: Floats | None,
+    spare: Counts,
+    ray: Three,
 ) -> tuple[float, int]:
-    """Distance to the first surface, and which; infinite and -1 for none."""
+    """Distance from the camera to the first surface, and which; infinite and -1 for none."""
     nearest, index = np.inf, -1
     for k in range(rows.shape[0]):
-        reach = _meet(rows[k], data, limbs, balls, start, ray)
+        reach = _meet(rows[k], data, limbs, balls, mesh, spare, (0.0, 0.0, 0.0), ray)
         if reach < nearest:
             nearest, index = reach, k
     return nearest, index
 
 
 @compiled
-def _normal(row: Floats, data: Floats, limbs: Floats, x: float, y: float, z: float) -> Three:
+def _normal(
+    row: Floats,
+    data: Floats,
+    limbs: Floats,
+    mesh: Floats | None,
+    spare: Counts,
+    point: Three,
+) -> Three:
     """Outward unit normal of a surface at a point of it, both in the scene."""
-    px, py, pz = _into(row, x - row[10], y - row[11], z - row[12])
+    px, py, pz = _into(row, point[0] - row[10], point[1] - row[11], point[2] - row[12])
     kind, at = int(row[_KIND]), int(row[_START])
     nx, ny, nz = 0.0, 0.0, 1.0
     if kind == _PLATE:
@@ -147,8 +163,6 @@ def _normal(row: Floats, data: Floats, limbs: Floats, x: float, y: float, z: flo
         nz = -1.0
     elif kind == _FLOOR:
         nx, ny, nz = data[at + 3], data[at + 4], data[at + 5]
-    elif kind == _MESH:
-        nx, ny, nz = mesh_normal(data, at, px, py, pz)
     elif kind == _BOX:
         pz -= 0.5 * data[at + 2]
         beyond_x, beyond_y = abs(px) - 0.5 * data[at], abs(py) - 0.5 * data[at + 1]
@@ -160,14 +174,16 @@ def _normal(row: Floats, data: Floats, limbs: Floats, x: float, y: float, z: flo
             ny = -1.0 if py < 0.0 else 1.0
         else:
             nz = -1.0 if pz < 0.0 else 1.0
-    else:
+    elif kind == _BODY:
         own, nz, d = limbs[at : int(row[_STOP])], 0.0, GRADIENT_STEP_MM
-        every = np.arange(own.shape[0])
+        every = spare[1, : own.shape[0]]
         a = distance(px + d, py - d, pz - d, own, every)
         b = distance(px - d, py - d, pz + d, own, every)
         c = distance(px - d, py + d, pz - d, own, every)
         e = distance(px + d, py + d, pz + d, own, every)
         nx, ny, nz = a - b - c + e, -a - b + c + e, -a + b - c + e
+    elif mesh is not None:
+        nx, ny, nz = mesh_normal(mesh, at, px, py, pz)
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     return _out_of(row, nx / length, ny / length, nz / length)
 
@@ -239,29 +255,48 @@ def _trace(
     data: Floats,
     limbs: Floats,
     balls: Floats,
+    mesh: Floats | None,
+    spare: Counts,
     reach: Floats,
-    surface: NDArray[np.int64],
+    surface: Counts,
     points: Floats,
 ) -> None:
     """First hits of the rays of pixels (N, 2), from the origin."""
     bend = (0.0, 0.0)
     for i in range(pixels.shape[0]):
         ray, bend = _ray(lens, pixels[i, 0], pixels[i, 1], tolerance, bend)
-        reach[i], surface[i] = _first(rows, data, limbs, balls, (0.0, 0.0, 0.0), ray)
+        reach[i], surface[i] = _first(rows, data, limbs, balls, mesh, spare, ray)
         for k in range(3):
             points[i, k] = reach[i] * ray[k] if surface[i] >= 0 else np.nan
 
 
 @compiled
 def _is_seen(
-    rows: Floats, data: Floats, limbs: Floats, balls: Floats, source: Three, point: Three
+    rows: Floats,
+    data: Floats,
+    limbs: Floats,
+    balls: Floats,
+    mesh: Floats | None,
+    spare: Counts,
+    own: int,
+    source: Three,
+    point: Three,
+    normal: Three,
 ) -> bool:
-    """Whether nothing stands between a source and a point of a surface."""
+    """Whether nothing stands between a source and a point of a surface.
+
+    Where a surface without hollows faces the source, it does not shade its own.
+    """
     x, y, z = point[0] - source[0], point[1] - source[1], point[2] - source[2]
     away = math.sqrt(x * x + y * y + z * z)
     ray = (x / away, y / away, z / away)
+    kind = int(rows[own, _KIND])
+    is_clear = x * normal[0] + y * normal[1] + z * normal[2] < 0.0
+    is_clear = is_clear and kind not in (_WAVES, _BODY, _MESH)
     for k in range(rows.shape[0]):
-        if _meet(rows[k], data, limbs, balls, source, ray) < away - SHADOW_MARGIN_MM:
+        if k == own and is_clear:
+            continue
+        if _meet(rows[k], data, limbs, balls, mesh, spare, source, ray) < away - SHADOW_MARGIN_MM:
             return False
     return True
 
@@ -342,6 +377,8 @@ def _shade(
     data: Floats,
     limbs: Floats,
     balls: Floats,
+    mesh: Floats | None,
+    spare: Counts,
     pattern: Floats,
     lights: Floats,
     borders: Floats,
@@ -353,12 +390,12 @@ def _shade(
     bend = (0.0, 0.0)
     for i in range(pixels.shape[0]):
         ray, bend = _ray(lens, pixels[i, 0], pixels[i, 1], tolerance, bend)
-        away, index = _first(rows, data, limbs, balls, (0.0, 0.0, 0.0), ray)
+        away, index = _first(rows, data, limbs, balls, mesh, spare, ray)
         if index < 0:
             continue
         point = (away * ray[0], away * ray[1], away * ray[2])
         row = rows[index]
-        normal = _normal(row, data, limbs, point[0], point[1], point[2])
+        normal = _normal(row, data, limbs, mesh, spare, point)
         sheet = lights[_sheet_of(lights, borders, point[0], point[1], point[2])]
         if sheet[20] > 0.0:
             near, strength = _lit_by_spot(sheet, point, normal)
@@ -368,7 +405,7 @@ def _shade(
         if abs(near) >= far_sigmas or strength <= FAINTEST:
             continue
         source = (sheet[0], sheet[1], sheet[2])
-        if _is_seen(rows, data, limbs, balls, source, point):
+        if _is_seen(rows, data, limbs, balls, mesh, spare, index, source, point, normal):
             albedo = _reflectance(row, base, data, pattern, point[0], point[1], point[2])
             peak[i] = strength * (albedo + _glossy(row, source, point, normal))
 
@@ -376,29 +413,34 @@ def _shade(
 @compiled
 def _room(
     points: Floats,
-    surface: NDArray[np.int64],
+    surface: Counts,
     rows: Floats,
     base: Floats,
     data: Floats,
     limbs: Floats,
     balls: Floats,
+    mesh: Floats | None,
+    spare: Counts,
     pattern: Floats,
     lamp: Floats,
     radiance: Floats,
 ) -> None:
     """Red light of hits (N, 3) under a lamp: even, direct, place, direction of the even part."""
     for i in range(points.shape[0]):
-        if surface[i] < 0:
+        index = surface[i]
+        if index < 0:
             continue
-        row, point = rows[surface[i]], (points[i, 0], points[i, 1], points[i, 2])
-        normal = _normal(row, data, limbs, point[0], point[1], point[2])
+        row, point = rows[index], (points[i, 0], points[i, 1], points[i, 2])
+        normal = _normal(row, data, limbs, mesh, spare, point)
         light = lamp[5] * normal[0] + lamp[6] * normal[1] + lamp[7] * normal[2]
         light = lamp[0] * (2.0 + light) / 3.0
         source = (lamp[2], lamp[3], lamp[4])
         x, y, z = source[0] - point[0], source[1] - point[1], source[2] - point[2]
         facing = x * normal[0] + y * normal[1] + z * normal[2]
         cosine = facing / math.sqrt(x * x + y * y + z * z)
-        if cosine > 0.0 and _is_seen(rows, data, limbs, balls, source, point):
+        if cosine > 0.0 and _is_seen(
+            rows, data, limbs, balls, mesh, spare, index, source, point, normal
+        ):
             light += lamp[1] * cosine
         albedo = _reflectance(row, base, data, pattern, point[0], point[1], point[2])
         radiance[i] = light * albedo
@@ -429,6 +471,22 @@ class SceneNumbers:
     balls: Floats
     lamp: Floats
 
+    @property
+    def spare(self) -> Counts:
+        """(2, L) room in which the limbs that a ray crosses are noted, and the number of each."""
+        every = np.arange(len(self.limbs))
+        return np.stack([every, every])
+
+    @property
+    def mesh(self) -> Floats | None:
+        """The data if there are meshes among it."""
+        return self.data if (self.rows[:, _KIND] == _MESH).any() else None
+
+    @property
+    def _shapes(self) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats | None, Counts]:
+        bodies = (self.limbs, self.balls)
+        return self.rows, self.base, self.data, *bodies, self.mesh, self.spare
+
     @staticmethod
     def of(scene: Scene, finishes: tuple[Material, ...]) -> SceneNumbers | None:
         """None if a surface is none of those that the loops know."""
@@ -457,15 +515,15 @@ class SceneNumbers:
         """First hits of the rays of pixels (N, 2); see `Scene.trace`."""
         n = len(pixels)
         reach, surface, points = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 3))
-        own = (self.rows, self.data, self.limbs, self.balls)
+        own = (self.rows, self.data, self.limbs, self.balls, self.mesh, self.spare)
         _trace(_own(pixels), lens_of(camera), tolerance, *own, reach, surface, points)
         return Hits(reach, surface, points)
 
     def room_light(self, hits: Hits) -> FloatArray:
         """(N,) red light of hits under the lamp; see `Scene.room_light`."""
         light = np.zeros(len(hits.surface))
-        own = (self.rows, self.base, self.data, self.limbs, self.balls, texture_pattern())
-        _room(_own(hits.points_mm), hits.surface, *own, self.lamp, light)
+        own, pattern = self._shapes, texture_pattern()
+        _room(_own(hits.points_mm), hits.surface, *own, pattern, self.lamp, light)
         return light
 
     def shade(
@@ -479,9 +537,9 @@ class SceneNumbers:
     ) -> tuple[FloatArray, FloatArray]:
         """Reach and peak (N,) of a light at pixels (N, 2)."""
         reach, peak = np.full(len(pixels), far_sigmas), np.zeros(len(pixels))
-        own = (self.rows, self.base, self.data, self.limbs, self.balls, texture_pattern())
+        own, pattern = self._shapes, texture_pattern()
         shone = (light.rows, light.borders, far_sigmas)
-        _shade(_own(pixels), lens_of(camera), tolerance, *own, *shone, reach, peak)
+        _shade(_own(pixels), lens_of(camera), tolerance, *own, pattern, *shone, reach, peak)
         return reach, peak
 
 
@@ -612,10 +670,17 @@ def _in_powers(waves_mm: FloatArray | None) -> FloatArray:
     n = max(waves_mm.shape)
     square = np.zeros((n, n))
     square[: waves_mm.shape[0], : waves_mm.shape[1]] = waves_mm
+    powers = _cosine_powers(n)
+    return np.asarray(powers.T @ square @ powers)
+
+
+@cache
+def _cosine_powers(n: int) -> FloatArray:
+    """(n, n) factors of the powers of a cosine, for the cosine of each multiple of its angle."""
     powers = np.zeros((n, n))
     for k in range(n):
         powers[k, : k + 1] = np.polynomial.chebyshev.cheb2poly(np.eye(n)[k])[: k + 1]
-    return np.asarray(powers.T @ square @ powers)
+    return powers
 
 
 def _print_numbers(board: PrintedBoard, pattern: CirclePattern) -> list[float]:

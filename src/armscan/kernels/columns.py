@@ -99,7 +99,8 @@ def _widen(typing: Any, raw: Any, first: Any, factor: Any, levels: Any) -> tuple
             context.make_array(signature.args[k])(context, builder, args[k]).data for k in (0, 3)
         )
         where = builder.bitcast(builder.gep(source, [args[1]]), bytes_.as_pointer())
-        numbers = builder.uitofp(builder.zext(builder.load(where, align=1), whole), row)
+        # signed: what is unsigned has no instruction of its own
+        numbers = builder.sitofp(builder.zext(builder.load(where, align=1), whole), row)
         undefined = ir.Constant(row, ir.Undefined)
         at = ir.Constant(ir.IntType(32), 0)
         factors = builder.shuffle_vector(

@@ -18,6 +18,7 @@ from armscan.kernels.section import (
 from armscan.kernels.smoothing import find_pulls, take_out_bends
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, Profile, StripeFlag
+from armscan.vision.stripe.columns import extract_fast
 from armscan.vision.stripe.fit import ProfileFits, fit_ridge
 from armscan.vision.stripe.flags import (
     MERGED_SIGMAS,
@@ -46,6 +47,7 @@ from armscan.vision.stripe.ridge import (
     find_candidates,
     find_line_sigma,
     is_bright,
+    is_of_bytes,
     measure_level,
     trace_ridges,
 )
@@ -95,8 +97,12 @@ def extract_stripes(
         check_background(exposure, background)
     full_scale = exposure.full_scale / NORMAL_SCALE
     threshold = None if options.threshold is None else options.threshold / full_scale
-    if exposure.colour == "mono" and background is None and options.method == "fit":
-        return _find(exposure, *lit_plane(exposure, threshold), options, threshold)
+    if exposure.colour == "mono" and background is None:
+        if options.method == "fit":
+            return _find(exposure, *lit_plane(exposure, threshold), options, threshold)
+        if options.method == "fast" and is_of_bytes(exposure.image):
+            level = measure_level(exposure.image, threshold, 1.0 / full_scale)
+            return extract_fast(exposure, None, level, options)
     if exposure.colour == "mono":
         plane = mono_plane(exposure, background)
     else:
@@ -104,7 +110,10 @@ def extract_stripes(
     if background is not None and options.on_print and options.method == "fit":
         ground = relative_reflectance(background, options.laser_colour)
         plane = replace(plane, reflectance=ground)
-    return _find(exposure, plane, measure_level(plane.image, threshold), options, threshold)
+    level = measure_level(plane.image, threshold)
+    if options.method == "fast":
+        return extract_fast(exposure, plane, level, options)
+    return _find(exposure, plane, level, options, threshold)
 
 
 def _find(

@@ -28,7 +28,7 @@ from armscan.vision.stripe.ridge import (
     strong_median,
 )
 
-StripeMethod = Literal["fit", "threshold", "centroid", "template", "hessian"]
+StripeMethod = Literal["fit", "fast", "threshold", "centroid", "template", "hessian"]
 MaskImage: TypeAlias = NDArray[np.uint8]
 
 SIGMA_RANGE_PX = (0.6, 10.0)
@@ -43,7 +43,8 @@ class StripeOptions:
     Parameters
     ----------
     method
-        ``fit`` (noise-weighted profile fit, smoothed along the line) or one of the thesis's four.
+        ``fit`` (noise-weighted profile fit, smoothed along the line), ``fast`` (each column or row
+        by itself in few passes, for live scans) or one of the thesis's four.
     laser_colour
         What of a colour image shows the line: a channel of the laser's colour; ``grey``, the mean
         of all; an excess, a channel less the mean of the two others (``green-excess``); or a

@@ -168,7 +168,7 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
         )
     if len(dropped):
         around.leave_out(dropped)
-    inflation = np.array([_inflation(correlation, h) for h in half])
+    inflation = np.array([inflation_of(correlation, h) for h in half])
     result = around.fit_parabolas(inflation, course.sigma, float(correlation[0]))
     points, normals, sigma, _, is_used = course.rows
     moved, turned = np.zeros(points.shape), np.zeros(points.shape)
@@ -186,7 +186,7 @@ def bends(course: Polyline, asked: BoolArray) -> NDArray[np.float32]:
 
 
 @cache
-def _weights(half: int) -> FloatArray:
+def quadratic_weights(half: int) -> FloatArray:
     """Weights (2 half + 1,) of a uniform local quadratic at its centre."""
     k = np.arange(-half, half + 1, dtype=np.float64)
     design = np.stack([np.ones_like(k), k, k * k], axis=1)
@@ -195,9 +195,9 @@ def _weights(half: int) -> FloatArray:
     return weights
 
 
-def _inflation(correlation: FloatArray, half_px: float) -> float:
+def inflation_of(correlation: FloatArray, half_px: float) -> float:
     """Variance of a uniform local quadratic's centre, divided by its value for white noise."""
-    weights = _weights(max(int(half_px), 2))
+    weights = quadratic_weights(max(int(half_px), 2))
     overlap = np.correlate(weights, weights, "full")[len(weights) - 1 :][:LAGS]
     factor = np.where(np.arange(len(overlap)) == 0, 1.0, 2.0)
     shape = correlation[: len(overlap)] / correlation[0]
@@ -214,7 +214,7 @@ def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float |
     for half in SCATTER_HALVES:
         residual = _filter_residuals(course, half)
         if np.isfinite(residual).sum() >= LEAST_PAIRS:
-            share = 1.0 - _weights(half)[half]
+            share = 1.0 - quadratic_weights(half)[half]
             return float(np.sqrt(np.nanmean(residual**2) / share))
     return None
 
@@ -251,7 +251,7 @@ def noise_correlation(course: Polyline, half_px: float) -> FloatArray | None:
 @cache
 def _mixture(half: int) -> FloatArray:
     """(LAGS, LAGS) by which covariances of residuals are mixed of those of the noise."""
-    kernel = -_weights(half)
+    kernel = -quadratic_weights(half)
     kernel[half] += 1.0
     autocorrelation = np.correlate(kernel, kernel, "full")
     middle = len(autocorrelation) // 2
@@ -280,7 +280,7 @@ def _lag_products(residual: FloatArray, chain: IntArray) -> FloatArray | None:
 def _filter_residuals(course: Polyline, half: int) -> FloatArray:
     """Residuals over sigma from a uniform quadratic over 2 half + 1 places; NaN near ends."""
     residual, told = np.zeros(len(course)), np.zeros(len(course))
-    count = filter_residuals(*course.rows, _weights(half), residual, told)
+    count = filter_residuals(*course.rows, quadratic_weights(half), residual, told)
     limit = 5.0 * max(float(np.median(told[:count])), 0.3) if count else 0.0
     residual[np.abs(residual) > limit * MAD_TO_SIGMA] = np.nan
     return residual

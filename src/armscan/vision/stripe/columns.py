@@ -1,0 +1,547 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fast way from an image to stripe centres: each column or row by itself, in few passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.kernels.columns import (
+    AMPLITUDE,
+    BACK,
+    BEND,
+    BEND_GAIN,
+    BEND_VARIANCE,
+    CELL_PX,
+    CENTRE,
+    FIRST_ROWS,
+    HIGH_SIDE,
+    LEAN,
+    LEAN_NORM,
+    LOW_SIDE,
+    N_CLIPPED,
+    N_SIDES,
+    POINT_ABOVE,
+    POINT_BELOW,
+    POINT_CHAIN,
+    POINT_COLUMN,
+    POINT_COLUMNS,
+    POINT_HIGH,
+    POINT_LOW,
+    RUN_DIPS,
+    RUN_HEIGHT,
+    RUN_LENGTH,
+    RUN_ROWS,
+    SECOND_ROWS,
+    SIGMA,
+    SLOPE,
+    SMOOTH_ROWS,
+    SMOOTH_VARIANCE,
+    SMOOTHED,
+    STEEPEST,
+    VARIANCE,
+    cut_stretches,
+    find_column_runs,
+    fit_columns,
+    gather_chains,
+    link_columns,
+    look_across,
+    mark_ends,
+    mean_along,
+    measure_runs,
+    score_middles,
+    slopes_along,
+    smooth_stretches,
+    sort_by_column,
+)
+from armscan.kernels.section import (
+    BACKGROUND_STEP,
+    LEAST_SKEW,
+    NEIGHBOUR_SIGMAS,
+    SIGNIFICANT,
+    SKEW_PX,
+)
+from armscan.records.exposure import Exposure
+from armscan.records.profile import REJECTING, Profile, StripeFlag
+from armscan.vision.stripe.fit import start_noise
+from armscan.vision.stripe.flags import MERGED_SIGMAS, close_gaps
+from armscan.vision.stripe.image import NORMAL_SCALE, StripeOptions, StripePlane
+from armscan.vision.stripe.ridge import (
+    LONGEST_RUN_PX,
+    SHORTEST_PX,
+    SIGMA_LIMITS_PX,
+    FloatImage,
+    ImageLevel,
+)
+from armscan.vision.stripe.smooth import (
+    CONFIDENCE,
+    OUTLIER_SIGMAS,
+    WHITE,
+    Polyline,
+    inflation_of,
+    noise_correlation,
+    quadratic_weights,
+    windows,
+)
+
+MaskImage = NDArray[np.uint8]
+NO_BYTES = np.zeros((1, 1), np.uint8)
+NO_IMAGE = np.zeros((1, 1), np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pixels:
+    """The pixels of a plane, as the passes read them.
+
+    ``sought``: (H, W) bytes in which lines are sought, ``sought_unit`` of them to a level of full
+    scale 255. ``raw``: (H, W) bytes to be measured, ``unit`` to a level; (1, 1) where ``image``
+    holds them. ``image``: (H, W) float32 of full scale 255; (1, 1) where ``raw`` does.
+    ``clipped``: (H, W) 1 where the camera saturated, or (1, 1) where the level ``clip`` says so.
+    """
+
+    sought: MaskImage
+    sought_unit: float
+    raw: MaskImage
+    unit: float
+    image: FloatImage
+    clipped: MaskImage
+    clip: float
+
+    @classmethod
+    def of_bytes(cls, raw: MaskImage, full_scale: int) -> Pixels:
+        """A grey exposure of at most eight bits."""
+        unit = full_scale / NORMAL_SCALE
+        return cls(raw, unit, raw, unit, NO_IMAGE, NO_BYTES, NORMAL_SCALE * (1.0 - 1e-6))
+
+    @classmethod
+    def of_plane(cls, plane: StripePlane, brightest: float) -> Pixels:
+        """Any other plane; what is sought is stretched to eight bits."""
+        unit = (DARKEST_SOUGHT - 1.0) / max(brightest, 1.0)
+        sought = np.clip(plane.image * np.float32(unit), 0.0, 255.0).astype(np.uint8)
+        return cls(sought, unit, NO_BYTES, 1.0, plane.image, plane.clipped, np.inf)
+
+    @property
+    def transposed(self) -> Pixels:
+        """The same with rows and columns exchanged."""
+        turned = [
+            np.ascontiguousarray(cv2.transpose(one))
+            for one in (self.sought, self.raw, self.image, self.clipped)
+        ]
+        sought, raw, image, clipped = turned
+        return replace(self, sought=sought, raw=raw, image=image, clipped=clipped)
+
+    def wide_enough(self) -> Pixels:
+        """The same with dark columns beyond the border where there are fewer than are read."""
+        missing = CELL_PX - self.sought.shape[1]
+        if missing <= 0:
+            return self
+        wider = [
+            one if one.size == 1 else np.pad(one, ((0, 0), (0, missing)), mode="edge")
+            for one in (self.sought, self.raw, self.image, self.clipped)
+        ]
+        sought = wider[0].copy()
+        sought[:, -missing:] = 0
+        return replace(self, sought=sought, raw=wider[1], image=wider[2], clipped=wider[3])
+
+
+DARKEST_SOUGHT = 255.0
+MEAN_HALF = 8
+"""Neighbours over which width, height and background beside the line are averaged."""
+LEAST_RATIO = 1.3
+"""Of a line's height over the threshold, from which its width is told by the length of its runs."""
+CLEAR_SIGMAS = 3.0
+"""Rows that are free before another line, in sigmas: fewer are lit up by it."""
+CLEAR_RATIO = 3.0
+"""Of a line's height over the threshold: runs of fainter ones are parted by noise."""
+WIDER_SHARE = 1.6
+"""Of the lines' typical width: where it is wider, there are two."""
+MOST_SLOPE = 1.3
+TREND_HALF = 12
+"""Neighbours over which it is told whether a line is for the columns or for the rows."""
+MERGED_SHARE, MERGED_PX = 1.4, 3.0
+"""Runs that are longer than their neighbours by this hold more than one line."""
+LEAN_HALF = 4
+"""Neighbours over which the shape of the section is averaged."""
+OUTLIER_HALF = 5
+NORMAL_MEDIAN = 0.6745
+"""Median of the size of a normal number of variance 1."""
+LEAST_SIGMA_PX = 0.002
+"""What pixel locking and the shape of the profile leave without any noise."""
+MOST_MEASURED = 6000
+"""Points of which the correlation of neighbours is measured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColumnPoints:
+    """Centres of lines in the columns of an image, along their chains.
+
+    ``points``: (N, 6) of `armscan.kernels.columns.gather_chains`. ``table``: (8, N) of
+    `armscan.kernels.columns.fit_columns`. ``slope``: (N,) rows a column. ``trend``: (N,) the same
+    over more neighbours. ``sigma``: (N,) standard deviation of the centre down the column.
+    ``noise_length``: (N,) as in `Profile`. ``flags``: (N,) of `StripeFlag`.
+    """
+
+    points: NDArray[np.int32]
+    table: FloatArray
+    slope: FloatArray
+    trend: FloatArray
+    sigma: FloatArray
+    noise_length: FloatArray
+    flags: IntArray
+
+    def select(self, keep: BoolArray) -> ColumnPoints:
+        """The points where ``keep`` (N,) is True."""
+        if keep.all():
+            return self
+        at = np.flatnonzero(keep)
+        return ColumnPoints(
+            points=self.points[at],
+            table=self.table[:, at],
+            slope=self.slope[at],
+            trend=self.trend[at],
+            sigma=self.sigma[at],
+            noise_length=self.noise_length[at],
+            flags=self.flags[at],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Chains:
+    """Runs of lit pixels that follow each other from column to column.
+
+    ``points``: (N, 6) of `gather_chains`. ``start``: (C + 1,) where each chain begins.
+    ``left_out``: (rows, columns) 1 for cells with runs that are in none of them.
+    """
+
+    points: NDArray[np.int32]
+    start: IntArray
+    left_out: MaskImage
+
+    def mean(self, values: FloatArray, weight: FloatArray, half: int) -> FloatArray:
+        """Weighted means (M, N) over the neighbours of a chain; NaN where all weights are 0."""
+        mean = np.zeros(values.shape)
+        mean_along(values, weight, self.start, half, mean)
+        return mean
+
+
+def find_columns(
+    pixels: Pixels, level: ImageLevel, smoothing_px: float
+) -> tuple[ColumnPoints | None, MaskImage]:
+    """Centres in the columns of an image, and cells (rows, columns) with other lit pixels."""
+    chains = _find_chains(pixels, level)
+    points, start = chains.points, chains.start
+    if not len(points):
+        return None, chains.left_out
+    first, dips = _look(pixels, level, chains)
+    noise = start_noise(level.noise).astype(np.float32)
+    table = np.zeros((SECOND_ROWS, len(points)))
+    fit_columns(*_read(pixels), pixels.clipped, pixels.clip, points, first, noise, table)
+    height, width = pixels.sought.shape
+    # of a column that the border cuts, the run tells no middle
+    is_cut = (points[:, POINT_LOW] == 0) | (points[:, POINT_HIGH] == height - 1)
+    table[VARIANCE, is_cut] = 0.0
+    slope, trend = np.zeros(len(points)), np.zeros(len(points))
+    slopes_along(table[CENTRE], points, start, MEAN_HALF, slope)
+    slopes_along(table[CENTRE], points, start, TREND_HALF, trend)
+    near = _is_near_another(chains, table, slope, dips, level.rise)
+    flags = _flag(chains, table, first, near)
+    mark_ends(table, points, slope, start, height, width, int(StripeFlag.END), flags)
+    left_out = chains.left_out | _cells_of(points[np.abs(trend) > STEEPEST, :3], level.lit.shape)
+    found = ColumnPoints(
+        points=points,
+        table=table,
+        slope=slope,
+        trend=trend,
+        sigma=np.sqrt(table[VARIANCE]),
+        noise_length=np.ones(len(points)),
+        flags=flags,
+    )
+    return _smooth(chains, found, smoothing_px), left_out
+
+
+def _read(pixels: Pixels) -> tuple[MaskImage, FloatImage, float]:
+    return pixels.raw, pixels.image, pixels.unit
+
+
+def _find_chains(pixels: Pixels, level: ImageLevel) -> _Chains:
+    sought = pixels.sought
+    capacity = max(1000, sought.size // 64)
+    while True:
+        runs = np.zeros((capacity, 3), np.int32)
+        cells = (level.background, level.lit, level.rise, pixels.sought_unit)
+        count = find_column_runs(sought, *cells, runs)
+        if count <= capacity:
+            break
+        capacity = count
+    runs = runs[:count]
+    order, first = np.zeros(count, np.int64), np.zeros(sought.shape[1] + 1, np.int64)
+    sort_by_column(runs, order, first)
+    chain, size = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    n_chains = link_columns(runs, order, first, LONGEST_RUN_PX, chain, size)
+    size = size[:n_chains]
+    least = int(SHORTEST_PX)
+    kept = size >= least
+    points = np.zeros((int(size[kept].sum()), POINT_COLUMNS), np.int32)
+    start = np.zeros(int(kept.sum()) + 1, np.int64)
+    gather_chains(runs, order, chain, size, least, points, start)
+    is_kept = np.zeros(count, np.bool_)
+    is_kept[order] = (chain >= 0) & np.append(kept, False)[chain]
+    return _Chains(points, start, _cells_of(runs[~is_kept], level.lit.shape))
+
+
+def _cells_of(runs: NDArray[np.int32], shape: tuple[int, ...]) -> MaskImage:
+    """Cells (rows, columns) that runs (N, 3) of more than one pixel touch."""
+    runs = runs[runs[:, 2] > runs[:, 1]] // CELL_PX
+    change = np.zeros((shape[0] + 1, shape[1]), np.int64)
+    np.add.at(change, (runs[:, 1], runs[:, 0]), 1)
+    np.add.at(change, (runs[:, 2] + 1, runs[:, 0]), -1)
+    return (np.cumsum(change, axis=0)[:-1] > 0).astype(np.uint8)
+
+
+def _look(pixels: Pixels, level: ImageLevel, chains: _Chains) -> tuple[FloatArray, FloatArray]:
+    """Results (6, N) of the first pass, averaged along the lines, and which runs (N,) dip."""
+    n = len(chains.points)
+    base, measured = np.zeros(n), np.zeros((RUN_ROWS, n))
+    given = (level.background, level.rise, chains.points)
+    measure_runs(*_read(pixels), *given, base, measured)
+    mean = chains.mean(measured[:RUN_DIPS], np.ones((RUN_DIPS, n)), MEAN_HALF)
+    ratio = np.maximum(mean[RUN_HEIGHT] / level.rise, LEAST_RATIO)
+    sigma = mean[RUN_LENGTH] / (2.0 * np.sqrt(2.0 * np.log(ratio)))
+    low, high = SIGMA_LIMITS_PX
+    sigma = np.clip(sigma, low, high * np.hypot(1.0, STEEPEST))
+    first = np.zeros((FIRST_ROWS, n))
+    look_across(*_read(pixels), chains.points, sigma, base, first)
+    height, room = np.maximum(first[AMPLITUDE], 0.0), CLEAR_SIGMAS * sigma
+    has_sides = first[N_SIDES] > 0.0
+    weight = np.zeros((3, n))
+    weight[0] = height * height
+    weight[1] = (chains.points[:, POINT_BELOW] > room) & has_sides
+    weight[2] = (chains.points[:, POINT_ABOVE] > room) & has_sides
+    own, low_side, high_side = chains.mean(first[SIGMA : HIGH_SIDE + 1], weight, MEAN_HALF)
+    first[SIGMA] = np.where(np.isfinite(own), np.clip(own, low, 2.0 * high), sigma)
+    # a side that another line lights up takes the value of the other one
+    other = np.where(np.isnan(high_side), base, high_side)
+    first[LOW_SIDE] = np.where(np.isnan(low_side), other, low_side)
+    first[HIGH_SIDE] = np.where(np.isnan(high_side), first[LOW_SIDE], high_side)
+    is_lost = np.flatnonzero(height == 0.0)
+    first[AMPLITUDE, is_lost] = np.maximum(measured[RUN_HEIGHT, is_lost], 1.0)
+    first[CENTRE, is_lost] = 0.5 * chains.points[is_lost][:, [POINT_LOW, POINT_HIGH]].sum(axis=1)
+    return first, measured[RUN_DIPS] > 0.0
+
+
+def _is_near_another(
+    chains: _Chains, table: FloatArray, slope: FloatArray, dips: BoolArray, rise: float
+) -> BoolArray:
+    """(N,) True where another line is so near that it pulls the centre, or runs into this one."""
+    points, sigma = chains.points, table[SIGMA]
+    length = points[:, POINT_HIGH] - points[:, POINT_LOW] + 1.0
+    gap = np.minimum(points[:, POINT_BELOW], points[:, POINT_ABOVE])
+    # runs of faint lines fall apart by noise
+    near = (gap <= sigma) | (gap + length < NEIGHBOUR_SIGMAS * sigma)
+    near &= table[AMPLITUDE] > CLEAR_RATIO * rise
+    steep = np.sqrt(1.0 + slope * slope)
+    own = float(np.median(sigma / steep)) * steep
+    ratio = np.maximum(table[AMPLITUDE] / rise, LEAST_RATIO)
+    near |= length > MERGED_SHARE * 2.0 * own * np.sqrt(2.0 * np.log(ratio)) + MERGED_PX
+    near |= (sigma > WIDER_SHARE * own) | dips
+    if near.any():
+        near = close_gaps(near, points[:, POINT_CHAIN], MERGED_SIGMAS * sigma)
+    return near
+
+
+def _flag(chains: _Chains, table: FloatArray, first: FloatArray, near: BoolArray) -> IntArray:
+    """Flags (N,) of each point by itself.
+
+    ``first``: (6, N) of the first pass. ``near``: (N,) of `_is_near_another`.
+    """
+    sigma = table[SIGMA]
+    flags = np.zeros(table.shape[1], np.int64)
+    step = np.abs(first[HIGH_SIDE] - first[LOW_SIDE])
+    leans = table[LEAN : LEAN_NORM + 1]
+    lean, norm = (2 * LEAN_HALF + 1) * chains.mean(leans, np.ones(leans.shape), LEAN_HALF)
+    norm = np.maximum(norm, 1e-12)
+    # what all sections have in common is the line's own
+    lean = np.abs(lean - norm * _typical_lean(table))
+    least = np.maximum(LEAST_SKEW, SKEW_PX / sigma) * norm
+    for flag, is_set in (
+        (StripeFlag.SATURATED, table[N_CLIPPED] > 0.0),
+        (StripeFlag.BACKGROUND_STEP, step > BACKGROUND_STEP * table[AMPLITUDE]),
+        (StripeFlag.NEIGHBOUR, near),
+        (StripeFlag.ASYMMETRIC, (lean > SIGNIFICANT * np.sqrt(norm)) & (lean > least)),
+    ):
+        if is_set.any():
+            flags[is_set] |= int(flag)
+    return flags
+
+
+def _typical_lean(table: FloatArray) -> float:
+    """Skew that the sections of a sample of the points have in common."""
+    step = max(table.shape[1] // MOST_MEASURED, 1)
+    lean, norm = table[LEAN, ::step], table[LEAN_NORM, ::step]
+    return float(np.median(lean[norm > 0.0] / norm[norm > 0.0])) if norm.any() else 0.0
+
+
+def _smooth(chains: _Chains, found: ColumnPoints, smoothing_px: float) -> ColumnPoints:
+    """The points with their centres smoothed along the chains, and the sigma that this leaves."""
+    points, table, flags = chains.points, found.table, found.flags.copy()
+    variance = np.maximum(table[VARIANCE], LEAST_SIGMA_PX**2)
+    is_used = ((flags & int(REJECTING)) == 0) & (table[VARIANCE] > 0.0)
+    rows, start = _stretches(points, is_used)
+    centre, own = table[CENTRE, rows], variance[rows]
+    score = np.zeros(len(rows))
+    if score_middles(centre, own, start, _half_weights(OUTLIER_HALF), score):
+        typical = max(1.0, float(np.median(score[score >= 0.0])) / NORMAL_MEDIAN)
+        is_off = score > OUTLIER_SIGMAS * typical
+        if is_off.any():
+            flags[rows[is_off]] |= int(StripeFlag.OUTLIER)
+            is_used[rows[is_off]] = False
+            rows, start = _stretches(points, is_used)
+            centre, own = table[CENTRE, rows], variance[rows]
+    half = windows(max(smoothing_px, 1.0))
+    correlation = _correlation(centre, own, start, half[-1])
+    if correlation is None:
+        flags |= int(StripeFlag.NOISE_ASSUMED)
+        correlation = WHITE
+    alike = max(1.0 + 2.0 * float(correlation[1:].sum()) / correlation[0], 1.0)
+    sigma, noise_length = np.sqrt(variance * correlation[0]), np.full(len(points), alike)
+    slope, table = found.slope.copy(), table.copy()
+    if smoothing_px > 0.0:
+        halves = np.unique(np.maximum(half.astype(np.int64), 1))
+        weights = np.zeros((len(halves), halves[-1] + 1))
+        for k, one in enumerate(halves):
+            weights[k, : one + 1] = _half_weights(int(one))
+        inflation = np.array([inflation_of(correlation, one) * _norm(int(one)) for one in halves])
+        smoothed = np.zeros((SMOOTH_ROWS, len(rows)))
+        own = own * correlation[0]
+        smooth_stretches(centre, own, start, halves, weights, inflation, CONFIDENCE, smoothed)
+        table[CENTRE, rows] = smoothed[SMOOTHED] - _pull(table, rows, smoothed, own)
+        slope[rows] = smoothed[SLOPE]
+        sigma[rows] = np.sqrt(smoothed[SMOOTH_VARIANCE])
+        noise_length[rows] = np.maximum(own * alike / smoothed[SMOOTH_VARIANCE], 1.0)
+    return replace(
+        found, table=table, slope=slope, sigma=sigma, noise_length=noise_length, flags=flags
+    )
+
+
+def _stretches(points: NDArray[np.int32], is_used: BoolArray) -> tuple[IntArray, IntArray]:
+    """Rows of the points that are used, and (S + 1,) where their stretches begin."""
+    rows, start = np.zeros(len(points), np.int64), np.zeros(len(points) + 1, np.int64)
+    n = cut_stretches(points, is_used.view(np.uint8), rows, start)
+    return rows[: start[n]], start[: n + 1]
+
+
+def _pull(
+    table: FloatArray, rows: IntArray, smoothed: FloatArray, variance: FloatArray
+) -> FloatArray:
+    """By how much bends pull the centres (M,) of columns that cut them at a slant: `find_pulls`.
+
+    Bends are shrunk towards zero by their own noise, so that straight lines are not disturbed.
+    """
+    bend, steep = smoothed[BEND], smoothed[SLOPE] * smoothed[SLOPE]
+    certain = np.maximum(1.0 - variance * BEND_VARIANCE / np.maximum(bend * bend, 1e-30), 0.0)
+    gain = table[BEND_GAIN, rows] * table[SIGMA, rows] ** 2
+    return np.asarray(0.5 * gain * certain * bend * steep / (1.0 + steep) ** 2)
+
+
+@cache
+def _half_weights(half: int) -> FloatArray:
+    """Weights (half + 1,) of a local quadratic at its middle, from there on."""
+    weights = quadratic_weights(half)[half:].copy()
+    weights.flags.writeable = False
+    return weights
+
+
+@cache
+def _norm(half: int) -> float:
+    """Variance of a local quadratic's middle for white noise, over that of its points."""
+    return float((quadratic_weights(half) ** 2).sum())
+
+
+def _correlation(
+    centre: FloatArray, variance: FloatArray, start: IntArray, half_px: float
+) -> FloatArray | None:
+    """Covariance (LAGS,) of neighbours over their variance; None where stretches are too short."""
+    stop = int(np.searchsorted(start, MOST_MEASURED))
+    n = int(start[min(stop, len(start) - 1)])
+    stretch = np.repeat(np.arange(len(start) - 1), np.diff(start))[:n]
+    at = np.stack([np.arange(n, dtype=np.float64), centre[:n]], axis=1)
+    down = np.repeat([[0.0, 1.0]], n, axis=0)
+    course = Polyline(at, down, np.sqrt(variance[:n]), stretch, np.ones(n, dtype=np.bool_))
+    return noise_correlation(course, half_px)
+
+
+def extract_fast(
+    exposure: Exposure, plane: StripePlane | None, level: ImageLevel, options: StripeOptions
+) -> Profile:
+    """Stripe points of a grey exposure, or of its plane: columns first, then rows.
+
+    ``plane``: None for an exposure of eight bits, whose own pixels are read. ``level``: Of what is
+    read.
+    """
+    if plane is None:
+        pixels = Pixels.of_bytes(exposure.image, exposure.full_scale)
+    else:
+        pixels = Pixels.of_plane(plane, level.brightest)
+    down, left_out = find_columns(pixels.wide_enough(), level, options.smoothing_px)
+    found = [] if down is None else [_to_profile(exposure, down, is_row=False)]
+    if left_out.any():
+        turned = replace(
+            level,
+            background=np.ascontiguousarray(level.background.T),
+            lit=np.ascontiguousarray(level.lit.T),
+        )
+        along, _ = find_columns(pixels.transposed.wide_enough(), turned, options.smoothing_px)
+        found += [] if along is None else [_to_profile(exposure, along, is_row=True)]
+    found = [part for part in found if len(part)]
+    if len(found) > 1:
+        after = found[1].segment + found[0].segment[-1] + 1
+        return Profile.concat([found[0], replace(found[1], segment=after)])
+    return found[0] if found else Profile.empty(source=exposure.source)
+
+
+def _to_profile(exposure: Exposure, found: ColumnPoints, is_row: bool) -> Profile:
+    """Points in full-sensor pixels, those left out whose line is rather the other pass's."""
+    steep = np.abs(found.trend)
+    keep = (steep < 1.0 / STEEPEST) if is_row else (steep <= STEEPEST)
+    keep &= (found.table[VARIANCE] > 0.0) & (np.abs(found.slope) < MOST_SLOPE)
+    kept = found.select(keep)
+    column, slope = kept.points[:, POINT_COLUMN], kept.slope
+    across = 1.0 / np.sqrt(1.0 + slope * slope)
+    down, along = (0, 1) if is_row else (1, 0)
+    at, normals = np.zeros((len(column), 2)), np.zeros((len(column), 2))
+    at[:, along], at[:, down] = column, kept.table[CENTRE]
+    normals[:, along], normals[:, down] = -slope * across, across
+    is_new = (np.diff(kept.points[:, POINT_CHAIN]) != 0) | (np.diff(column) > BACK)
+    segment = np.zeros(len(column), np.int64)
+    np.cumsum(is_new, out=segment[1:])
+    flags = kept.flags
+    is_short = _arc_lengths(at, segment) < SHORTEST_PX
+    if is_short.any():
+        flags = flags | np.where(is_short[segment], int(StripeFlag.SHORT_SEGMENT), 0)
+    binning = exposure.window.binning
+    return Profile(
+        source=exposure.source,
+        points_px=exposure.window.to_full_sensor(at),
+        normals_px=normals,
+        sigma_px=np.maximum(kept.sigma * across, LEAST_SIGMA_PX) * binning,
+        width_px=kept.table[SIGMA] * across * binning,
+        intensity=np.maximum(kept.table[AMPLITUDE], 0.0) * (exposure.full_scale / NORMAL_SCALE),
+        flags=flags,
+        segment=segment,
+        noise_length=kept.noise_length,
+    )
+
+
+def _arc_lengths(points: FloatArray, segment: IntArray) -> FloatArray:
+    """Length of each segment of points (N, 2), which bear increasing numbers (N,)."""
+    if not len(points):
+        return np.zeros(0)
+    step = np.diff(points, axis=0)
+    length = np.sqrt((step * step).sum(axis=1))
+    length[np.diff(segment) != 0] = 0.0
+    return np.bincount(segment[1:], length, minlength=int(segment[-1]) + 1)

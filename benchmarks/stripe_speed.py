@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray
-from armscan.kernels.ridge import gaussian_taps
+from armscan.kernels.stripe.ridge import gaussian_taps
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import lit_plane

@@ -127,7 +127,7 @@ StripeMethodOption = Annotated[
     str | None,
     typer.Option(
         "--stripe-method",
-        help="fit, or the thesis's threshold, centroid, template, hessian.",
+        help="fit; fast, in few passes; or the thesis's threshold, centroid, template, hessian.",
         show_default=DefaultOf(STRIPES + "method"),
     ),
 ]

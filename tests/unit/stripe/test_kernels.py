@@ -8,7 +8,7 @@ from scipy.optimize import curve_fit
 
 from armscan.kernels.arrays import COLUMN
 from armscan.kernels.chains import find_other_lines, measure_chains, sum_windows, walk_chains
-from armscan.kernels.profile_fit import (
+from armscan.kernels.stripe.profile_fit import (
     AMPLITUDE,
     CENTRE,
     SIGMA,
@@ -17,7 +17,7 @@ from armscan.kernels.profile_fit import (
     fit_profiles,
     read_sides,
 )
-from armscan.kernels.ridge import (
+from armscan.kernels.stripe.ridge import (
     derivatives_at,
     find_runs,
     gaussian_taps,
@@ -26,7 +26,7 @@ from armscan.kernels.ridge import (
     sample_across,
     sum_at_border,
 )
-from armscan.kernels.section import (
+from armscan.kernels.stripe.section import (
     NORMAL_00,
     NORMAL_11,
     SCORE_0,
@@ -37,7 +37,7 @@ from armscan.kernels.section import (
     weigh_section,
     widen_sigmas,
 )
-from armscan.kernels.smoothing import (
+from armscan.kernels.stripe.smoothing import (
     BEND_SPAN,
     BEYOND_BENDS,
     filter_residuals,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.kernels.smoothing import (
+from armscan.kernels.stripe.smoothing import (
     BEND,
     LEAST_POINTS,
     MOST_TURNED_COSINE,

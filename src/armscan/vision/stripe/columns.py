@@ -11,21 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.kernels.columns import (
-    AMPLITUDE,
+from armscan.kernels.stripe.column_runs import (
     BACK,
-    BEND,
-    BEND_GAIN,
-    BEND_VARIANCE,
     CELL_PX,
-    CENTRE,
-    FIRST_ROWS,
-    HIGH_SIDE,
-    LEAN,
-    LEAN_NORM,
-    LOW_SIDE,
-    N_CLIPPED,
-    N_SIDES,
     POINT_ABOVE,
     POINT_BELOW,
     POINT_CHAIN,
@@ -37,6 +25,25 @@ from armscan.kernels.columns import (
     RUN_HEIGHT,
     RUN_LENGTH,
     RUN_ROWS,
+    find_column_runs,
+    gather_chains,
+    link_columns,
+    measure_runs,
+    sort_by_column,
+)
+from armscan.kernels.stripe.columns import (
+    AMPLITUDE,
+    BEND,
+    BEND_GAIN,
+    BEND_VARIANCE,
+    CENTRE,
+    FIRST_ROWS,
+    HIGH_SIDE,
+    LEAN,
+    LEAN_NORM,
+    LOW_SIDE,
+    N_CLIPPED,
+    N_SIDES,
     SECOND_ROWS,
     SIGMA,
     SLOPE,
@@ -46,20 +53,15 @@ from armscan.kernels.columns import (
     STEEPEST,
     VARIANCE,
     cut_stretches,
-    find_column_runs,
     fit_columns,
-    gather_chains,
-    link_columns,
     look_across,
     mark_ends,
     mean_along,
-    measure_runs,
     score_middles,
     slopes_along,
     smooth_stretches,
-    sort_by_column,
 )
-from armscan.kernels.section import (
+from armscan.kernels.stripe.section import (
     BACKGROUND_STEP,
     LEAST_SKEW,
     NEIGHBOUR_SIGMAS,
@@ -180,10 +182,10 @@ MOST_MEASURED = 6000
 class ColumnPoints:
     """Centres of lines in the columns of an image, along their chains.
 
-    ``points``: (N, 6) of `armscan.kernels.columns.gather_chains`. ``table``: (8, N) of
-    `armscan.kernels.columns.fit_columns`. ``slope``: (N,) rows a column. ``trend``: (N,) the same
-    over more neighbours. ``sigma``: (N,) standard deviation of the centre down the column.
-    ``noise_length``: (N,) as in `Profile`. ``flags``: (N,) of `StripeFlag`.
+    ``points``: (N, 6) of `gather_chains`. ``table``: (8, N) of `fit_columns`. ``slope``: (N,) rows
+    a column. ``trend``: (N,) the same over more neighbours. ``sigma``: (N,) standard deviation of
+    the centre down the column. ``noise_length``: (N,) as in `Profile`. ``flags``: (N,) of
+    `StripeFlag`.
     """
 
     points: NDArray[np.int32]

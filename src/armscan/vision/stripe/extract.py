@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.kernels.profile_fit import AMPLITUDE
-from armscan.kernels.section import (
+from armscan.kernels.stripe.profile_fit import AMPLITUDE
+from armscan.kernels.stripe.section import (
     EDGE_BLUR_PX2,
     MARK_SIGMA,
     MARK_WIDTH,
     MOST_PULL,
     widen_sigmas,
 )
-from armscan.kernels.smoothing import find_pulls, take_out_bends
+from armscan.kernels.stripe.smoothing import find_pulls, take_out_bends
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.stripe.columns import extract_fast

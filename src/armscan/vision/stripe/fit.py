@@ -13,7 +13,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.arrays import COLUMN, ROW
 from armscan.kernels.chains import find_other_lines
-from armscan.kernels.profile_fit import (
+from armscan.kernels.stripe.profile_fit import (
     AMPLITUDE,
     CENTRE,
     FIT_COLUMNS,
@@ -26,7 +26,7 @@ from armscan.kernels.profile_fit import (
     fit_profiles,
     read_sides,
 )
-from armscan.kernels.section import (
+from armscan.kernels.stripe.section import (
     BIN_MEANS,
     BLACK_NORMAL,
     BLACK_SCORE,
@@ -69,8 +69,9 @@ def estimate_noise(
     The residuals are binned by the line's own grey level ``m``; each bin gives a robust variance,
     and non-negative least squares gives the three terms.
 
-    ``pixels``: (3, >= n) of `kernels.section.weigh_section`, ``n_pixels`` of which count. ``peak``:
-    amplitude of the bright ones. ``fallback``: (3,) what to return if there are too few residuals.
+    ``pixels``: (3, >= n) of `kernels.stripe.section.weigh_section`, ``n_pixels`` of which count.
+    ``peak``: amplitude of the bright ones. ``fallback``: (3,) what to return if there are too few
+    residuals.
     """
     bins = np.zeros((len(BIN_EDGES) - 1, BIN_MEANS))
     bin_residuals(pixels, n_pixels, BIN_EDGES * peak, bins)
@@ -106,7 +107,7 @@ def estimate_section(
     profiles share are therefore made part of the model; what single profiles have beside them
     stays the sign of an edge.
 
-    ``said``: (N, 8) of `kernels.section.weigh_section`. ``section``: (4,) of the fit.
+    ``said``: (N, 8) of `kernels.stripe.section.weigh_section`. ``section``: (4,) of the fit.
     ``is_usable``: (N,) profiles whose core is not clipped and that no other line is near.
     ``axis``: (N,) along which each was fitted. ``chain``: (N,) increasing numbers.
     """
@@ -135,7 +136,7 @@ def estimate_black(said: FloatArray) -> float:
     A camera that shows darkness as some grey levels, and ink that is not as dark for the laser as
     for the room's light, make dark print seem lighter or darker than it is under the line.
 
-    ``said``: (N, 8) of `kernels.section.weigh_section`.
+    ``said``: (N, 8) of `kernels.stripe.section.weigh_section`.
     """
     normal, score = said[:, BLACK_NORMAL], said[:, BLACK_SCORE]
     size = np.sqrt(np.maximum(normal, 1e-12))
@@ -193,8 +194,8 @@ LEAST_REACH_PX = 6.0
 class ProfileFits:
     """Result of fitting the cross-section at each ridge point.
 
-    ``ridge``: The ridge points, only those whose fit succeeded. ``values``: (N, 8) columns as named
-    in `armscan.kernels.profile_fit`. ``sides``: (N, 2) background on the lower and upper side,
+    ``ridge``: The ridge points, only those whose fit succeeded. ``values``: (N, 8) columns as in
+    `armscan.kernels.stripe.profile_fit`. ``sides``: (N, 2) background on the lower and upper side,
     averaged along the line. ``side_sigma``: (N,) standard deviation of the difference of the two
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
     px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's own

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX
-from armscan.kernels.profile_fit import REACH_SIGMAS
-from armscan.kernels.section import (
+from armscan.kernels.stripe.profile_fit import REACH_SIGMAS
+from armscan.kernels.stripe.section import (
     MARK_COLUMNS,
     MARK_LEAN,
     MARK_MEAN_WIDTH,

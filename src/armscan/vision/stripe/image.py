@@ -14,7 +14,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
-from armscan.kernels.ridge import copy_cells
+from armscan.kernels.stripe.ridge import copy_cells
 from armscan.models.calibration import LaserColour
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.ridge import (

@@ -23,7 +23,7 @@ from armscan.kernels.chains import (
     sum_windows,
     walk_chains,
 )
-from armscan.kernels.ridge import (
+from armscan.kernels.stripe.ridge import (
     ROUNDING,
     count_bright,
     find_runs,

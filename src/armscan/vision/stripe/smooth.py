@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA
-from armscan.kernels.smoothing import (
+from armscan.kernels.stripe.smoothing import (
     COURSE_ROWS,
     LANES,
     SMOOTH_ROWS,

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.kernels.ridge import gaussian_taps
+from armscan.kernels.stripe.ridge import gaussian_taps
 from armscan.vision.stripe.ridge import (
     CELL_PX,
     LONGEST_RUN_PX,

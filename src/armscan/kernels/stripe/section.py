@@ -19,7 +19,7 @@ from armscan.kernels.arrays import (
     TableOut,
     compiled,
 )
-from armscan.kernels.profile_fit import (
+from armscan.kernels.stripe.profile_fit import (
     AMPLITUDE,
     CENTRE,
     COUNTS,

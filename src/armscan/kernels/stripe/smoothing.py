@@ -27,7 +27,7 @@ from armscan.kernels.arrays import (
     TableOut,
     compiled,
 )
-from armscan.kernels.profile_fit import BEND_GAIN, SIGMA
+from armscan.kernels.stripe.profile_fit import BEND_GAIN, SIGMA
 
 SHIFT, SLOPE, BEND, BEND_SIGMA, SMOOTH_SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(8)
 SMOOTH_ROWS = 8

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stripe centres column by column: runs of lit pixels, their chains, weighted sums across them.
+"""Stripe centres column by column: weighted sums across lines, and quadratics along them.
 
 Sixteen neighbouring columns of a chain are looked at together: their pixels lie beside each other
 in every row of the image, so that a row is read as a whole. Lines that run rather up and down are
@@ -18,7 +18,6 @@ from numba.extending import intrinsic
 
 from armscan.kernels.arrays import (
     Bytes,
-    BytesOut,
     Floats,
     FloatsOut,
     Image,
@@ -32,57 +31,16 @@ from armscan.kernels.arrays import (
     TableOut,
     compiled,
 )
-from armscan.kernels.ridge import IS_PLAIN, VALLEY_RATIO
+from armscan.kernels.stripe.column_runs import (
+    POINT_CHAIN,
+    POINT_COLUMN,
+    POINT_HIGH,
+    POINT_LOW,
+)
+from armscan.kernels.stripe.ridge import IS_PLAIN
 
 LANES = 16
 """Columns that are looked at together."""
-CELL_PX = 64
-"""Pixels of a row that are compared at once, and the side of a cell of the background."""
-LIMIT_ROWS = 4
-"""Rows for which one threshold holds."""
-DARK = 255
-"""Threshold of eight bits that no pixel exceeds."""
-
-
-def _above(typing: Any, raw: Any, first: Any, limit: Any, column: Any) -> tuple[Any, Any]:
-    """One bit for each of `CELL_PX` pixels from a place on: brighter than its column's threshold.
-
-    ``first``: Place of the first pixel in the image. ``column``: Its column. Both must be followed
-    by as many.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        row = ir.VectorType(ir.IntType(8), CELL_PX)
-
-        def load(k: int) -> Any:
-            data = context.make_array(signature.args[k])(context, builder, args[k]).data
-            where = builder.bitcast(builder.gep(data, [args[k + 1]]), row.as_pointer())
-            return builder.load(where, align=1)
-
-        return builder.bitcast(builder.icmp_unsigned(">", load(0), load(2)), ir.IntType(64))
-
-    return types.uint64(raw, types.intp, limit, types.intp), generate
-
-
-def _above_slowly(raw: Mask, first: int, limit: Bytes, column: int) -> Any:
-    """The same where compilation is switched off."""
-    own = raw.reshape(raw.size)[first : first + CELL_PX]
-    is_above = own > limit[column : column + CELL_PX]
-    return np.packbits(is_above, bitorder="little").view(np.uint64)[0]
-
-
-def _lowest(typing: Any, bits: Any) -> tuple[Any, Any]:
-    """Place of the lowest bit that is set."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.uint64), generate
-
-
-def _lowest_slowly(bits: Any) -> int:
-    """The same where compilation is switched off."""
-    return (int(bits) & -int(bits)).bit_length() - 1
 
 
 def _widen(typing: Any, raw: Any, first: Any, factor: Any, levels: Any) -> tuple[Any, Any]:
@@ -120,219 +78,7 @@ def _widen_slowly(raw: Mask, first: int, factor: np.float32, levels: RowOut) -> 
     levels[:LANES] = raw.reshape(raw.size)[first : first + LANES] * factor
 
 
-pixels_above: Any = _above_slowly if IS_PLAIN else intrinsic(_above)
-lowest_bit: Any = _lowest_slowly if IS_PLAIN else intrinsic(_lowest)
 widen_bytes: Any = _widen_slowly if IS_PLAIN else intrinsic(_widen)
-
-
-@compiled()
-def set_limits(
-    background: Image, is_lit_cell: Mask, y: int, rise: float, unit: float, limit: BytesOut
-) -> None:
-    """Threshold of each column of lit cells in a row; elsewhere it stays.
-
-    ``background``: (rows, columns) level at the middles of cells, linear in between. ``y``: Row.
-    ``rise``: Height above it. ``unit``: Of the image, over that of these. ``limit``: (W,) output.
-    """
-    rows, columns = background.shape
-    v = min(max((y + 0.5) / CELL_PX - 0.5, 0.0), rows - 1.0)
-    upper = int(v)
-    lower = min(upper + 1, rows - 1)
-    share = v - upper
-    for c in range(columns):
-        if is_lit_cell[y // CELL_PX, c] == 0:
-            continue
-        before, after = max(c - 1, 0), min(c + 1, columns - 1)
-        left = background[upper, before]
-        left += share * (background[lower, before] - left)
-        middle = background[upper, c] + share * (background[lower, c] - background[upper, c])
-        right = background[upper, after]
-        right += share * (background[lower, after] - right)
-        first = c * CELL_PX
-        for x in range(first, min(first + CELL_PX, limit.shape[0])):
-            u = (x - first + 0.5) / CELL_PX - 0.5
-            level = middle + (u * (right - middle) if u > 0.0 else u * (middle - left))
-            limit[x] = np.uint8(min(max((level + rise) * unit, 0.0), 254.0))
-
-
-@compiled()
-def find_column_runs(
-    raw: Mask, background: Image, is_lit_cell: Mask, rise: float, unit: float, runs: MapOut
-) -> int:
-    """Runs of pixels down the columns that are brighter than the background by ``rise``.
-
-    ``raw``: (H, W >= 64) of eight bits. ``background``, ``rise``, ``unit``: As for `set_limits`.
-    ``is_lit_cell``: (rows, columns) 0 for cells that are passed over unread. ``runs``: (capacity,
-    3) int32 output: column, first and last row, in the order of their last rows.
-
-    Returns count of runs; more than the capacity if the output was too short.
-    """
-    height, width = raw.shape
-    n_cells = is_lit_cell.shape[1]
-    limit = np.full(width, DARK, np.uint8)
-    open_, one, none = np.zeros(n_cells, np.uint64), np.uint64(1), np.uint64(0)
-    start = np.zeros(n_cells * CELL_PX, np.int32)
-    count = 0
-    for y in range(height + 1):
-        if y < height and y % LIMIT_ROWS == 0:
-            set_limits(background, is_lit_cell, y, rise, unit, limit)
-        for c in range(n_cells):
-            lit = none
-            if y < height and is_lit_cell[y // CELL_PX, c] != 0:
-                # the last cell is read together with pixels of the one before
-                first = min(c * CELL_PX, width - CELL_PX)
-                lit = pixels_above(raw, y * width + first, limit, first)
-                lit = lit >> np.uint64(c * CELL_PX - first)
-            if lit == open_[c]:
-                continue
-            begun, ended = lit & ~open_[c], open_[c] & ~lit
-            open_[c] = lit
-            while begun != none:
-                start[c * CELL_PX + lowest_bit(begun)] = y
-                begun &= begun - one
-            while ended != none:
-                x = c * CELL_PX + lowest_bit(ended)
-                ended &= ended - one
-                if count < runs.shape[0]:
-                    runs[count, 0] = x
-                    runs[count, 1] = start[x]
-                    runs[count, 2] = y - 1
-                count += 1
-    return count
-
-
-@compiled()
-def sort_by_column(runs: MapOut, order: IntsOut, first: IntsOut) -> None:
-    """Order of the runs (N, 3) by column, then from top to bottom.
-
-    ``order``: (N,) output. ``first``: (W + 1,) output: place in it of each column's first run.
-    """
-    first[:] = 0
-    width = first.shape[0] - 1
-    for i in range(runs.shape[0]):
-        first[runs[i, 0] + 1] += 1
-    for x in range(width):
-        first[x + 1] += first[x]
-    at = first.copy()
-    for i in range(runs.shape[0]):
-        x = runs[i, 0]
-        order[at[x]] = i
-        at[x] += 1
-
-
-BACK = 5
-"""Columns before a run in which the last point of its chain may lie."""
-SLOPE_SHARE = 0.25
-"""Of a new step in the slope that a chain is followed by."""
-OFF_SHARE, OFF_PX = 0.25, 2.0
-"""How far the middle of a run may lie from where its chain leads: a share of its length, and px."""
-NONE = -1
-
-
-@compiled()
-def link_columns(
-    runs: MapOut, order: Ints, first: Ints, longest_px: int, chain: IntsOut, size: IntsOut
-) -> int:
-    """Number the chains of runs that follow each other from column to column.
-
-    A run goes on with the chain whose last one, up to `BACK` columns before, overlaps with it and
-    leads nearest to its middle.
-
-    ``runs``: (N, 3). ``order``, ``first``: Of `sort_by_column`. ``longest_px``: Longer ones are no
-    cross-sections of a line. ``chain``: (N,) output, in the order by column; -1 of these. ``size``:
-    (N,) output: points of each chain.
-
-    Returns count of chains.
-    """
-    n = order.shape[0]
-    slope, is_taken = np.zeros(n), np.zeros(n, np.uint8)
-    number = 0
-    size[:] = 0
-    for x in range(first.shape[0] - 1):
-        for k in range(first[x], first[x + 1]):
-            low, high = runs[order[k], 1], runs[order[k], 2]
-            chain[k] = NONE
-            if high - low >= longest_px or high == low:
-                continue
-            middle = 0.5 * (low + high)
-            best, least, own = NONE, OFF_SHARE * (high - low) + OFF_PX, 0.0
-            for back in range(1, min(BACK, x) + 1):
-                for m in range(first[x - back], first[x - back + 1]):
-                    if chain[m] < 0 or is_taken[m] != 0:
-                        continue
-                    j = order[m]
-                    if runs[j, 1] > high + back or runs[j, 2] < low - back:
-                        continue
-                    step = (middle - 0.5 * (runs[j, 1] + runs[j, 2])) / back
-                    off = abs(step - slope[m]) * back
-                    if off < least:
-                        best, least, own = m, off, step
-                if best >= 0:
-                    break
-            if best >= 0:
-                is_taken[best] = 1
-                chain[k] = chain[best]
-                slope[k] = slope[best] + SLOPE_SHARE * (own - slope[best])
-            else:
-                chain[k] = number
-                number += 1
-            size[chain[k]] += 1
-    return number
-
-
-POINT_COLUMN, POINT_LOW, POINT_HIGH, POINT_BELOW, POINT_ABOVE, POINT_CHAIN = range(6)
-POINT_COLUMNS = 6
-"""Of a point: column, first and last row of its run, rows that are free before the next run on the
-side of smaller and of larger rows, and number of its chain."""
-FREE_PX = 100000
-OTHER_SHARE = 0.25
-"""Of a run's length: shorter ones beside it are its own speckle, not another line."""
-
-
-@compiled()
-def gather_chains(
-    runs: MapOut, order: Ints, chain: Ints, size: Ints, least: int, points: MapOut, start: IntsOut
-) -> int:
-    """Points of the chains of at least so many, chain after chain.
-
-    ``runs``, ``order``, ``chain``, ``size``: Of `link_columns`. ``points``: (N, 6) output.
-    ``start``: (C + 1,) output: where each chain of those kept begins, and one more than the last.
-
-    Returns count of chains that are kept.
-    """
-    at = np.full(size.shape[0], NONE, np.int64)
-    n_kept = total = 0
-    for c in range(size.shape[0]):
-        if size[c] >= least:
-            at[c] = total
-            start[n_kept] = total
-            total += size[c]
-            n_kept += 1
-    start[n_kept] = total
-    for k in range(order.shape[0]):
-        c = chain[k]
-        if c < 0 or at[c] < 0:
-            continue
-        i = order[k]
-        own = points[at[c]]
-        at[c] += 1
-        own[POINT_COLUMN], own[POINT_LOW], own[POINT_HIGH] = runs[i, 0], runs[i, 1], runs[i, 2]
-        own[POINT_BELOW] = own[POINT_ABOVE] = FREE_PX
-        own[POINT_CHAIN] = c
-        least_px = OTHER_SHARE * (runs[i, 2] - runs[i, 1] + 1)
-        for way in (-1, 1):
-            m = k + way
-            while 0 <= m < order.shape[0] and runs[order[m], 0] == runs[i, 0]:
-                j = order[m]
-                if runs[j, 2] - runs[j, 1] + 1 >= least_px:
-                    if way < 0:
-                        own[POINT_BELOW] = runs[i, 1] - runs[j, 2]
-                    else:
-                        own[POINT_ABOVE] = runs[j, 1] - runs[i, 2]
-                    break
-                m += way
-    return n_kept
-
 
 FARTHEST_SQUARE = np.float32(40.0)
 
@@ -347,71 +93,6 @@ def bell_at(square: np.float32) -> np.float32:
     power4 = power2 * power2
     power8 = power4 * power4
     return np.float32(power8 * power8)
-
-
-RUN_LENGTH, RUN_HEIGHT, RUN_DIPS = range(3)
-RUN_ROWS = 3
-HEIGHT_HALF = 1
-"""Pixels to both sides of a run's middle of which the height is taken."""
-
-
-DIP_STEP = 8
-"""Every so many points are asked whether their run dips: lines that run into each other do so
-over more of them."""
-
-
-@compiled()
-def measure_runs(
-    raw: Mask,
-    image: Image,
-    unit: float,
-    background: Image,
-    rise: float,
-    points: MapOut,
-    base: FloatsOut,
-    measured: TableOut,
-) -> None:
-    """Length and height of the runs of points, whether they dip, and the background at each.
-
-    A run dips where the three-pixel mean falls below `VALLEY_RATIO` of the peaks on both sides; of
-    every `DIP_STEP` points one is asked.
-
-    ``raw``, ``image``, ``unit``: As for `read_row`. ``background``: As for `set_limits`.
-    ``rise``: Height by which a peak stands out of a dip. ``points``: (N, 6). ``base``: (N,) output.
-    ``measured``: (3, N) output.
-    """
-    rows, columns = background.shape
-    has_bytes, share = raw.shape[0] > 1, 1.0 / unit
-    height = raw.shape[0] if has_bytes else image.shape[0]
-    for i in range(points.shape[0]):
-        x, low, high = points[i, POINT_COLUMN], points[i, POINT_LOW], points[i, POINT_HIGH]
-        middle = (low + high) // 2
-        v = min(max((middle + 0.5) / CELL_PX - 0.5, 0.0), rows - 1.0)
-        u = min(max((x + 0.5) / CELL_PX - 0.5, 0.0), columns - 1.0)
-        r, c = int(v), int(u)
-        below, right = min(r + 1, rows - 1), min(c + 1, columns - 1)
-        upper = background[r, c] + (u - c) * (background[r, right] - background[r, c])
-        lower = background[below, c] + (u - c) * (background[below, right] - background[below, c])
-        base[i] = upper + (v - r) * (lower - upper)
-        measured[RUN_LENGTH, i] = high - low + 1
-        top, bottom = max(middle - HEIGHT_HALF, 0), min(middle + HEIGHT_HALF, height - 1)
-        total = 0.0
-        for y in range(top, bottom + 1):
-            total += share * raw[y, x] if has_bytes else image[y, x]
-        measured[RUN_HEIGHT, i] = total / (bottom - top + 1) - base[i]
-        measured[RUN_DIPS, i] = 0.0
-        if i % DIP_STEP != 0:
-            continue
-        before = own = peak = least = 0.0
-        for y in range(max(low - 1, 0), min(high + 1, height - 1) + 1):
-            after = (share * raw[y, x] if has_bytes else image[y, x]) - base[i]
-            mean = (before + own + after) / 3.0
-            before, own = own, after
-            if mean >= peak:
-                peak, least = mean, mean
-            least = min(least, mean)
-            if least < VALLEY_RATIO * peak and mean > 2.0 * least + rise:
-                measured[RUN_DIPS, i] = 1.0
 
 
 SIDE_FROM, SIDE_TO = 3.4, 4.7

@@ -188,8 +188,8 @@ def _studied(case: str) -> FloatArray:
 def test_squares_of_the_errors_are_as_stated(case: str) -> None:
     """Mean of e' C^-1 e over 6: half of it if C is doubled, 1.67 of it if C is taken times 0.6.
 
-    150 and 300 draws of heavy tails, up to 1.1 each: a standard deviation of 0.09 or 0.06; priors that
-    expect another arm, and waves that are none of the model's, may add 0.1.
+    150 and 300 draws of heavy tails, up to 1.1 each: a standard deviation of 0.09 and 0.06;
+    priors that expect another arm, and waves that are none of the model's, may add 0.1.
     """
     mean = float(_studied(case)[:, 0].mean()) / 6.0
     assert 0.75 < mean < 1.25

@@ -125,6 +125,7 @@ def run_hand_eye(
         error,
         covariance,
         GROUPS,
+        region_factor=calibration.diagnostics.region_factor,
         over_bound=_over(covariance, best),
         over_granted=granted,
         warnings=found.warnings,

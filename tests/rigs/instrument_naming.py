@@ -58,7 +58,7 @@ def run_naming(
     share = wrong / max(named, 1)
     yield Outcome(
         stage,
-        "right" if share < MOST_WRONG else "silently wrong",
+        "right" if share < MOST_WRONG else "wrong",
         f"{wrong} of {named} named points wrong" if wrong else "",
         groups={"wrong": float(wrong), "named": float(named), "points": float(asked)},
         seconds=time.process_time() - begun,

@@ -62,7 +62,7 @@ LEAST_REST_MM = 1e-6
 class Outcome:
     """What became of one stage of one instrument.
 
-    ``result`` is right, silently wrong, rightly refused, wrongly refused or not reached; ``chi2``
+    ``result`` is right, wrong, rightly refused, wrongly refused or not reached; ``chi2``
     the joint normalised error over ``freedom`` parameters; ``over_bound`` the stated standard
     deviations over the Cramer-Rao bound, ``over_granted`` over that of the question that is
     answered: sheets of the stored camera, planes that may be bowed as is likely, the hand-eye of
@@ -102,21 +102,26 @@ def judged(
     error: FloatArray,
     covariance: FloatArray,
     groups: dict[str, Sequence[int]],
+    *,
+    region_factor: float = 1.0,
     **more: object,
 ) -> Outcome:
-    """Right if the joint error and that of each group of parameters are within four sigma."""
+    """Right if the joint error and that of each group of parameters are within four sigma.
+
+    ``region_factor`` is stated beside the covariance where tails are longer than normal ones.
+    """
     square = quadratic(error, covariance)
     parts = {}
-    is_wrong = is_beyond(square, len(error))
+    is_wrong = is_beyond(square / region_factor, len(error))
     for name, rows in groups.items():
         chosen = np.array([k for k in rows if k < len(error)])
         if len(chosen):
             own = quadratic(error[chosen], covariance[np.ix_(chosen, chosen)])
             parts[name] = own / len(chosen)
-            is_wrong |= is_beyond(own, len(chosen))
+            is_wrong |= is_beyond(own / region_factor, len(chosen))
     return Outcome(
         stage,
-        "silently wrong" if is_wrong else "right",
+        "wrong" if is_wrong else "right",
         chi2=square,
         freedom=len(error),
         groups=parts,
@@ -437,7 +442,7 @@ def judge_sheets(
     warnings = (*fit.warnings, *(text for sheet in fit.sheets for text in sheet.warnings))
     return Outcome(
         "sheet",
-        "silently wrong" if is_wrong else "right",
+        "wrong" if is_wrong else "right",
         reason,
         squares,
         freedom,

@@ -162,9 +162,9 @@ def calibrate_on_plate(
 def _refuse_start(
     problem: Problem, plate: PlateSurface, start: Start, cause: str
 ) -> FitFailure | None:
-    conditioning = conditioning_at(problem, problem.start(start.tool_from_sensor))
-    refusal = refuse_underdetermined(conditioning, cause, VARY_POSTURES)
-    if refusal is None and not start.typical_mm <= problem.options.max_rms_mm:
+    state = problem.start(start.tool_from_sensor)
+    refusal = refuse_underdetermined(conditioning_at(problem, state), cause, VARY_POSTURES)
+    if refusal is None and not start.typical_mm <= problem.far_mm(problem.place(state)):
         return explain_misfit(problem, plate, start)
     return refusal
 
@@ -357,7 +357,7 @@ def _refuse_open(conditioning: Conditioning, diameter_mm: float) -> FitFailure |
 
 def _refuse_far(problem: Problem, state: HandEyeState) -> FitFailure | None:
     """Refuse points that stay away from any sphere; say whether another diameter would do."""
-    limit_mm = problem.options.max_rms_mm
+    limit_mm = problem.far_mm(problem.place(state))
     typical_mm = _typical_mm(problem, state)
     if not typical_mm > limit_mm:
         return None

@@ -61,6 +61,8 @@ NAMED_SHARE = 0.3
 LESS_LIKELY = 3.0
 """Logarithm of the posterior by which a round of the sphere may be less likely than the one before:
 residuals that the sensor's errors explain can lead a small sphere away step by step."""
+FAR_SIGMAS = 3.0
+"""Of the points' typical error by the sensor, which may lie that far from the reference."""
 ROBUST_ROUNDS = 10
 WEIGHTS_SETTLED = 0.02
 LEAST_FOR_WEIGHTS = 4
@@ -118,6 +120,15 @@ class Problem:
         if by_sensor is None or self.observations.sensor_covariance is None:
             return np.zeros((len(placed.residual_mm),) * 2)
         return np.asarray(by_sensor @ self.observations.sensor_covariance @ by_sensor.T)
+
+    def far_mm(self, placed: Placed) -> float:
+        """Typical distance from the reference above which the data contradict each other.
+
+        What is asked for, or what the sensor's own error explains: where that is known badly, arm,
+        poses and reference are not to blame.
+        """
+        by_sensor_mm = float(np.median(np.sqrt(np.diag(self.sensor_covariance(placed)))))
+        return max(self.options.max_rms_mm, FAR_SIGMAS * by_sensor_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

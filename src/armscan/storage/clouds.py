@@ -34,9 +34,8 @@ from armscan.storage.formats.ply import (
     read_ply,
 )
 from armscan.storage.formats.text import SIGMA_LOSS, XYZ_LOSES, xyz_bytes
-from armscan.storage.parts.meshes import MESH_SUFFIXES, read_part
+from armscan.storage.parts.meshes import MESH_SUFFIXES, encoded_surface, read_part
 from armscan.storage.parts.step import STEP_SUFFIXES, ChordError
-from armscan.storage.parts.surfaces import encoded_surface
 
 __all__ = (
     "CLOUD_SUFFIXES",

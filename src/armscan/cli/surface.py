@@ -73,7 +73,7 @@ def clean(
     """Take outliers, edges, overlap and excess out of a cloud."""
     from armscan.geometry.arrays import Box
     from armscan.inspection.cleaning import CleaningOptions
-    from armscan.jobs.inspection.cleaning import clean as clean_file
+    from armscan.jobs.inspection.surface import clean as clean_file
 
     options = CleaningOptions(
         region=Box.from_limits(numbers(region, "--region"), "--region") if region else None,
@@ -123,7 +123,7 @@ def mesh(
     The surface is smooth over a cell: edges are rounded by about one, and a round face of radius R
     lies (0.75 cell)²/R too high. For deviations, compare the points themselves, not the mesh.
     """
-    from armscan.jobs.inspection.mesh import draw_mesh
+    from armscan.jobs.inspection.surface import draw_mesh
     from armscan.reconstruction.surface import SurfaceOptions
 
     options = given(SurfaceOptions, cell_mm=cell, reach_mm=reach)

@@ -16,7 +16,7 @@ from armscan.fusion.voxel_map import VoxelMap
 from armscan.jobs.job import Job
 from armscan.pipeline.progress import ProgressEvent
 from armscan.records.cloud import FUSED, PointCloud
-from armscan.report.fuse import FusedCloud, fused_page, fused_quantities
+from armscan.report.cloud import FusedCloud, fused_page, fused_quantities
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import (
     CLOUD_SUFFIXES,

@@ -12,9 +12,8 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.inspection.cad.part import PartModel, part_of
 from armscan.storage.files import path_text, read_bytes
 from armscan.storage.formats.columns import DAMAGED as CUT
-from armscan.storage.formats.meshes import parse_obj
+from armscan.storage.formats.meshes import parse_obj, stl_corners
 from armscan.storage.formats.ply import BYTE_ORDERS, TYPES, parse_ply
-from armscan.storage.formats.stl import stl_corners
 from armscan.storage.parts.step import STEP_SUFFIXES, ChordError, read_step
 
 MESH_SUFFIXES, SURFACE_SUFFIXES = (".stl", ".ply", ".obj"), (".stl", ".ply")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a cloud to a file of triangles."""
+"""From a cloud to a cleaned one, and to a file of triangles."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from armscan.errors import EstimationError, OptionError
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import part_of
+from armscan.inspection.cleaning import CleaningOptions, clean_cloud
 from armscan.jobs.job import Job
 from armscan.reconstruction.surface import (
     ScannedSurface,
@@ -17,8 +18,15 @@ from armscan.reconstruction.surface import (
     draw_surface,
     thinned_surface,
 )
+from armscan.report.inspection.cleaning import cleaning_page, cleaning_quantities, cleaning_table
 from armscan.report.quantity import Quantity, Summary, sentences
-from armscan.storage.clouds import read_cloud
+from armscan.storage.clouds import (
+    CLOUD_SUFFIXES,
+    cloud_bytes,
+    cloud_losses,
+    read_cloud,
+    read_cloud_file,
+)
 from armscan.storage.files import path_text
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.parts.meshes import SURFACE_SUFFIXES, encoded_surface
@@ -136,3 +144,44 @@ def _warnings(surface: ScannedSurface) -> tuple[str, ...]:
             "apart: the surface falls into strips; leave --cell out, or scan more densely"
         )
     return tuple(texts)
+
+
+def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
+    """Clean a cloud.
+
+    Parameters
+    ----------
+    job
+        Where to write the cleaned cloud; ``NAME.html`` is written beside it.
+    path
+        A cloud in any format that is read.
+    options
+        Which filters take points out.
+
+    Raises
+    ------
+    ArmscanError
+        If the file is unreadable, an option is wrong, or no point is left; nothing is written then.
+    """
+    if job.output is None:
+        raise OptionError("no output is named", where="-o", remedy="name the cloud to write")
+    places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
+    source = read_cloud_file(path)
+    cloud = source.cloud
+    found = clean_cloud(cloud, options)
+    losses = cloud_losses(found.cloud, job.output, source.dropped)
+    lost = (f"the new file does not hold: {', '.join(losses)}",) if losses else ()
+    warnings = (*found.warnings, *lost)
+    provenance = job.provenance((path,), (options,), warnings=warnings, forced=cloud.forced)
+    page = cleaning_page(found, cloud.points_mm, provenance, is_simulated=cloud.is_simulated)
+    written = job.write({places[0]: cloud_bytes(found.cloud, job.output), places[1]: page})
+    return Summary(
+        title="Cloud cleaned" + (" (simulated data)." if cloud.is_simulated else "."),
+        quantities=cleaning_quantities(found),
+        tables=(cleaning_table(found),),
+        warnings=sentences(warnings),
+        written=written,
+        next_step=f"open {places[1]}",
+        forced=cloud.forced,
+        extra={"kind": "cleaning", "simulated": cloud.is_simulated, "frame": cloud.frame},
+    )

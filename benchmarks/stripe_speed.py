@@ -25,7 +25,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.kernels.stripe.ridge import gaussian_taps
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import lit_plane
+from armscan.vision.stripe.image import StripeOptions, lit_plane
 from armscan.vision.stripe.ridge import find_candidates, trace_ridges
 from rigs.stripe_image import SimulatedStripe, StripeScene, WaveCurve
 
@@ -111,9 +111,12 @@ def ridge_points(exposure: Exposure) -> FloatArray:
     return trace_ridges(plane.image, runs, SIGMA_PX, level.rise).table[:, :2]
 
 
-def accepted_points(exposure: Exposure) -> FloatArray:
+FAST = StripeOptions(method="fast")
+
+
+def accepted_points(exposure: Exposure, options: StripeOptions | None = None) -> FloatArray:
     """All of the extraction: points, sigma, flags."""
-    profile = extract_stripes(exposure)
+    profile = extract_stripes(exposure, options)
     return profile.points_px[profile.is_accepted]
 
 
@@ -161,6 +164,7 @@ def main() -> None:
         image = exposure.image
         work: dict[str, Callable[[], FloatArray]] = {
             "points, sigma, flags": lambda e=exposure: accepted_points(e),
+            "points, sigma, flags: fast": lambda e=exposure: accepted_points(e, FAST),
             "ridge points, linked": lambda e=exposure: ridge_points(e),
             "OpenCV + numpy Steger": lambda i=image: opencv_steger(i),
         }

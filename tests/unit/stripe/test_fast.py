@@ -221,3 +221,14 @@ def test_a_bend_is_known_as_well_as_it_is_said() -> None:
     x = np.arange(-half, half + 1.0)
     bends = [2.0 * np.polyfit(x, rng.normal(size=len(x)), 2)[0] for _ in range(3000)]
     assert np.var(bends) == pytest.approx(columns.BEND_VARIANCE, rel=0.1)
+
+
+def test_faint_reflections_are_left_out() -> None:
+    bright, faint = (
+        SimulatedStripe(StraightCurve(160.0, y, 3.0), peak=peak)
+        for y, peak in ((60.0, 200.0), (160.0, 14.0))
+    )
+    profile = extract_stripes(StripeScene((bright, faint), 320, 240).expose(0), FAST)
+    found = profile.points_px[profile.is_accepted, 1]
+    assert len(found) > 300
+    assert (found < 100.0).all()

@@ -396,25 +396,23 @@ def mean_along(values: Table, weight: Table, start: Ints, half: int, mean: Table
     ``values``, ``weight``: (M, N); values of weight 0 may be NaN. ``start``: (C + 1,) of
     `gather_chains`. ``mean``: (M, N) output, NaN where the weights sum to 0.
     """
-    n_rows = values.shape[0]
-    total, norm = np.zeros(n_rows), np.zeros(n_rows)
-    for c in range(start.shape[0] - 1):
-        first, stop = start[c], start[c + 1]
-        total[:] = 0.0
-        norm[:] = 0.0
-        for i in range(first - half, stop):
-            ahead, behind = i + half, i - half - 1
-            for row in range(n_rows):
+    for row in range(values.shape[0]):
+        own, weights = values[row], weight[row]
+        for c in range(start.shape[0] - 1):
+            first, stop = start[c], start[c + 1]
+            total = norm = 0.0
+            for i in range(first, min(first + half, stop)):
+                total += weights[i] * own[i] if weights[i] > 0.0 else 0.0
+                norm += weights[i]
+            for i in range(first, stop):
+                ahead, behind = i + half, i - half - 1
                 if ahead < stop:
-                    w = weight[row, ahead]
-                    total[row] += w * values[row, ahead] if w > 0.0 else 0.0
-                    norm[row] += w
+                    total += weights[ahead] * own[ahead] if weights[ahead] > 0.0 else 0.0
+                    norm += weights[ahead]
                 if behind >= first:
-                    w = weight[row, behind]
-                    total[row] -= w * values[row, behind] if w > 0.0 else 0.0
-                    norm[row] -= w
-                if i >= first:
-                    mean[row, i] = total[row] / norm[row] if norm[row] > 1e-9 else np.nan
+                    total -= weights[behind] * own[behind] if weights[behind] > 0.0 else 0.0
+                    norm -= weights[behind]
+                mean[row, i] = total / norm if norm > 1e-9 else np.nan
 
 
 @compiled(error_model="numpy", fastmath=True)

@@ -71,21 +71,22 @@ class ImageLevel:
 
 
 def measure_level(
-    image: FloatImage | ImageArray, threshold: float | None, scale: float = 1.0
+    image: FloatImage | ImageArray, threshold: float | None, scale: float = 1.0, sparse: int = 1
 ) -> ImageLevel:
     """Estimate background and noise from a sample of the pixels.
 
     ``image``: (H, W) float32, or as the camera delivered it. ``threshold``: Least height of a line
     above the background, or None to set it from the noise. ``scale``: What ``image`` is to be
-    multiplied by; level and threshold are then of that.
+    multiplied by; level and threshold are then of that. ``sparse``: By which the distances between
+    sampled rows and columns of bytes are multiplied; 1, 2 or 4.
     """
     factor = np.float32(scale)
-    background = np.asarray(_cell_quantiles(image) * factor, dtype=np.float32)
-    noise = _noise(image, 1, factor)
-    clutter = max(_noise(image, CLUTTER_LAG_PX, factor), noise)
+    background = np.asarray(_cell_quantiles(image, sparse) * factor, dtype=np.float32)
+    noise = _noise(image, 1, factor, sparse)
+    clutter = max(_noise(image, CLUTTER_LAG_PX, factor, sparse), noise)
     peaks = _cell_peaks(image)
     if threshold is None:
-        peak = _brightest(image, peaks, factor) - float(np.median(background))
+        peak = _brightest(image, peaks, factor, sparse) - float(np.median(background))
         threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
     # between cells the background is linear: never below the least of them
     least = minimum_filter(background, 3, mode="nearest") + (threshold - ROUNDING)
@@ -136,15 +137,15 @@ def is_of_bytes(image: FloatImage | ImageArray) -> TypeGuard[NDArray[np.uint8]]:
     return image.dtype == np.uint8 and image.flags.c_contiguous
 
 
-def _cell_quantiles(image: FloatImage | ImageArray) -> FloatImage:
+def _cell_quantiles(image: FloatImage | ImageArray, sparse: int) -> FloatImage:
     height, width = image.shape
     rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
+    if is_of_bytes(image):
+        levels, step = np.zeros((rows, columns), np.float32), sparse * SAMPLE_STEP_PX
+        rank_cells(image, CELL_PX, step, int(BACKGROUND_QUANTILE * (CELL_PX // step) ** 2), levels)
+        return levels
     steps = CELL_PX // SAMPLE_STEP_PX
     k = int(BACKGROUND_QUANTILE * steps * steps)
-    if is_of_bytes(image):
-        levels = np.zeros((rows, columns), np.float32)
-        rank_cells(image, CELL_PX, SAMPLE_STEP_PX, k, levels)
-        return levels
     # of single precision: smaller numbers are sorted more slowly
     sample = image[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].astype(np.float32)
     missing = (rows * steps - sample.shape[0], columns * steps - sample.shape[1])
@@ -159,13 +160,16 @@ def _cell_quantiles(image: FloatImage | ImageArray) -> FloatImage:
 PEAK_STEP_PX = 2
 
 
-def _brightest(image: FloatImage | ImageArray, peaks: FloatImage, factor: np.float32) -> float:
+def _brightest(
+    image: FloatImage | ImageArray, peaks: FloatImage, factor: np.float32, sparse: int
+) -> float:
     """The level that a share of `PEAK_QUANTILE` of the pixels stays below, times a factor.
 
     ``peaks``: (rows, columns) of `_cell_peaks`.
     """
-    sample = image[::PEAK_STEP_PX, ::PEAK_STEP_PX]
-    few = sample[::8, ::8].astype(np.float32).ravel()
+    pixel_step = PEAK_STEP_PX * sparse if is_of_bytes(image) else PEAK_STEP_PX
+    sample = image[::pixel_step, ::pixel_step]
+    few = sample[:: 16 // pixel_step, :: 16 // pixel_step].astype(np.float32).ravel()
     # nearly all pixels are dark: the bright ones are sorted alone
     k = int(0.98 * (len(few) - 1))
     limit = float(np.partition(few, k)[k])
@@ -173,7 +177,7 @@ def _brightest(image: FloatImage | ImageArray, peaks: FloatImage, factor: np.flo
     if is_of_bytes(image):
         counts = np.zeros(256, np.int64)
         is_bright_cell = (peaks > limit).view(np.uint8)
-        count_bright(image, is_bright_cell, CELL_PX, PEAK_STEP_PX, int(limit), counts)
+        count_bright(image, is_bright_cell, CELL_PX, pixel_step, int(limit), counts)
         n_bright = int(counts.sum())
         if n_bright - 1 > n_above:
             place = n_bright - 1 - n_above
@@ -194,15 +198,16 @@ def _level_at(counts: IntArray, place: int) -> int:
 NOISE_STEP_PX, NOISE_ROW_STEP_PX = 3, 2 * SAMPLE_STEP_PX
 
 
-def _noise(image: FloatImage | ImageArray, lag: int, factor: np.float32) -> float:
+def _noise(image: FloatImage | ImageArray, lag: int, factor: np.float32, sparse: int) -> float:
     """Standard deviation of pixels against others of their row at a distance."""
     if image.shape[1] <= lag:
         return LEAST_NOISE
     if is_of_bytes(image):
         height, width = image.shape
-        rows, columns = -(-height // NOISE_ROW_STEP_PX), -(-(width - lag) // NOISE_STEP_PX)
+        row_step = sparse * NOISE_ROW_STEP_PX
+        rows, columns = -(-height // row_step), -(-(width - lag) // NOISE_STEP_PX)
         step, counts = np.zeros((rows, columns), np.float32), np.zeros(256, np.int64)
-        read_steps(image, NOISE_ROW_STEP_PX, NOISE_STEP_PX, lag, step, counts)
+        read_steps(image, row_step, NOISE_STEP_PX, lag, step, counts)
         if factor != 1.0:
             step *= factor
         middle = _level_at(counts, step.size // 2) + _level_at(counts, (step.size - 1) // 2)

@@ -27,11 +27,13 @@ from stripe_speed import machine, opencv_steger
 
 from armscan.devices.sources import ScanSource, TwinScene
 from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import StageClock, peak_memory_mb
-from armscan.pipeline.scan import measure_long_scan, scan_spool
+from armscan.pipeline.scan import ScanOptions, measure_long_scan, scan_spool
 from armscan.pipeline.simulate import TwinName, fewer_views
 from armscan.records.exposure import Exposure
 from armscan.storage.recording import read_recording, write_recording
+from armscan.vision.stripe.image import StripeOptions
 from rigs.true_scanner import true_scanner
 
 
@@ -60,11 +62,13 @@ def least_ms(work: Callable[[], object], repeats: int) -> float:
     return 1e3 * min(times)
 
 
-def chain(source: Any, scanner: ScannerCalibration, clock: StageClock | None = None) -> int:
+def chain(
+    source: Any, scanner: ScannerCalibration, options: ScanOptions, clock: StageClock | None = None
+) -> int:
     """Points of a scan in Base, with normals."""
     with tempfile.TemporaryDirectory() as place:
         spool = scan_spool(scanner, Path(place))
-        measure_long_scan(source, scanner, spool, clock=clock)
+        measure_long_scan(source, scanner, spool, options, clock=clock)
         return len(spool)
 
 
@@ -78,7 +82,7 @@ def on_cores(count: int, work: Callable[[], object], repeats: int) -> float:
         os.sched_setaffinity(0, before)
 
 
-def measure(head: str, scene: TwinScene, most: int, repeats: int) -> None:
+def measure(head: str, scene: TwinScene, most: int, repeats: int, options: ScanOptions) -> None:
     twin = TwinName(head, "thesis", 1).build()
     scanner = true_scanner(twin)
     with tempfile.TemporaryDirectory() as place:
@@ -91,10 +95,10 @@ def measure(head: str, scene: TwinScene, most: int, repeats: int) -> None:
         kept = InMemory(recording)
     images = [kept.exposure(k).image for k in rows]
     steger = least_ms(lambda: [opencv_steger(image) for image in images], repeats) / n
-    alone = on_cores(1, lambda: chain(kept, scanner), repeats) / n
-    both = on_cores(2, lambda: chain(kept, scanner), repeats) / n
+    alone = on_cores(1, lambda: chain(kept, scanner, options), repeats) / n
+    both = on_cores(2, lambda: chain(kept, scanner, options), repeats) / n
     clock = StageClock()
-    n_points = chain(kept, scanner, clock)
+    n_points = chain(kept, scanner, options, clock)
     print(
         f"| {head}, {scene} | {n} | {len(rows) // n} | {n_points / n:,.0f} | {decoding:.1f} | "
         f"{alone:.1f} | {both:.1f} | {steger:.1f} | {both / steger:.2f} | {1e3 / alone:.1f} |"
@@ -110,7 +114,10 @@ def main() -> None:
     parser.add_argument("--scene", default="ball")
     parser.add_argument("--most", type=int, default=40)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--stripe-method", default="fit")
     given = parser.parse_args()
+    stripes = StripeOptions(method=given.stripe_method)
+    options = ScanOptions(measure=MeasureOptions(stripes=stripes))
     cv2.setNumThreads(1)
     print(machine())
     print(
@@ -119,7 +126,7 @@ def main() -> None:
     )
     print("|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|")
     for head in given.heads:
-        measure(head, given.scene, given.most, given.repeats)
+        measure(head, given.scene, given.most, given.repeats, options)
 
 
 if __name__ == "__main__":

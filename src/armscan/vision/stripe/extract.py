@@ -18,7 +18,6 @@ from armscan.kernels.stripe.section import (
 from armscan.kernels.stripe.smoothing import find_pulls, take_out_bends
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, Profile, StripeFlag
-from armscan.vision.stripe.columns import extract_fast
 from armscan.vision.stripe.fit import ProfileFits, fit_ridge
 from armscan.vision.stripe.flags import (
     MERGED_SIGMAS,
@@ -104,7 +103,7 @@ def extract_stripes(
             return _find(exposure, *lit_plane(exposure, threshold), options, threshold)
         if options.method == "fast" and is_of_bytes(exposure.image):
             level = measure_level(exposure.image, threshold, 1.0 / full_scale, SPARSE)
-            return extract_fast(exposure, None, level, options)
+            return _find_fast(exposure, None, level, options)
     if exposure.colour == "mono":
         plane = mono_plane(exposure, background)
     else:
@@ -114,8 +113,17 @@ def extract_stripes(
         plane = replace(plane, reflectance=ground)
     level = measure_level(plane.image, threshold)
     if options.method == "fast":
-        return extract_fast(exposure, plane, level, options)
+        return _find_fast(exposure, plane, level, options)
     return _find(exposure, plane, level, options, threshold)
+
+
+def _find_fast(
+    exposure: Exposure, plane: StripePlane | None, level: ImageLevel, options: StripeOptions
+) -> Profile:
+    # its loops are compiled only where they are asked for
+    from armscan.vision.stripe.columns import extract_fast
+
+    return extract_fast(exposure, plane, level, options)
 
 
 def _find(

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from armscan.cli.run import VARIABLE, give_kernels_a_folder
+from armscan.jobs.info import kernel_modules
 from armscan.kernels import arrays
 from armscan.kernels.arrays import load_kernels
 
@@ -189,3 +190,14 @@ def test_a_kernel_that_fails_is_named_and_the_others_are_loaded(
         assert len(module.mean.overloads) == 1
     finally:
         arrays._WAITING.pop("kernels_of_a_test.broken")
+
+
+def test_every_module_of_kernels_is_compiled_ahead() -> None:
+    folder = Path(arrays.__file__).parent
+    files = {
+        ".".join(("armscan.kernels", *path.relative_to(folder).with_suffix("").parts))
+        for path in folder.rglob("*.py")
+    }
+    wanted = {name for name in files if not name.endswith("__init__")}
+    assert wanted <= set(kernel_modules())
+    assert "armscan.kernels.stripe.columns" in wanted

@@ -127,7 +127,8 @@ StripeMethodOption = Annotated[
     str | None,
     typer.Option(
         "--stripe-method",
-        help="fit; fast, in few passes; or the thesis's threshold, centroid, template, hessian.",
+        help="fit; fast, of lines in the dark, not on lit boards; or the thesis's threshold, "
+        "centroid, template, hessian.",
         show_default=DefaultOf(STRIPES + "method"),
     ),
 ]

@@ -670,14 +670,20 @@ def _compiler_fact(problems: list[str]) -> str:
     return f"works ({time.perf_counter() - start:.1f} s for a first function)"
 
 
+def kernel_modules() -> tuple[str, ...]:
+    """Names of all modules that hold compiled loops of measuring."""
+    found = pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}.")
+    return tuple(item.name for item in found)
+
+
 def _compile_kernels(problems: list[str]) -> str:
     from armscan.kernels.arrays import COMPILED, load_kernels
 
-    for item in pkgutil.iter_modules(kernels.__path__):
+    for name in kernel_modules():
         try:
-            importlib.import_module(f"{kernels.__name__}.{item.name}")
+            importlib.import_module(name)
         except Exception as error:
-            problems.append(f"kernel module {item.name} cannot be imported ({error})")
+            problems.append(f"kernel module {name} cannot be imported ({error})")
     failures = load_kernels()
     problems += [f"kernel {name} does not compile ({error})" for name, error in failures.items()]
     seconds = sum(COMPILED.values())

@@ -34,6 +34,7 @@ from armscan.storage.formats.ply import (
     read_ply,
 )
 from armscan.storage.formats.text import SIGMA_LOSS, XYZ_LOSES, xyz_bytes
+from armscan.storage.image_paths import are_simulated
 from armscan.storage.parts.meshes import MESH_SUFFIXES, encoded_surface, read_part
 from armscan.storage.parts.step import STEP_SUFFIXES, ChordError
 
@@ -350,7 +351,9 @@ def _convert_model(source: Path, output: Path, *, is_overwriting: bool) -> Conve
     """Write the triangles of a part's model as STL."""
     check_outputs((output,), is_overwriting=is_overwriting)
     part = read_part(source)
-    content = encoded_surface(".stl", part.vertices_mm, part.triangles, f"{source.name}, mm")
+    is_simulated = are_simulated((source,))
+    title = f"{source.name}, mm{', simulated data' if is_simulated else ''}"
+    content = encoded_surface(".stl", part.vertices_mm, part.triangles, title)
     write_files({output: content}, is_overwriting=is_overwriting)
     is_step = source.suffix.lower() in STEP_SUFFIXES
     losses = ("names of faces", "digits beyond single precision")

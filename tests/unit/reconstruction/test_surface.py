@@ -183,6 +183,7 @@ def test_files_hold_what_another_program_reads(suffix: str) -> None:
         assert np.array_equal(np.frombuffer(body[: 4 * 24], "<f8").reshape(4, 3), vertices)
         assert body[96] == 3 and np.array_equal(np.frombuffer(body[97:109], "<i4"), triangles[0])
         return
+    assert not data.startswith(b"solid")
     assert int.from_bytes(data[80:84], "little") == 2 and len(data) == 84 + 2 * 50
     facet = np.frombuffer(data[84:132], "<f4").reshape(4, 3)
     np.testing.assert_array_equal(facet[0], [0.0, 0.0, -1.0])

@@ -198,7 +198,8 @@ def test_smoothing_is_a_local_quadratic_with_its_variance_slope_and_bend() -> No
     halves = np.array([3, 7])
     weights = np.zeros((2, 8))
     weights[0, :4], weights[1] = quadratic_weights(3)[3:], quadratic_weights(7)[7:]
-    inflation = np.array([(quadratic_weights(h) ** 2).sum() for h in halves])
+    norm = (quadratic_weights(7) ** 2).sum()
+    inflation = np.ones(2)
     result = np.zeros((columns.SMOOTH_ROWS, 60))
     given = (centre, np.full(60, 0.01), np.array([0, 60]), halves, weights, inflation)
     columns.smooth_stretches(*given, 2.2, result)
@@ -206,7 +207,7 @@ def test_smoothing_is_a_local_quadratic_with_its_variance_slope_and_bend() -> No
     inner = slice(columns.TANGENT_HALF, 60 - columns.TANGENT_HALF)
     np.testing.assert_allclose(result[columns.SLOPE, inner], (0.3 + 0.008 * x)[inner], atol=1e-9)
     np.testing.assert_allclose(result[columns.BEND, inner], 0.008, atol=1e-9)
-    assert result[columns.SMOOTH_VARIANCE, 30] == pytest.approx(0.01 * inflation[1])
+    assert result[columns.SMOOTH_VARIANCE, 30] == pytest.approx(0.01 * norm)
     assert result[columns.SMOOTH_VARIANCE, 1] == pytest.approx(0.01)
 
     noisy = centre + np.random.default_rng(0).normal(0.0, 0.1, 60)
@@ -232,3 +233,42 @@ def test_faint_reflections_are_left_out() -> None:
     found = profile.points_px[profile.is_accepted, 1]
     assert len(found) > 300
     assert (found < 100.0).all()
+
+
+def test_points_beside_worse_ones_do_not_state_their_own_variance_alone() -> None:
+    weights = np.zeros((1, 4))
+    weights[0] = quadratic_weights(3)[3:]
+    variance = np.where(np.arange(40) < 20, 0.01, 1.0)
+    result = np.zeros((columns.SMOOTH_ROWS, 40))
+    stretch = np.array([0, 40])
+    columns.smooth_stretches(
+        np.zeros(40), variance, stretch, np.array([3]), weights, np.ones(1), 2.2, result
+    )
+    full = quadratic_weights(3) ** 2
+    for i in (10, 18, 19, 20, 30):
+        expected = (full * variance[i - 3 : i + 4]).sum()
+        assert result[columns.SMOOTH_VARIANCE, i] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_the_border_of_a_narrow_image_ends_no_line(is_turned: bool) -> None:
+    scene = StripeScene((SimulatedStripe(StraightCurve(24.0, 200.0, 27.0)),), 48, 400)
+    exposure = scene.expose(1)
+    if is_turned:
+        exposure = Exposure(np.ascontiguousarray(exposure.image.T), "turned")
+    profile = extract_stripes(exposure, FAST)
+    assert profile.is_accepted.sum() == 48
+
+
+def test_what_lacks_the_laser_colour_is_left_out() -> None:
+    red = StripeScene((SimulatedStripe(StraightCurve(160.0, 70.0, 3.0)),), 320, 240)
+    white = StripeScene((SimulatedStripe(StraightCurve(160.0, 170.0, 3.0)),), 320, 240)
+    image = np.maximum(
+        red.expose_red(1, overdrive=1.0).image,
+        np.repeat(white.expose(2).image[:, :, None], 3, axis=2),
+    )
+    options = StripeOptions(method="fast", laser_colour="red")
+    profile = extract_stripes(Exposure(image, "colour"), options)
+    found = profile.points_px[profile.is_accepted, 1]
+    assert len(found) > 280
+    assert (found < 120.0).all()

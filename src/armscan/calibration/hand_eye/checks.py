@@ -267,11 +267,12 @@ def likeliest_start(problem: Problem, start: Start, cause: str) -> Start | FitFa
 
 def explain_misfit(problem: Problem, plate: PlateSurface, start: Start) -> FitFailure:
     """Say why no hand-eye fits: another plane, another reading of the poses, or neither."""
-    observations, limit_mm = problem.observations, problem.options.max_rms_mm
+    observations = problem.observations
+    limit_mm = problem.far_mm(problem.place(problem.start(start.tool_from_sensor)))
     typical_mm = start.typical_mm
     fact = (
         f"no hand-eye fits: the stripes of the typical posture lie {typical_mm:.2f} mm from "
-        f"the plate, more than {limit_mm:g} mm"
+        f"the plate, more than {limit_mm:.3g} mm"
     )
     refusal = find_mirror(problem, plate, start, smaller=BETTER)
     if refusal is None:

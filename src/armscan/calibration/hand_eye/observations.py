@@ -88,7 +88,7 @@ class HandEyeOptions:
         Postures on a sphere whose pose errs by more than this many standard deviations lose weight.
     max_rms_mm
         Typical distance of a posture's points from the reference above which the data contradict
-        each other and no hand-eye is returned.
+        each other and no hand-eye is returned, where the sensor's own error does not explain more.
     """
 
     arm_position_mm: float | None = None

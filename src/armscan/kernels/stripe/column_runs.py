@@ -234,8 +234,8 @@ def link_columns(
 
 POINT_COLUMN, POINT_LOW, POINT_HIGH, POINT_BELOW, POINT_ABOVE, POINT_CHAIN = range(6)
 POINT_COLUMNS = 6
-"""Of a point: column, first and last row of its run, rows that are free before the next run on the
-side of smaller and of larger rows, and number of its chain."""
+"""Of a point: column, first and last row of its run, rows to the next run on the side of smaller
+and of larger rows (1: they touch), and number of its chain."""
 FREE_PX = 100000
 OTHER_SHARE = 0.25
 """Of a run's length: shorter ones beside it are its own speckle, not another line."""

@@ -575,10 +575,10 @@ def smooth_stretches(
     ``centre``, ``variance``: (N,) of points; stretches are consecutive. ``start``: (S + 1,) where
     each stretch begins. ``halves``: (K,) half windows, increasing. ``weights``: (K, H + 1) of the
     quadratic's value, from the middle on. ``inflation``: (K,) variance that the estimate has over
-    the mean of its points'. ``result``: (4, N) output.
+    that of points which err on their own. ``result``: (4, N) output.
     """
     n_windows, n = halves.shape[0], centre.shape[0]
-    total, sums = np.zeros((n_windows, n)), np.zeros((2, n))
+    total, spread, sums = np.zeros((n_windows, n)), np.zeros((n_windows, n)), np.zeros((2, n))
     middle = TANGENT_HALF * (TANGENT_HALF + 1.0) / 3.0
     for s in range(start.shape[0] - 1):
         for k in range(n_windows):
@@ -588,8 +588,11 @@ def smooth_stretches(
                 break
             for i in range(first, stop):
                 total[k, i] = weights[k, 0] * centre[i]
+                spread[k, i] = weights[k, 0] * weights[k, 0] * variance[i]
             for way in range(1, half + 1):
-                add_shifted(centre, first, stop, way, weights[k, way], 1.0, total[k])
+                share = weights[k, way]
+                add_shifted(centre, first, stop, way, share, 1.0, total[k])
+                add_shifted(variance, first, stop, way, share * share, 1.0, spread[k])
         first, stop = start[s] + TANGENT_HALF, start[s + 1] - TANGENT_HALF
         for way in range(1, TANGENT_HALF + 1):
             if stop > first:
@@ -608,12 +611,12 @@ def smooth_stretches(
             for k in range(n_windows):
                 if halves[k] > room:
                     break
-                spread = variance[i] * inflation[k]
-                reach = confidence * math.sqrt(spread)
+                square = spread[k, i] * inflation[k]
+                reach = confidence * math.sqrt(square)
                 low, high = max(low, total[k, i] - reach), min(high, total[k, i] + reach)
                 if low > high:
                     break
-                best, own = total[k, i], spread
+                best, own = total[k, i], square
             result[SMOOTHED, i] = best
             result[SMOOTH_VARIANCE, i] = own
             if room >= TANGENT_HALF:

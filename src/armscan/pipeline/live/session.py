@@ -45,6 +45,7 @@ from armscan.pipeline.measure import (
 from armscan.reconstruction.labels import PointStatus, StripeLabeller
 from armscan.reconstruction.place import BaseTransform, merge_clouds, propagate_to_base
 from armscan.records.cloud import PointCloud
+from armscan.vision.stripe.extract import load_stripe_method
 
 NEW_PASS_RAD = np.radians(25.0)
 """The head shows another side: a pass of its own, that can be undone by itself."""
@@ -332,6 +333,7 @@ class LiveSession:
             raise DeviceError("a session is opened once", remedy="make a new one")
         if self._labeller is not None:
             # no exposure waits for a loop to be loaded or compiled
+            load_stripe_method(self.options.measure.stripes.method)
             load_kernels()
         try:
             for control, camera in zip(self._controls, self._rig.cameras, strict=True):

@@ -249,5 +249,5 @@ def _stl(vertices: FloatArray, triangles: IntArray, title: str) -> bytes:
     rows["normal"] = np.divide(across, length, out=np.zeros_like(across), where=length > 0.0)
     rows["corners"] = corners
     # a reader takes a file that begins with "solid" for text
-    head = title.encode("ascii", "replace")[:_HEADER_BYTES].ljust(_HEADER_BYTES)
+    head = f"armscan: {title}".encode("ascii", "replace")[:_HEADER_BYTES].ljust(_HEADER_BYTES)
     return head + np.array(len(rows), "<u4").tobytes() + rows.tobytes()

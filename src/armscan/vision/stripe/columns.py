@@ -73,7 +73,13 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.stripe.fit import start_noise
 from armscan.vision.stripe.flags import MERGED_SIGMAS, close_gaps
-from armscan.vision.stripe.image import NORMAL_SCALE, StripeOptions, StripePlane
+from armscan.vision.stripe.image import (
+    NORMAL_SCALE,
+    StripeOptions,
+    StripePlane,
+    has_laser_colour,
+    is_on_known_ground,
+)
 from armscan.vision.stripe.ridge import (
     FAINTEST_SHARE,
     LONGEST_RUN_PX,
@@ -127,7 +133,7 @@ class Pixels:
     @classmethod
     def of_plane(cls, plane: StripePlane, brightest: float) -> Pixels:
         """Any other plane; what is sought is stretched to eight bits."""
-        unit = (DARKEST_SOUGHT - 1.0) / max(brightest, 1.0)
+        unit = BRIGHTEST_SOUGHT / max(brightest, 1.0)
         sought = np.clip(plane.image * np.float32(unit), 0.0, 255.0).astype(np.uint8)
         return cls(sought, unit, NO_BYTES, 1.0, plane.image, plane.clipped, np.inf)
 
@@ -175,11 +181,14 @@ def _widened(image: Plane, columns: int) -> Plane:
     return cast(Plane, np.pad(image, ((0, 0), (0, columns)), mode="edge"))
 
 
-DARKEST_SOUGHT = 255.0
+BRIGHTEST_SOUGHT = 254.0
+"""Level of bytes for the brightest pixel of a plane: thresholds stay below it."""
 MOST_RUNS_A_COLUMN = 16
 """For which there is room at once."""
 MEAN_HALF = 8
 """Neighbours over which width, height and background beside the line are averaged."""
+MOST_OFF_SIGMAS = 2.0
+"""Of a line, by which the first pass may move the middle of a run."""
 LEAST_RATIO = 1.3
 """Of a line's height over the threshold, from which its width is told by the length of its runs."""
 CLEAR_SIGMAS = 3.0
@@ -261,6 +270,8 @@ def find_columns(
     pixels: Pixels, level: ImageLevel, smoothing_px: float
 ) -> tuple[ColumnPoints | None, MaskImage]:
     """Centres in the columns of an image, and cells (rows, columns) with other lit pixels."""
+    height, width = pixels.sought.shape
+    pixels = pixels.wide_enough()
     chains = _find_chains(pixels, level)
     points, start = chains.points, chains.start
     if not len(points):
@@ -269,7 +280,6 @@ def find_columns(
     noise = start_noise(level.noise).astype(np.float32)
     table = np.zeros((SECOND_ROWS, len(points)))
     fit_columns(*_read(pixels), pixels.clipped, pixels.clip, points, first, noise, table)
-    height, width = pixels.sought.shape
     # of a column that the border cuts, the run tells no middle
     is_cut = (points[:, POINT_LOW] == 0) | (points[:, POINT_HIGH] == height - 1)
     table[VARIANCE, is_cut] = 0.0
@@ -357,9 +367,11 @@ def _look(pixels: Pixels, level: ImageLevel, chains: _Chains) -> tuple[FloatArra
     other = np.where(np.isnan(high_side), base, high_side)
     first[LOW_SIDE] = np.where(np.isnan(low_side), other, low_side)
     first[HIGH_SIDE] = np.where(np.isnan(high_side), first[LOW_SIDE], high_side)
-    is_lost = np.flatnonzero(height == 0.0)
+    middle = 0.5 * (chains.points[:, POINT_LOW] + chains.points[:, POINT_HIGH])
+    is_off = np.abs(first[CENTRE] - middle) > MOST_OFF_SIGMAS * sigma
+    is_lost = np.flatnonzero((height == 0.0) | is_off)
     first[AMPLITUDE, is_lost] = np.maximum(measured[RUN_HEIGHT, is_lost], 1.0)
-    first[CENTRE, is_lost] = 0.5 * chains.points[is_lost][:, [POINT_LOW, POINT_HIGH]].sum(axis=1)
+    first[CENTRE, is_lost] = middle[is_lost]
     return first, measured[RUN_DIPS] > 0.0
 
 
@@ -459,7 +471,7 @@ def _smooth(chains: _Chains, found: ColumnPoints, smoothing_px: float) -> Column
         weights = np.zeros((len(halves), halves[-1] + 1))
         for k, one in enumerate(halves):
             weights[k, : one + 1] = _half_weights(int(one))
-        inflation = np.array([inflation_of(correlation, one) * _norm(int(one)) for one in halves])
+        inflation = np.array([inflation_of(correlation, one) for one in halves])
         smoothed = np.zeros((SMOOTH_ROWS, len(rows)))
         own = own * correlation[0]
         smooth_stretches(centre, own, start, halves, weights, inflation, CONFIDENCE, smoothed)
@@ -500,12 +512,6 @@ def _half_weights(half: int) -> FloatArray:
     return weights
 
 
-@cache
-def _norm(half: int) -> float:
-    """Variance of a local quadratic's middle for white noise, over that of its points."""
-    return float((quadratic_weights(half) ** 2).sum())
-
-
 def _correlation(
     centre: FloatArray, variance: FloatArray, start: IntArray, half_px: float
 ) -> FloatArray | None:
@@ -534,16 +540,16 @@ def extract_fast(
         pixels = Pixels.of_bytes(image, exposure.full_scale)
     else:
         raise TypeError(f"an image of {image.dtype} needs its plane")
-    down, left_out = find_columns(pixels.wide_enough(), level, options.smoothing_px)
-    found = [] if down is None else [_to_profile(exposure, down, is_row=False)]
+    down, left_out = find_columns(pixels, level, options.smoothing_px)
+    found = [] if down is None else [_to_profile(exposure, plane, down, is_row=False)]
     if left_out.any():
         turned = replace(
             level,
             background=np.ascontiguousarray(level.background.T),
             lit=np.ascontiguousarray(level.lit.T),
         )
-        along, _ = find_columns(pixels.transposed.wide_enough(), turned, options.smoothing_px)
-        found += [] if along is None else [_to_profile(exposure, along, is_row=True)]
+        along, _ = find_columns(pixels.transposed, turned, options.smoothing_px)
+        found += [] if along is None else [_to_profile(exposure, plane, along, is_row=True)]
     found = [part for part in found if len(part)]
     if len(found) > 1:
         after = found[1].segment + found[0].segment[-1] + 1
@@ -551,8 +557,13 @@ def extract_fast(
     return found[0] if found else Profile.empty(source=exposure.source)
 
 
-def _to_profile(exposure: Exposure, found: ColumnPoints, is_row: bool) -> Profile:
-    """Points in full-sensor pixels, those left out whose line is rather the other pass's."""
+def _to_profile(
+    exposure: Exposure, plane: StripePlane | None, found: ColumnPoints, is_row: bool
+) -> Profile:
+    """Points in full-sensor pixels, those left out whose line is rather the other pass's.
+
+    Left out, too, is what lacks the laser's colour, and what was white without it.
+    """
     steep = np.abs(found.trend)
     keep = (steep < 1.0 / STEEPEST) if is_row else (steep <= STEEPEST)
     keep &= (found.table[VARIANCE] > 0.0) & (np.abs(found.slope) < MOST_SLOPE)
@@ -571,7 +582,7 @@ def _to_profile(exposure: Exposure, found: ColumnPoints, is_row: bool) -> Profil
     if is_short.any():
         flags = flags | np.where(is_short[segment], int(StripeFlag.SHORT_SEGMENT), 0)
     binning = exposure.window.binning
-    return Profile(
+    profile = Profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(at),
         normals_px=normals,
@@ -582,6 +593,15 @@ def _to_profile(exposure: Exposure, found: ColumnPoints, is_row: bool) -> Profil
         segment=segment,
         noise_length=kept.noise_length,
     )
+    if plane is None or not len(at):
+        return profile
+    across_px = float(np.median(kept.table[SIGMA] * across))
+    rows, keep = np.concatenate([at, normals], axis=1), np.ones(len(at), dtype=np.bool_)
+    if plane.gate is not None:
+        keep &= has_laser_colour(plane.gate, rows, segment, across_px)
+    if plane.unknown is not None:
+        keep &= is_on_known_ground(plane.unknown, rows, across_px)
+    return profile.select(keep)
 
 
 def _arc_lengths(points: FloatArray, segment: IntArray) -> FloatArray:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -115,6 +116,12 @@ def extract_stripes(
     if options.method == "fast":
         return _find_fast(exposure, plane, level, options)
     return _find(exposure, plane, level, options, threshold)
+
+
+def load_stripe_method(method: str) -> None:
+    """Import what a method needs besides, so that `load_kernels` finds its loops."""
+    if method == "fast":
+        importlib.import_module("armscan.vision.stripe.columns")
 
 
 def _find_fast(

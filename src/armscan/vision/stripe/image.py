@@ -44,13 +44,14 @@ class StripeOptions:
     ----------
     method
         ``fit`` (noise-weighted profile fit, smoothed along the line), ``fast`` (each column or row
-        by itself in few passes, for live scans) or one of the thesis's four.
+        by itself in few passes: for lines in the dark, not on lit boards) or one of the thesis's
+        four.
     laser_colour
         What of a colour image shows the line: a channel of the laser's colour; ``grey``, the mean
         of all; an excess, a channel less the mean of the two others (``green-excess``); or a
         difference of two (``green-red`` is green less red). ``auto`` finds it.
     line_sigma_px
-        Sigma of the line's cross-section, or None to find it.
+        Sigma of the line's cross-section, or None to find it; ``fast`` always finds it.
     threshold
         Least height of a line above its background in grey levels, or None to set it from the
         image's noise.

@@ -3,14 +3,22 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from net.cases import GROUPS
-from net.compare import Limits
+from net.compare import Difference, Limits
 from net.run import compare_group
 
+GOLDEN_PROCESSOR = "Intel(R) Xeon(R) Processor"
+"""On which golden/ was written. Others round otherwise (fused products, widths of vectors)."""
+ELSEWHERE = Limits(1e-2, 0.1)
+"""On a processor of another maker the tree that wrote golden/ differs by up to 6e-3 of a value, in
+figures of the smallest differences; a share of points, by one point of some hundred."""
+NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]?\d+)?")
 # The noise's rounds of a hand-eye end where no scatter changes by 2 %: on another machine than that
 # of golden/ values moved by up to 6e-5 of themselves.
 LIMITS = {"hand-eye": Limits(1e-4, 1e-2)}
@@ -19,8 +27,35 @@ LIMITS = {"hand-eye": Limits(1e-4, 1e-2)}
 UNSETTLED = "hand-eye/several/"
 
 
+def is_processor_of_golden() -> bool:
+    """True where values must be the same to the last digits that are compared."""
+    facts = Path("/proc/cpuinfo")
+    return facts.exists() and GOLDEN_PROCESSOR in facts.read_text("utf-8")
+
+
+def is_rounding(one: Difference) -> bool:
+    """True for texts of the same words whose numbers are as near as `ELSEWHERE` asks."""
+    texts = (str(one.old), str(one.new))
+    words = [NUMBER.sub("#", text) for text in texts]
+    numbers = [[float(number) for number in NUMBER.findall(text)] for text in texts]
+    if words[0] != words[1] or len(numbers[0]) != len(numbers[1]):
+        return False
+    return bool(np.allclose(*numbers, rtol=ELSEWHERE.relative, atol=0.0))
+
+
 @pytest.mark.parametrize("group", GROUPS)
 def test_nothing_that_a_command_writes_has_changed(group: str, tmp_path: Path) -> None:
-    found = compare_group(group, tmp_path, LIMITS.get(group, Limits(1e-6, 1e-2)))
-    wrong = [str(one) for one in found if not one.is_warning and UNSETTLED not in str(one)]
+    is_home = is_processor_of_golden()
+    limits = LIMITS.get(group, Limits(1e-6, 1e-2)) if is_home else ELSEWHERE
+    found = [one for one in compare_group(group, tmp_path, limits) if not one.is_warning]
+    wrong = [str(one) for one in found if UNSETTLED not in str(one)]
+    if not is_home:
+        wrong = [str(one) for one in found if UNSETTLED not in str(one) and not is_rounding(one)]
     assert not wrong, "\n".join(wrong)
+
+
+def test_texts_differ_by_more_than_rounding() -> None:
+    near = Difference("a", "seen_from 9 [343.80, -30.89]", "seen_from 9 [343.81, -30.88]", False)
+    far = Difference("a", "seen_from 9 [343.80, -30.89]", "seen_from 9 [349.80, -30.89]", False)
+    other = Difference("a", "seen_from 9 [343.80]", "looked from 9 [343.80]", False)
+    assert [is_rounding(one) for one in (near, far, other)] == [True, False, False]

@@ -73,7 +73,7 @@ def convert(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a cloud, a model, a recording or a camera in another format."""
+    """Write a cloud, model, scan or camera in another format."""
     from armscan.report.quantity import Summary
     from armscan.storage.clouds import convert_file
 

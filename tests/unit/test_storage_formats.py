@@ -170,7 +170,7 @@ def test_converting_says_what_is_lost_and_what_a_mesh_is(
     assert "12 faces" in out
     assert "multiples of 1e-06 mm" in out
     assert main(["convert", str(tmp_path / "cloud.ply"), str(tmp_path / "cloud.stl")]) == 2
-    assert "a cloud has none" in capsys.readouterr().err
+    assert "points but no faces" in capsys.readouterr().err
     (item,) = describe_files([str(tmp_path / "cloud.e57")]).data["items"]
     assert item["what"] == "point cloud, 60 points"
     assert item["frame"] == "Base"

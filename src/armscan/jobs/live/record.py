@@ -17,7 +17,7 @@ from armscan.devices.registry import device_drivers, open_device
 from armscan.errors import DeviceError, OptionError, OutputError
 from armscan.jobs.live.recordings import SUFFIX
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline.live.acquire import OWN_PARTS, LiveEvent
+from armscan.pipeline.live.acquire import MATCHING, OWN_PARTS, RECORDER, LiveEvent
 from armscan.pipeline.live.recorder import LiveRecorder
 from armscan.pipeline.live.rig import MOST_RATE_HZ, Rig, RigDescription, read_rig
 from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
@@ -219,7 +219,7 @@ class _Recording:
         self._before = replace(self._end), 0.0
         self._is_interrupted = False
         self._before_it: Path | None = None
-        self._last_fault = ""
+        self._why_ended = ""
         self._is_triggered = rig.description.is_common_trigger
 
     def until_the_end(self, request: RecordRequest) -> None:
@@ -266,7 +266,7 @@ class _Recording:
             )
         if not is_kept:
             raise DeviceError(
-                f"the recording ended after {self._seconds:.1f} s: {self._last_fault}",
+                f"after {self._seconds:.1f} s {self._why_ended}",
                 where=str(self._output),
                 remedy="what came before is whole",
             )
@@ -352,8 +352,8 @@ class _Recording:
         if event.kind in ("fault", "recovered", "warning"):
             self._n_faults += event.kind == "fault" and event.device not in OWN_PARTS
             self._tell(f"{event.kind}: {event.words}")
-        if event.kind in ("fault", "warning"):
-            self._last_fault = event.text
+        if event.device in (MATCHING, RECORDER):
+            self._why_ended = event.text
 
     def summary(self, scanner: Path | None) -> Summary:
         """What was written."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -46,15 +47,21 @@ SHOWN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
 """Commands that can show the messages of a module; the first entry that fits a path holds."""
 
 
+@cache
 def options_of(path: tuple[str, ...]) -> set[str]:
-    node: Any = command()
+    node: Any = root()
     for word in path:
         node = node.commands[word]
     return {name for parameter in node.params for name in parameter.opts} | {"--help"}
 
 
+@cache
+def root() -> Any:
+    return command()
+
+
 def every_path(node: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    node = node or command()
+    node = node or root()
     yield path
     for name, child in getattr(node, "commands", {}).items():
         yield from every_path(child, (*path, name))

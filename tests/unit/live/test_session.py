@@ -179,6 +179,19 @@ def test_a_camera_that_is_unplugged_is_told_of_and_goes_on() -> None:
     assert ("fault", "camera 0") in kinds and ("recovered", "camera 0") in kinds
 
 
+def test_of_two_devices_of_one_name_the_one_that_answers_does_not_hide_the_other() -> None:
+    scan = triggered_scan(2)
+    cameras = [Device("webcam", [DeviceError("unplugged", where="webcam")]) for _ in range(2)]
+    session = LiveSession(Rig(cameras, None, None, RigDescription(("a", "b"))), options=ALL)  # type: ignore[arg-type]
+    session.start()
+    waited(lambda: len(session.snapshot().faults) == 2)
+    cameras[0].elements = [frame(scan, 0)]
+    waited(lambda: len(session.snapshot().faults) != 2)
+    left = session.snapshot().faults
+    session.stop()
+    assert left == ("webcam: unplugged.",)
+
+
 def test_shows_one_point_a_voxel_and_takes_a_pass_back() -> None:
     scan = triggered_scan(6)
     session, clouds, _ = run(rig_of(scan), 6, options=replace(ALL, voxel_mm=2.0))

@@ -16,7 +16,7 @@ import pytest
 
 from armscan.devices.matching import InstantMatcher, MatchedInstant
 from armscan.devices.protocols import ArmSample, CameraSettings, Frame, LaserEvent
-from armscan.errors import DeviceError, InputError, OutputError
+from armscan.errors import DeviceError, InputError, OptionError, OutputError
 from armscan.models.arm import forward, thesis_arm
 from armscan.pipeline.live.acquire import (
     Acquisition,
@@ -25,7 +25,7 @@ from armscan.pipeline.live.acquire import (
     WaitingInstants,
     exposure_of,
 )
-from armscan.pipeline.live.exposure import ExposureSettings
+from armscan.pipeline.live.exposure import ExposureSettings, LaserTarget
 from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
 from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
 from armscan.pipeline.measure import measure_instants
@@ -222,6 +222,20 @@ def test_a_rig_opens_all_devices_or_none() -> None:
 
     with pytest.raises(DeviceError, match="taken"):
         Rig.open(RigDescription(("a", "b"), arm="c"), open_device)
+    assert [device.calls for device in opened] == [["close"], ["close"]]
+
+
+def test_an_exposure_for_a_laser_that_is_not_there_is_refused_and_all_is_closed() -> None:
+    opened: list[Any] = []
+
+    def open_device(kind: str, address: str) -> Any:
+        opened.append(Device(address, []))
+        opened[-1].sources = ("A", "B")
+        return opened[-1]
+
+    asked = ExposureSettings("automatic", laser=(LaserTarget("b", 0.5),))
+    with pytest.raises(OptionError, match="no laser is called 'b'; choose from A, B"):
+        Rig.open(RigDescription(("a",), lasers="c", exposure=asked), open_device)
     assert [device.calls for device in opened] == [["close"], ["close"]]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import cast
 
-from armscan.console.journey import Status, StepResult, StepState
+from armscan.console.journey import SIDES, Status, StepResult, StepState
 from armscan.console.quality import ModelWatch
 from armscan.console.scan import LiveScan
 from armscan.console.scene import paragraph
@@ -76,7 +76,7 @@ def live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) ->
         else f"the last pass lies {drift:.3f} mm from the earlier ones (median)",
     ]
     for k, lines_seen in enumerate(shown.brightness):
-        camera = f"camera {k + 1}" if len(shown.brightness) > 1 else "exposure"
+        camera = f"{SIDES[k]} camera" if len(shown.brightness) > 1 else "exposure"
         lines += [f"{camera}: {'; '.join(one.words for one in lines_seen)}"] if lines_seen else []
     still = shown.counts.get(LiveStatus.STILL, 0)
     lines += [f"{still} dropped while the hand was still"] if still else []

@@ -23,6 +23,7 @@ from armscan.console.journey import (
     BY_NAME,
     INSPECTIONS,
     OF_A_SCAN,
+    OF_TWO_CAMERAS,
     REPORT_FILE,
     Journey,
     SeeingSettings,
@@ -552,8 +553,8 @@ class ConsolePage:
     def _instruction(self, state: StepState) -> str:
         step = BY_NAME[self.step]
         body = paragraph(step.to_do)
-        if self.step is StepName.CAMERA and self.journey.settings.n_cameras > 1:
-            body += paragraph("Both cameras must see all of it: look at both images.")
+        if self.journey.settings.n_cameras > 1:
+            body += paragraph(OF_TWO_CAMERAS.get(self.step, ""))
         if self.step is StepName.HAND_EYE:
             with suppress(ArmscanError):
                 sensor = read_sensor_calibration(self.journey.folder / "sensor.json")

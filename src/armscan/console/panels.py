@@ -18,7 +18,7 @@ import numpy as np
 import viser
 
 from armscan.console.cards import live_facts, padded
-from armscan.console.journey import SeeingSettings
+from armscan.console.journey import SIDES, SeeingSettings
 from armscan.console.quality import ModelWatch
 from armscan.console.scan import LiveScan
 from armscan.console.scene import (
@@ -494,11 +494,18 @@ class ScanPanel:
 
     def show_images(self, exposures: Sequence[Exposure]) -> None:
         """Show what the cameras see, one image each; none to show nothing."""
+        self._name_pictures(len(exposures))
         for handle, exposure in zip_longest(self._pictures, exposures[: len(self._pictures)]):
             if exposure is not None:
                 handle.image = taken_image(exposure)
             handle.visible = exposure is not None
         self._window.visible = bool(exposures)
+
+    def _name_pictures(self, n: int) -> None:
+        for handle, side in zip(self._pictures, SIDES, strict=True):
+            label = f"{side.capitalize()} camera" if n > 1 else None
+            if handle.label != label:
+                handle.label = label
 
     def _label(self, *, is_again: bool = False) -> None:
         if self.live is None:
@@ -528,6 +535,7 @@ class ScanPanel:
         sensor = None if self._scanner is None else self._scanner.sensor
         if sensor is not None:
             names = tuple(one.name for one in sensor.sheets)
+            self._name_pictures(len(shown.cameras))
             views = zip(self._pictures, shown.cameras, live.rig.cameras, strict=False)
             for handle, view, camera in views:
                 handle.image = live_image(view, names, camera.setup.window)

@@ -306,9 +306,12 @@ def sheet_corners_mm(sensor: SensorCalibration) -> list[FloatArray]:
 
 
 def depths_mm(sensor: SensorCalibration) -> tuple[float, float]:
-    """Nearest and farthest depth in which all sheets are calibrated."""
-    ranges = [one.depth_range_mm for one in sensor.sheets]
-    return max(low for low, _ in ranges), min(high for _, high in ranges)
+    """Nearest and farthest depth in which more than half of the sheets are calibrated.
+
+    No depth need be all sheets': the outer ones of a fan cross the view nearer and farther off.
+    """
+    low, high = np.sort([one.depth_range_mm for one in sensor.sheets], axis=0).T
+    return float(low[len(low) // 2]), float(high[(len(high) - 1) // 2])
 
 
 def range_bar(depth_mm: float | None, low_mm: float, high_mm: float) -> str:

@@ -6,6 +6,8 @@ The page is viser's, whole in one file. Every answer forbids the browser to load
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import hmac
 import ipaddress
 import secrets
@@ -61,6 +63,13 @@ class Door:
     token: str
     folder_of_pages: Callable[[], Path]
 
+    @property
+    def cookie(self) -> str:
+        """Name of the cookie: browsers keep one for all ports, and two consoles may stand at one
+        computer.
+        """
+        return f"{COOKIE}_{hashlib.sha256(self.token.encode()).hexdigest()[:8]}"
+
     def refusal(self, peer: str, request: Request) -> str:
         """Why a request is not let in; empty if it is."""
         host = request.headers.get("Host", "")
@@ -84,8 +93,8 @@ class Door:
                 cookie.load(text)
             except CookieError:
                 continue
-        if COOKIE in cookie:
-            yield cookie[COOKIE].value
+        if self.cookie in cookie:
+            yield cookie[self.cookie].value
 
     def page(self, path: str) -> bytes | None:
         """A page of the session; None where there is none of that name."""
@@ -98,11 +107,16 @@ class Door:
     def answer(self, connection: sockets.ServerConnection, request: Request) -> Response | None:
         """The answer to a request that is refused or asks for a page; None to go on."""
         address = connection.remote_address
-        why = self.refusal(str(address[0]) if address else "", request)
+        is_page = request.path.startswith(PAGES) and request.headers.get("Upgrade") != "websocket"
+        try:
+            why = self.refusal(str(address[0]) if address else "", request)
+            content = self.page(request.path) if is_page and not why else None
+        except (ValueError, OSError):
+            # bytes that no browser sends in an address, a name, or a path
+            return _response(HTTPStatus.BAD_REQUEST, b"this is no address", "text/plain")
         if why:
             return _response(HTTPStatus.FORBIDDEN, why.encode(), "text/plain; charset=utf-8")
-        if request.path.startswith(PAGES) and request.headers.get("Upgrade") != "websocket":
-            content = self.page(request.path)
+        if is_page:
             if content is None:
                 return _response(HTTPStatus.NOT_FOUND, b"there is no such page", "text/plain")
             return _response(HTTPStatus.OK, content, "text/html; charset=utf-8")
@@ -114,7 +128,7 @@ class Door:
             response.headers["Content-Security-Policy"] = POLICY
             if parse_qs(urlsplit(request.path).query).get("token"):
                 response.headers["Set-Cookie"] = (
-                    f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+                    f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
                 )
         return response
 
@@ -231,8 +245,8 @@ def close_server(server: viser.ViserServer) -> None:
 
 
 def _free_port(host: str, port: int, *, is_asked: bool) -> int:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     for candidate in (port,) if is_asked else (port, 0):
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             with socket.socket(family) as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -240,6 +254,12 @@ def _free_port(host: str, port: int, *, is_asked: bool) -> int:
                 return int(probe.getsockname()[1])
         except OSError as error:
             reason = error.strerror or str(error)
+            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+                raise DeviceError(
+                    f"{host} is no address of this computer ({reason})",
+                    where="--host",
+                    remedy="give one that it has, or 0.0.0.0 for all of them",
+                ) from error
     raise DeviceError(
         f"nothing can listen at {host} port {port} ({reason})",
         where="--port",

@@ -10,7 +10,7 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -25,6 +25,7 @@ from armscan.console.journey import (
     REPORT_FILE,
     RESULTS,
     SETTINGS_FILE,
+    SIDES,
     STEPS,
     Journey,
     SessionSettings,
@@ -49,6 +50,7 @@ from armscan.jobs.stereo import calibrate_stereo
 from armscan.jobs.verify import Standard, verify
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.targets import find_targets
+from armscan.records.exposure import Exposure
 from armscan.report.page import Block, Facts, Links, Page, Section, footer, render_page
 from armscan.report.quantity import Summary, fact, sentence
 from armscan.storage.arm import ARM_FILE
@@ -58,7 +60,7 @@ from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.targets.target import parse_target
+from armscan.vision.targets.target import Target, parse_target
 
 Result = TypeVar("Result")
 LEAST_LINE = 50
@@ -323,12 +325,35 @@ def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> t
     journey = Journey(folder, read_settings(folder / SETTINGS_FILE))
     source = read_recording(journey.recording(step))
     views = [row.t_ns if row.view is None else row.view for row in source.rows]
-    rows = [k for k, view in enumerate(views) if view == views[-1]]
-    lit = [source.exposure(k) for k in rows if source.rows[k].lasers]
-    dark = [source.exposure(k) for k in rows if not source.rows[k].lasers]
+    latest = [k for k, view in enumerate(views) if view == views[-1]]
+    by_camera: dict[int, list[Exposure]] = {}
+    for k in latest:
+        by_camera.setdefault(source.rows[k].camera, []).append(source.exposure(k))
+    target = parse_target(journey.settings.target) if step in OF_TARGET else None
+    found = [_seen_by_one(by_camera[camera], step, target) for camera in sorted(by_camera)]
+    are_of_use = [is_of_use for is_of_use, _ in found]
+    words = [text for _, text in found]
+    if len(words) > 1:
+        words = [f"in the {side} image: {text}" for side, text in zip(SIDES, words, strict=True)]
+    # the sheets are calibrated by what either camera sees of them
+    enough = any if step is StepName.LASER else all
+    if not enough(are_of_use):
+        return False, f"{sentence('; '.join(words))} Take it back and once more."
+    rest = "" if all(are_of_use) else " One of the two images is enough here."
+    return True, f"Seen{' ' if len(words) > 1 else ': '}{'; '.join(words)}.{rest}"
+
+
+OF_TARGET = (StepName.CAMERA, StepName.LASER)
+
+
+def _seen_by_one(
+    exposures: Sequence[Exposure], step: StepName, target: Target | None
+) -> tuple[bool, str]:
+    """Whether one camera's images of a take are of use, and what they show or lack."""
+    lit = [one for one in exposures if one.lasers]
     seen, lacks = [], []
-    if step in (StepName.CAMERA, StepName.LASER):
-        found = find_targets(dark, parse_target(journey.settings.target))
+    if target is not None:
+        found = find_targets([one for one in exposures if not one.lasers], target)
         seen += [f"{len(view.points_px)} points of the target" for view in found.views]
         lacks += [reason for _, reason in found.not_found]
     if step in (StepName.LASER, StepName.HAND_EYE):
@@ -338,9 +363,7 @@ def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> t
         seen += [f"a laser line of {min(counts)} points{each}"] if counts else []
         if not lit or min(n) < LEAST_LINE:
             lacks.append("no laser line is seen: look at laser, exposure and distance")
-    if lacks:
-        return False, f"{sentence('; '.join(lacks))} Take it back and once more."
-    return True, f"Seen: {' and '.join(seen)}."
+    return not lacks, "; ".join(lacks) if lacks else " and ".join(seen)
 
 
 def _inputs(journey: Journey, step: StepName, scan: str) -> list[Path]:

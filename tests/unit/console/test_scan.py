@@ -10,6 +10,8 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -285,6 +287,20 @@ def test_the_range_bar_says_where_to_move() -> None:
     assert "move nearer" in range_bar(170.0, low, high)
     assert "move" not in range_bar(140.0, low, high)
     assert "no surface" in range_bar(None, low, high)
+
+
+def test_the_green_zone_is_where_more_than_half_of_the_sheets_are_calibrated() -> None:
+    def with_depths(*depths: tuple[float, float]) -> tuple[float, float]:
+        sensor: Any = SimpleNamespace(sheets=[SimpleNamespace(depth_range_mm=d) for d in depths])
+        return depths_mm(sensor)
+
+    assert with_depths((100.0, 160.0)) == (100.0, 160.0)
+    assert with_depths((100.0, 160.0), (110.0, 170.0)) == (110.0, 160.0)
+    # lines of a fan: the first is calibrated nearer than the last begins
+    fan = ((100.0, 119.0), (100.0, 144.0), (114.0, 173.0), (120.0, 177.0), (123.0, 184.0))
+    low, high = with_depths(*fan)
+    assert (low, high) == (114.0, 173.0)
+    assert "move" not in range_bar(150.0, low, high)
 
 
 def test_two_million_points_are_shown_and_more_are_thinned_to_them() -> None:

@@ -15,11 +15,11 @@ pytest.importorskip("viser")
 
 from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
-from websockets.http11 import Request
+from websockets.http11 import Request, Response
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from armscan.console.server import COOKIE, Door, close_server, is_loopback, open_server
+from armscan.console.server import Door, close_server, is_loopback, open_server
 from armscan.errors import DeviceError, OptionError
 
 VISER = Subprotocol("viser-v0")
@@ -84,9 +84,45 @@ def test_a_token_lets_in_whoever_is_not_here(tmp_path: Path) -> None:
     assert door.refusal("192.168.1.9", request("/?token=Secret"))
     assert door.refusal("127.0.0.1", request("/")), "a forwarded name is not this computer"
     assert not door.refusal("192.168.1.9", request("/?token=secret"))
-    assert not door.refusal("192.168.1.9", request("/", Cookie=f"a=b; {COOKIE}=secret"))
+    assert not door.refusal("192.168.1.9", request("/", Cookie=f"a=b; {door.cookie}=secret"))
     # the token does not help a page of another host
     assert door.refusal("192.168.1.9", request("/?token=secret", Origin="http://evil.example"))
+
+
+def test_two_consoles_at_one_computer_leave_each_other_s_cookie_alone(tmp_path: Path) -> None:
+    # browsers send a host's cookies to all its ports, and keep one of each name
+    first, second = (Door(token, lambda: tmp_path) for token in ("one", "two"))
+    kept = {}
+    for door in (first, second):
+        answer = Response(200, "OK", Headers())
+        door.marked(request(f"/?token={door.token}"), answer)
+        name, _, value = answer.headers["Set-Cookie"].partition(";")[0].partition("=")
+        kept[name] = value
+    both = "; ".join(f"{name}={value}" for name, value in kept.items())
+    assert not first.refusal("192.168.1.9", request("/", Cookie=both))
+    assert not second.refusal("192.168.1.9", request("/", Cookie=both))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"GET /?token=\xff\xfe HTTP/1.1\r\nHost: 192.168.1.5",
+        b"GET / HTTP/1.1\r\nHost: [",
+        b"GET /pages/%00.html HTTP/1.1\r\nHost: localhost",
+        b"GET /pages/" + 300 * b"a" + b".html HTTP/1.1\r\nHost: localhost",
+    ],
+)
+def test_an_address_that_is_none_is_refused_in_words(port: int, line: bytes) -> None:
+    with socket.create_connection(("127.0.0.1", port), timeout=10.0) as link:
+        link.sendall(line + b"\r\n\r\n")
+        answer = link.makefile("rb").read()
+    assert answer.startswith(b"HTTP/1.1 400") and answer.endswith(b"this is no address")
+
+
+def test_another_computer_s_address_is_told_as_such(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match="no address of this computer") as told:
+        open_server(lambda: tmp_path, "203.0.113.7")
+    assert told.value.where == "--host"
 
 
 @pytest.mark.parametrize(
@@ -128,7 +164,8 @@ def test_all_addresses_of_this_computer_are_told_by_its_name(tmp_path: Path) -> 
         assert status == 200
         cookie = headers["Set-Cookie"].partition(";")[0]
         assert ask(port, "/", Host=name, Cookie=cookie)[0] == 200
-        assert ask(port, "/", Host=name, Cookie=f"{COOKIE}=wrong")[0] == 403
+        wrong = f"{cookie.partition('=')[0]}=wrong"
+        assert ask(port, "/", Host=name, Cookie=wrong)[0] == 403
     finally:
         close_server(server)
 

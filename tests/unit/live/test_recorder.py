@@ -22,6 +22,7 @@ from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.live.session import LiveSession
 from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.reconstruction.sync import PoseStatus, exposure_poses
+from armscan.reconstruction.track_faults import check_track
 from armscan.records.recording import CameraSetup
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording
@@ -124,6 +125,30 @@ def test_a_first_frame_that_lacks_parts_is_no_exposure(tmp_path: Path, is_trigge
     recorded, found, _ = read_back(tmp_path / "scan.mcap")
     assert [row.t_ns for row in recorded.rows] == [2 * 10**9]
     assert (found.n_exposures, found.n_aside) == (1, 1)
+
+
+def test_samples_that_a_busy_computer_reads_together_are_no_jump_of_the_arm(tmp_path: Path) -> None:
+    # 250 a second at 200 mm/s; of every 25 the last 10 come together and late: their times are not
+    # sure, those after them are
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    step_ns, n = 4_000_000, 200
+    pose = triggered_scan(1).truth[0]
+    for k in range(n):
+        late = k % 25 >= 15
+        t_ns = 10**9 + step_ns * k
+        host_ns = 10**9 + step_ns * (25 * (k // 25) + 27) if late else t_ns + 1_000_000
+        moved = replace(pose, translation_mm=pose.translation_mm + np.array([0.8 * k, 0.0, 0.0]))
+        sample = ArmSample(k, 10**15 + step_ns * k, host_ns, moved, None, trigger_id=k)
+        status = ElementStatus.DOUBTFUL if late else ElementStatus.USABLE
+        recorder.add_samples((TimedSample(sample, None if late else t_ns, status, moved),))
+    recorder.add_instant(instant(0, 10**9))
+    recorder.close()
+    arm = read_recording(tmp_path / "scan.mcap").arm
+    assert arm is not None and arm.trigger_ids is not None
+    np.testing.assert_array_equal(arm.trigger_ids, np.arange(n))
+    np.testing.assert_array_equal(arm.t_ns, 10**9 + step_ns * np.arange(n))
+    assert check_track(arm).faults == ()
 
 
 def test_where_ids_decide_a_clock_that_is_not_known_sets_nothing_aside(tmp_path: Path) -> None:

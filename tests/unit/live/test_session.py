@@ -16,7 +16,7 @@ import pytest
 
 from armscan.devices.matching import InstantMatcher, MatchedInstant
 from armscan.devices.protocols import ArmSample, CameraSettings, Frame, LaserEvent
-from armscan.errors import DeviceError, InputError, OutputError
+from armscan.errors import DeviceError, InputError, OptionError, OutputError
 from armscan.models.arm import forward, thesis_arm
 from armscan.pipeline.live.acquire import (
     Acquisition,
@@ -25,7 +25,7 @@ from armscan.pipeline.live.acquire import (
     WaitingInstants,
     exposure_of,
 )
-from armscan.pipeline.live.exposure import ExposureSettings
+from armscan.pipeline.live.exposure import ExposureSettings, LaserTarget
 from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
 from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
 from armscan.pipeline.measure import measure_instants
@@ -179,6 +179,19 @@ def test_a_camera_that_is_unplugged_is_told_of_and_goes_on() -> None:
     assert ("fault", "camera 0") in kinds and ("recovered", "camera 0") in kinds
 
 
+def test_of_two_devices_of_one_name_the_one_that_answers_does_not_hide_the_other() -> None:
+    scan = triggered_scan(2)
+    cameras = [Device("webcam", [DeviceError("unplugged", where="webcam")]) for _ in range(2)]
+    session = LiveSession(Rig(cameras, None, None, RigDescription(("a", "b"))), options=ALL)  # type: ignore[arg-type]
+    session.start()
+    waited(lambda: len(session.snapshot().faults) == 2)
+    cameras[0].elements = [frame(scan, 0)]
+    waited(lambda: len(session.snapshot().faults) != 2)
+    left = session.snapshot().faults
+    session.stop()
+    assert left == ("webcam: unplugged.",)
+
+
 def test_shows_one_point_a_voxel_and_takes_a_pass_back() -> None:
     scan = triggered_scan(6)
     session, clouds, _ = run(rig_of(scan), 6, options=replace(ALL, voxel_mm=2.0))
@@ -209,6 +222,20 @@ def test_a_rig_opens_all_devices_or_none() -> None:
 
     with pytest.raises(DeviceError, match="taken"):
         Rig.open(RigDescription(("a", "b"), arm="c"), open_device)
+    assert [device.calls for device in opened] == [["close"], ["close"]]
+
+
+def test_an_exposure_for_a_laser_that_is_not_there_is_refused_and_all_is_closed() -> None:
+    opened: list[Any] = []
+
+    def open_device(kind: str, address: str) -> Any:
+        opened.append(Device(address, []))
+        opened[-1].sources = ("A", "B")
+        return opened[-1]
+
+    asked = ExposureSettings("automatic", laser=(LaserTarget("b", 0.5),))
+    with pytest.raises(OptionError, match="no laser is called 'b'; choose from A, B"):
+        Rig.open(RigDescription(("a",), lasers="c", exposure=asked), open_device)
     assert [device.calls for device in opened] == [["close"], ["close"]]
 
 

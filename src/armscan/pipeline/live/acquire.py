@@ -141,7 +141,7 @@ class Acquisition:
     Attributes
     ----------
     faults
-        What is wrong with the devices that do not answer now, by their names.
+        What is wrong with the devices that do not answer now, by their place in the rig.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class Acquisition:
             latency_ns=latency_ns,
             arm=rig.arm_model,
         )
-        self.faults: dict[str, str] = {}
+        self.faults: dict[tuple[str, int], str] = {}
         self._recording: _Recording | None = None
         self._deliver, self._tell = deliver, tell
         self._arrived: queue.Queue[tuple[str, int, Any]] = queue.Queue(MOST_WAITING)
@@ -280,7 +280,7 @@ class Acquisition:
                 return
             if found:
                 if is_silent:
-                    self.faults.pop(device.name, None)
+                    self.faults.pop((what, k), None)
                     self._tell(LiveEvent("recovered", f"{device.name} answers again", device.name))
                 last, is_silent = time.monotonic(), False
                 self._put(what, k, found)
@@ -291,7 +291,7 @@ class Acquisition:
             if not is_silent and (fault or time.monotonic() - last > SILENT_S):
                 is_silent = True
                 since = f"{device.name} has delivered nothing for {time.monotonic() - last:.1f} s"
-                self.faults[device.name] = fault or since
+                self.faults[what, k] = fault or since
                 self._tell(LiveEvent("fault", fault or since, device.name))
 
     def _is_late(self, found: Any) -> bool:

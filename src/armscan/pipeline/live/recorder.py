@@ -71,6 +71,8 @@ class LiveRecorder:
         self._index = 0
         self._last_ns = [0] * len(rig.cameras)
         self._last_sample_ns = -1
+        self._sample_device_ns: int | None = None
+        self._sample_step_ns = 1
         self._samples: list[TimedSample] = []
 
     def begin(self) -> None:
@@ -222,8 +224,8 @@ class LiveRecorder:
         times, kept = [], []
         for one in samples:
             t_ns = one.t_ns
-            if self._is_triggered and t_ns is None and one.status not in _REPEATED:
-                t_ns = max(one.sample.t_host_ns, self._last_sample_ns + 1)
+            if self._is_triggered and one.status not in _REPEATED:
+                t_ns = self._ordered_ns(one)
             if t_ns is not None and t_ns > self._last_sample_ns:
                 times.append(t_ns)
                 kept.append(one)
@@ -244,6 +246,22 @@ class LiveRecorder:
             trigger_ids=np.array([NO_TRIGGER if one is None else one for one in ids]),
             joints_rad=self._joints(kept),
         )
+
+    def _ordered_ns(self, one: TimedSample) -> int:
+        """A sample's time; where its clock is not sure, as long after the last one as that says.
+
+        Ids place the exposures, so such a time only orders. Times of arrival would not do: of what
+        came together one sample would lie upon the other, as if the arm had jumped.
+        """
+        t_device_ns, before_ns = one.sample.t_device_ns, self._sample_device_ns
+        if before_ns is not None and one.status != ElementStatus.JUMP:
+            self._sample_step_ns = t_device_ns - before_ns
+        self._sample_device_ns = t_device_ns
+        t_ns = one.t_ns
+        if t_ns is None:
+            is_first = before_ns is None
+            t_ns = one.sample.t_host_ns if is_first else self._last_sample_ns + self._sample_step_ns
+        return max(t_ns, self._last_sample_ns + 1)
 
     def _joints(self, samples: Sequence[TimedSample]) -> FloatArray | None:
         """(N, J) angles of an arm that gives those alone; NaN where they are not valid."""

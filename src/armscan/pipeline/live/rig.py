@@ -174,6 +174,8 @@ class Rig:
             If one cannot be opened; those opened before it are closed.
         FileFormatError
             If the arm's document cannot be read.
+        OptionError
+            If an exposure is asked for of a laser that the controller does not have.
         """
         place = description.arm_model
         model = read_arm_model(Path(place)) if place else None
@@ -187,10 +189,11 @@ class Rig:
             for kind, address in addresses:
                 with told_as_fault_of(address):
                     opened.append(open_device(kind, address))
+            found = dict(zip((kind for kind, _ in addresses), opened, strict=True))
+            _check_targets(description, found.get("lasers"))
         except BaseException:
             _close(opened)
             raise
-        found = dict(zip((kind for kind, _ in addresses), opened, strict=True))
         cameras = opened[: len(description.cameras)]
         return Rig(cameras, found.get("arm"), found.get("lasers"), description, model)
 
@@ -302,6 +305,18 @@ def told_as_fault_of(device: str) -> Iterator[None]:
     except Exception as error:
         raise DeviceError(f"its driver failed ({type(error).__name__}: {error})",
                           where=device) from error  # fmt: skip
+
+
+def _check_targets(description: RigDescription, lasers: LaserController | None) -> None:
+    """A target for a laser that is misspelt would count for none, and nobody would know."""
+    known = () if lasers is None else lasers.sources
+    for one in description.exposure.laser:
+        if known and one.laser not in known:
+            raise OptionError(
+                f"no laser is called '{one.laser}'",
+                where="exposure.laser",
+                remedy=f"choose from {', '.join(known)}",
+            )
 
 
 def _close(devices: Sequence[Any]) -> None:

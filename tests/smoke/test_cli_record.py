@@ -19,7 +19,7 @@ import pytest
 from armscan.cli import main
 from armscan.errors import DeviceError, OutputError
 from armscan.jobs.live.record import RecordRequest, _Recording, record_scan
-from armscan.pipeline.live.acquire import JUMPED, MATCHING, LiveEvent
+from armscan.pipeline.live.acquire import BEHIND, JUMPED, MATCHING, LiveEvent
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.storage.recordings.write_mcap import RecordingWriter
@@ -100,13 +100,15 @@ def test_a_full_disk_ends_it_and_says_what_is_safe(
 
     heard = _Recording._hear
 
-    def then_a_jump(self: _Recording, event: LiveEvent) -> None:
-        """On a busy machine a clock seems to jump, too: that is not why it ended."""
+    def with_other_trouble(self: _Recording, event: LiveEvent) -> None:
+        """A busy machine is slow, and a clock seems to jump: that is not why it ended."""
+        for other in (LiveEvent("warning", BEHIND), LiveEvent("warning", JUMPED, "arm")):
+            heard(self, other)
         heard(self, event)
-        heard(self, LiveEvent("warning", JUMPED, "arm"))
+        heard(self, other)
 
     monkeypatch.setattr(RecordingWriter, "add_exposure", full)
-    monkeypatch.setattr(_Recording, "_hear", then_a_jump)
+    monkeypatch.setattr(_Recording, "_hear", with_other_trouble)
     output = rig.parent / "scan.mcap"
     told: list[str] = []
     with pytest.raises(DeviceError, match="no space"):

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from html import escape
 from typing import cast
 
-from armscan.console.journey import SIDES, Status, StepResult, StepState
+from armscan.calibration.cameras.pairs import SIDES
+from armscan.console.journey import Status, StepResult, StepState
 from armscan.console.quality import ModelWatch
 from armscan.console.scan import LiveScan
 from armscan.console.scene import paragraph

@@ -41,9 +41,6 @@ RECORDINGS, RESULTS = "recordings", "results"
 MOVED = ".mcap"
 """Of a recording that was taken while the hand moved."""
 
-SIDES = ("left", "right")
-"""Cameras of a head with two, in their order."""
-
 
 class StepName(StrEnum):
     """The steps in their order."""
@@ -179,7 +176,7 @@ BY_NAME: Mapping[StepName, Step] = {step.name: step for step in STEPS}
 OF_TWO_CAMERAS = {
     StepName.CAMERA: "Both cameras must see all of it: look at both images.",
     StepName.LASER: "Of many lines each one has to cross the target near and far, left and right. "
-    "One of the two cameras is enough to see it.",
+    "It is enough that one of the two cameras sees line and target.",
     StepName.HAND_EYE: "Both cameras must see the lines: look at both images.",
 }
 """What a head with two cameras asks for besides."""

@@ -17,8 +17,9 @@ from typing import Any, Literal, cast
 import numpy as np
 import viser
 
+from armscan.calibration.cameras.pairs import SIDES
 from armscan.console.cards import live_facts, padded
-from armscan.console.journey import SIDES, SeeingSettings
+from armscan.console.journey import SeeingSettings
 from armscan.console.quality import ModelWatch
 from armscan.console.scan import LiveScan
 from armscan.console.scene import (

@@ -17,6 +17,7 @@ from typing import cast
 
 import numpy as np
 
+from armscan.calibration.cameras.pairs import SIDES
 from armscan.console.journey import BY_NAME, SeeingSettings, SessionSettings, StepName
 from armscan.console.scan import ArmReading, Bench, GrowingRecording, samples_of
 from armscan.devices.clocks import ElementStatus
@@ -35,7 +36,7 @@ from armscan.devices.sources import Preset, ScanSource, TwinScene
 from armscan.errors import DeviceError, FileFormatError, OptionError
 from armscan.pipeline.live.acquire import exposure_of
 from armscan.pipeline.live.exposure import ExposureSettings
-from armscan.pipeline.live.rig import Rig, RigDescription, read_rig, told_as_fault_of
+from armscan.pipeline.live.rig import Rig, RigDescription, check_targets, read_rig, told_as_fault_of
 from armscan.pipeline.live.session import LiveOptions, LiveSession
 from armscan.pipeline.simulate import TwinName, fewer_views
 from armscan.records.exposure import Exposure
@@ -542,6 +543,7 @@ class DeviceBench:
         """As of `Bench`."""
         how = seeing or SeeingSettings.of(self._described)
         described = how.set_in(self._described)
+        check_targets(described, self.rig.lasers)
         self.rest()
         self.rig.description, self._photo_us = described, how.photo_us
 
@@ -688,4 +690,11 @@ def open_bench(rig: str) -> Bench:
     """
     if rig.startswith(TWIN):
         return TwinBench(rig)
-    return DeviceBench(Rig.open(read_rig(Path(rig)), open_device), rig)
+    description = read_rig(Path(rig))
+    if len(description.cameras) > len(SIDES):
+        raise OptionError(
+            f"{len(description.cameras)} cameras are more than a head of the console has",
+            where=rig,
+            remedy="name one or two; `armscan record` takes any number",
+        )
+    return DeviceBench(Rig.open(description, open_device), rig)

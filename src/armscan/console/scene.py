@@ -306,12 +306,20 @@ def sheet_corners_mm(sensor: SensorCalibration) -> list[FloatArray]:
 
 
 def depths_mm(sensor: SensorCalibration) -> tuple[float, float]:
-    """Nearest and farthest depth in which more than half of the sheets are calibrated.
+    """Nearest and farthest depth between which more than half of the sheets are calibrated.
 
-    No depth need be all sheets': the outer ones of a fan cross the view nearer and farther off.
+    No depth need be all sheets': the outer ones of a fan cross the view nearer and farther off. Of
+    sheets that share less it is where most of them are.
     """
-    low, high = np.sort([one.depth_range_mm for one in sensor.sheets], axis=0).T
-    return float(low[len(low) // 2]), float(high[(len(high) - 1) // 2])
+    ranges = np.array([one.depth_range_mm for one in sensor.sheets])
+    ends = np.unique(ranges)
+    covers = (ranges[:, :1] <= ends[:-1]) & (ends[1:] <= ranges[:, 1:])
+    n = covers.sum(axis=0)
+    is_inside = n >= min(len(ranges) // 2 + 1, n.max())
+    change = np.flatnonzero(np.diff(np.r_[False, is_inside, False]))
+    first, last = ends[change[::2]], ends[change[1::2]]
+    longest = int(np.argmax(last - first))
+    return float(first[longest]), float(last[longest])
 
 
 def range_bar(depth_mm: float | None, low_mm: float, high_mm: float) -> str:

@@ -108,15 +108,11 @@ class Door:
         """The answer to a request that is refused or asks for a page; None to go on."""
         address = connection.remote_address
         is_page = request.path.startswith(PAGES) and request.headers.get("Upgrade") != "websocket"
-        try:
-            why = self.refusal(str(address[0]) if address else "", request)
-            content = self.page(request.path) if is_page and not why else None
-        except (ValueError, OSError):
-            # bytes that no browser sends in an address, a name, or a path
-            return _response(HTTPStatus.BAD_REQUEST, b"this is no address", "text/plain")
+        why = self.refusal(str(address[0]) if address else "", request)
         if why:
             return _response(HTTPStatus.FORBIDDEN, why.encode(), "text/plain; charset=utf-8")
         if is_page:
+            content = self.page(request.path)
             if content is None:
                 return _response(HTTPStatus.NOT_FOUND, b"there is no such page", "text/plain")
             return _response(HTTPStatus.OK, content, "text/html; charset=utf-8")
@@ -172,10 +168,15 @@ def _guarded(door: Door) -> Iterator[None]:
 
         def guarded(*given: Any, process_request: Any = None, **named: Any) -> Any:
             def ask(connection: sockets.ServerConnection, request: Request) -> Any:
-                refused = door.answer(connection, request)
-                if refused is not None or process_request is None:
-                    return refused
-                return door.marked(request, process_request(connection, request))
+                try:
+                    refused = door.answer(connection, request)
+                    if refused is not None or process_request is None:
+                        return refused
+                    return door.marked(request, process_request(connection, request))
+                except (ValueError, OSError):
+                    # bytes that no browser sends in an address, a name no disk takes
+                    words = b"nothing can be read there"
+                    return _response(HTTPStatus.BAD_REQUEST, words, "text/plain")
 
             asking.set()
             return serve(*given, process_request=ask, **named)
@@ -216,10 +217,11 @@ def open_server(
     Raises
     ------
     DeviceError
-        If the port is taken.
+        If the port is taken, or the address is not this computer's.
     OptionError
-        If there is no such port or address.
+        If there is no such port.
     """
+    host = host.strip("[]")
     if port is not None and not 0 <= port < 2**16:
         raise OptionError(f"port {port}", where="--port", remedy="give 1024 to 65535")
     token = secrets.token_urlsafe(24)
@@ -254,7 +256,7 @@ def _free_port(host: str, port: int, *, is_asked: bool) -> int:
                 return int(probe.getsockname()[1])
         except OSError as error:
             reason = error.strerror or str(error)
-            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES, errno.EPERM):
                 raise DeviceError(
                     f"{host} is no address of this computer ({reason})",
                     where="--host",

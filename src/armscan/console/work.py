@@ -11,13 +11,14 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from armscan.calibration.cameras.pairs import SIDES
 from armscan.console.journey import (
     BY_NAME,
     INSPECTIONS,
@@ -25,7 +26,6 @@ from armscan.console.journey import (
     REPORT_FILE,
     RESULTS,
     SETTINGS_FILE,
-    SIDES,
     STEPS,
     Journey,
     SessionSettings,
@@ -331,39 +331,58 @@ def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> t
         by_camera.setdefault(source.rows[k].camera, []).append(source.exposure(k))
     target = parse_target(journey.settings.target) if step in OF_TARGET else None
     found = [_seen_by_one(by_camera[camera], step, target) for camera in sorted(by_camera)]
-    are_of_use = [is_of_use for is_of_use, _ in found]
-    words = [text for _, text in found]
+    words = [one.words for one in found]
     if len(words) > 1:
         words = [f"in the {side} image: {text}" for side, text in zip(SIDES, words, strict=True)]
-    # the sheets are calibrated by what either camera sees of them
-    enough = any if step is StepName.LASER else all
-    if not enough(are_of_use):
+    is_whole = not any(one.lacks for one in found)
+    # a sheet is calibrated by what either camera sees of it
+    lines = {source.rows[k].lasers for k in latest if source.rows[k].lasers}
+    shown = {lasers for one in found if one.has_target for lasers in one.lines}
+    if not is_whole and not (step is StepName.LASER and lines and lines <= shown):
         return False, f"{sentence('; '.join(words))} Take it back and once more."
-    rest = "" if all(are_of_use) else " One of the two images is enough here."
+    rest = "" if is_whole else " One of the two images is enough for each line."
     return True, f"Seen{' ' if len(words) > 1 else ': '}{'; '.join(words)}.{rest}"
 
 
 OF_TARGET = (StepName.CAMERA, StepName.LASER)
 
 
+@dataclass(slots=True)
+class _SeenByOne:
+    """What one camera's images of a take show and lack, and of which lasers lines are seen."""
+
+    has_target: bool = False
+    lines: set[tuple[str, ...]] = field(default_factory=set)
+    seen: list[str] = field(default_factory=list)
+    lacks: list[str] = field(default_factory=list)
+
+    @property
+    def words(self) -> str:
+        """What is lacking; if nothing is, what is seen."""
+        return "; ".join(self.lacks) if self.lacks else " and ".join(self.seen)
+
+
 def _seen_by_one(
     exposures: Sequence[Exposure], step: StepName, target: Target | None
-) -> tuple[bool, str]:
-    """Whether one camera's images of a take are of use, and what they show or lack."""
-    lit = [one for one in exposures if one.lasers]
-    seen, lacks = [], []
+) -> _SeenByOne:
+    one = _SeenByOne()
     if target is not None:
-        found = find_targets([one for one in exposures if not one.lasers], target)
-        seen += [f"{len(view.points_px)} points of the target" for view in found.views]
-        lacks += [reason for _, reason in found.not_found]
+        found = find_targets([image for image in exposures if not image.lasers], target)
+        one.has_target = bool(found.views)
+        one.seen += [f"{len(view.points_px)} points of the target" for view in found.views]
+        one.lacks += [reason for _, reason in found.not_found]
     if step in (StepName.LASER, StepName.HAND_EYE):
-        n = [len(extract_stripes(one).points_px) for one in lit]
+        lit = [image for image in exposures if image.lasers]
+        n = [len(extract_stripes(image).points_px) for image in lit]
         counts = [count for count in n if count >= LEAST_LINE]
         each = " in each image" if len(counts) > 1 else ""
-        seen += [f"a laser line of {min(counts)} points{each}"] if counts else []
-        if not lit or min(n) < LEAST_LINE:
-            lacks.append("no laser line is seen: look at laser, exposure and distance")
-    return not lacks, "; ".join(lacks) if lacks else " and ".join(seen)
+        one.lines = {image.lasers for image, k in zip(lit, n, strict=True) if k >= LEAST_LINE}
+        one.seen += [f"a laser line of {min(counts)} points{each}"] if counts else []
+        dark = [" and ".join(image.lasers) for image in lit if image.lasers not in one.lines]
+        if dark or not lit:
+            of = f" of {', '.join(dark)}" if dark and one.lines else ""
+            one.lacks.append(f"no laser line{of} is seen: look at laser, exposure and distance")
+    return one
 
 
 def _inputs(journey: Journey, step: StepName, scan: str) -> list[Path]:

@@ -296,11 +296,20 @@ def test_the_green_zone_is_where_more_than_half_of_the_sheets_are_calibrated() -
 
     assert with_depths((100.0, 160.0)) == (100.0, 160.0)
     assert with_depths((100.0, 160.0), (110.0, 170.0)) == (110.0, 160.0)
-    # lines of a fan: the first is calibrated nearer than the last begins
+    # lines of a fan: the first is calibrated nearer than the last begins; at 119.5 mm two are
     fan = ((100.0, 119.0), (100.0, 144.0), (114.0, 173.0), (120.0, 177.0), (123.0, 184.0))
     low, high = with_depths(*fan)
-    assert (low, high) == (114.0, 173.0)
+    assert (low, high) == (120.0, 173.0)
     assert "move" not in range_bar(150.0, low, high)
+    # of eleven no six share a depth; five do
+    steps = tuple((100.0 + 5.0 * k, 125.0 + 5.0 * k) for k in range(11))
+    assert with_depths(*steps) == (120.0, 155.0)
+    assert with_depths((100.0, 119.0), (100.0, 120.0), (121.0, 184.0), (124.0, 190.0)) == (
+        124.0,
+        184.0,
+    )
+    # two that share no depth: the longer one
+    assert with_depths((100.0, 119.0), (123.0, 184.0)) == (123.0, 184.0)
 
 
 def test_two_million_points_are_shown_and_more_are_thinned_to_them() -> None:

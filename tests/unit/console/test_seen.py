@@ -67,8 +67,18 @@ def test_a_sheet_is_calibrated_by_what_one_of_two_cameras_sees(tmp_path: Path) -
     # the outer lines of a fan leave the view that both cameras share
     left = (0, "A", line()), (0, "", circles())
     good, words = told(tmp_path / "a", StepName.LASER, *left, (1, "A", DARK), (1, "", DARK))
-    assert good and words.endswith("One of the two images is enough here.")
+    assert good and words.endswith("One of the two images is enough for each line.")
     good, words = told(
         tmp_path / "b", StepName.LASER, (0, "A", DARK), left[1], (1, "A", line()), (1, "", DARK)
     )
     assert not good and "no laser line" in words and words.endswith("Take it back and once more.")
+
+
+def test_of_two_lasers_each_is_to_be_seen_by_one_camera(tmp_path: Path) -> None:
+    both = (0, "", circles()), (1, "", circles())
+    lit = (0, "A", line()), (0, "B", DARK), (1, "A", DARK)
+    good, words = told(tmp_path / "a", StepName.LASER, *both, *lit, (1, "B", line()))
+    assert good and "left image: no laser line of B" in words
+    assert "right image: no laser line of A" in words
+    good, words = told(tmp_path / "b", StepName.LASER, *both, *lit, (1, "B", DARK))
+    assert not good and "left image: no laser line of B" in words

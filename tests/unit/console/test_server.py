@@ -110,18 +110,21 @@ def test_two_consoles_at_one_computer_leave_each_other_s_cookie_alone(tmp_path: 
         b"GET / HTTP/1.1\r\nHost: [",
         b"GET /pages/%00.html HTTP/1.1\r\nHost: localhost",
         b"GET /pages/" + 300 * b"a" + b".html HTTP/1.1\r\nHost: localhost",
+        b"GET /" + 300 * b"a" + b" HTTP/1.1\r\nHost: localhost",
+        b"GET //[?token=x HTTP/1.1\r\nHost: localhost",
     ],
 )
 def test_an_address_that_is_none_is_refused_in_words(port: int, line: bytes) -> None:
     with socket.create_connection(("127.0.0.1", port), timeout=10.0) as link:
         link.sendall(line + b"\r\n\r\n")
         answer = link.makefile("rb").read()
-    assert answer.startswith(b"HTTP/1.1 400") and answer.endswith(b"this is no address")
+    assert answer.startswith(b"HTTP/1.1 400") and answer.endswith(b"nothing can be read there")
 
 
-def test_another_computer_s_address_is_told_as_such(tmp_path: Path) -> None:
+@pytest.mark.parametrize("host", ["203.0.113.7", "[2001:db8::7]", "no.such.host.invalid"])
+def test_another_computer_s_address_is_told_as_such(tmp_path: Path, host: str) -> None:
     with pytest.raises(DeviceError, match="no address of this computer") as told:
-        open_server(lambda: tmp_path, "203.0.113.7")
+        open_server(lambda: tmp_path, host)
     assert told.value.where == "--host"
 
 

@@ -151,6 +151,30 @@ def test_samples_that_a_busy_computer_reads_together_are_no_jump_of_the_arm(tmp_
     assert check_track(arm).faults == ()
 
 
+@pytest.mark.parametrize("begins_ns", [0, 2 * 10**15])
+def test_an_arm_that_was_started_anew_did_not_jump(tmp_path: Path, begins_ns: int) -> None:
+    # silent for 3 s while it moved by 600 mm; its clock begins anew, and is not related at once
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    step_ns, pose = 4_000_000, triggered_scan(1).truth[0]
+    for k in range(80):
+        is_again = k >= 40
+        t_ns = 10**9 + step_ns * k + 3 * 10**9 * is_again
+        device_ns = begins_ns + step_ns * (k - 40) if is_again else 10**15 + step_ns * k
+        x_mm = 200e-9 * (t_ns - 10**9)
+        moved = replace(pose, translation_mm=pose.translation_mm + np.array([x_mm, 0.0, 0.0]))
+        sample = ArmSample(k % 40, device_ns, t_ns + 1_000_000, moved, None, trigger_id=k)
+        status = ElementStatus.JUMP if k == 40 else ElementStatus.USABLE
+        recorder.add_samples((TimedSample(sample, None if is_again else t_ns, status, moved),))
+    recorder.add_instant(instant(0, 10**9))
+    recorder.close()
+    arm = read_recording(tmp_path / "scan.mcap").arm
+    assert arm is not None
+    off_ns = arm.t_ns - 10**9 - step_ns * np.arange(80) - 3 * 10**9 * (np.arange(80) >= 40)
+    assert np.all((off_ns >= 0) & (off_ns <= 1_000_000))
+    assert check_track(arm).faults == ()
+
+
 def test_where_ids_decide_a_clock_that_is_not_known_sets_nothing_aside(tmp_path: Path) -> None:
     recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
     recorder.begin()

@@ -352,7 +352,7 @@ class _Recording:
         if event.kind in ("fault", "recovered", "warning"):
             self._n_faults += event.kind == "fault" and event.device not in OWN_PARTS
             self._tell(f"{event.kind}: {event.words}")
-        if event.device in (MATCHING, RECORDER):
+        if event.device in (MATCHING, RECORDER) and not self._why_ended:
             self._why_ended = event.text
 
     def summary(self, scanner: Path | None) -> Summary:

@@ -318,11 +318,11 @@ class Acquisition:
             try:
                 self._arrived.put((what, k, found), timeout=READ_S)
             except queue.Full:
-                self._warn(BEHIND, RECORDER)
+                self._warn(BEHIND)
             else:
                 return
 
-    def _warn(self, text: str, device: str) -> None:
+    def _warn(self, text: str, device: str = "") -> None:
         """Tell of trouble, of the same now and then."""
         if time.monotonic() > self._told_at.get(device, -TOLD_EVERY_S) + TOLD_EVERY_S:
             self._told_at[device] = time.monotonic()

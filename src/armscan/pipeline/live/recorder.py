@@ -33,7 +33,8 @@ _REPEATED = (ElementStatus.DUPLICATE, ElementStatus.LATE)
 class LiveRecorder:
     """Writes a rig's streams to an MCAP file; see `armscan.pipeline.live.acquire.Recorder`.
 
-    All times of the tables are this computer's. A frame that no table may place is written with
+    All times of the tables are this computer's; where ids of triggers decide, those of samples may
+    only order them. A frame that no table may place is written with
     its pixels, its flag (``incomplete``, ``no-time``, ``late``, ``back``) and the time of the frame
     before it, 0 for the first: whoever reads the recording sets it aside, and counts it.
 
@@ -71,8 +72,7 @@ class LiveRecorder:
         self._index = 0
         self._last_ns = [0] * len(rig.cameras)
         self._last_sample_ns = -1
-        self._sample_device_ns: int | None = None
-        self._sample_step_ns = 1
+        self._last_device_ns = 0
         self._samples: list[TimedSample] = []
 
     def begin(self) -> None:
@@ -248,19 +248,18 @@ class LiveRecorder:
         )
 
     def _ordered_ns(self, one: TimedSample) -> int:
-        """A sample's time; where its clock is not sure, as long after the last one as that says.
+        """A sample's time; where that is not sure, what the arm's clock says since the last one.
 
-        Ids place the exposures, so such a time only orders. Times of arrival would not do: of what
-        came together one sample would lie upon the other, as if the arm had jumped.
+        Ids place the exposures, so such a time only orders. That of arrival would not do: of what
+        came together one sample would lie upon the other, as if the arm had jumped. It is the
+        latest that can be, and all that there is where the arm's clock begins anew.
         """
-        t_device_ns, before_ns = one.sample.t_device_ns, self._sample_device_ns
-        if before_ns is not None and one.status != ElementStatus.JUMP:
-            self._sample_step_ns = t_device_ns - before_ns
-        self._sample_device_ns = t_device_ns
-        t_ns = one.t_ns
+        t_ns, t_device_ns = one.t_ns, one.sample.t_device_ns
         if t_ns is None:
-            is_first = before_ns is None
-            t_ns = one.sample.t_host_ns if is_first else self._last_sample_ns + self._sample_step_ns
+            t_ns, passed_ns = one.sample.t_host_ns, t_device_ns - self._last_device_ns
+            if self._last_sample_ns >= 0 and passed_ns > 0:
+                t_ns = min(t_ns, self._last_sample_ns + passed_ns)
+        self._last_device_ns = t_device_ns
         return max(t_ns, self._last_sample_ns + 1)
 
     def _joints(self, samples: Sequence[TimedSample]) -> FloatArray | None:

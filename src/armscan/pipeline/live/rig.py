@@ -175,7 +175,7 @@ class Rig:
         FileFormatError
             If the arm's document cannot be read.
         OptionError
-            If an exposure is asked for of a laser that the controller does not have.
+            As of `check_targets`.
         """
         place = description.arm_model
         model = read_arm_model(Path(place)) if place else None
@@ -190,7 +190,7 @@ class Rig:
                 with told_as_fault_of(address):
                     opened.append(open_device(kind, address))
             found = dict(zip((kind for kind, _ in addresses), opened, strict=True))
-            _check_targets(description, found.get("lasers"))
+            check_targets(description, found.get("lasers"))
         except BaseException:
             _close(opened)
             raise
@@ -307,9 +307,22 @@ def told_as_fault_of(device: str) -> Iterator[None]:
                           where=device) from error  # fmt: skip
 
 
-def _check_targets(description: RigDescription, lasers: LaserController | None) -> None:
-    """A target for a laser that is misspelt would count for none, and nobody would know."""
-    known = () if lasers is None else lasers.sources
+def check_targets(description: RigDescription, lasers: LaserController | None) -> None:
+    """Refuse a target for a laser that is misspelt: it would count for none, and nobody would know.
+
+    Without a controller the lasers are the rig's own business, and nothing is checked.
+
+    Raises
+    ------
+    OptionError
+        If the controller has no laser of that name.
+    DeviceError
+        If it cannot tell.
+    """
+    known: Sequence[str] = ()
+    if lasers is not None:
+        with told_as_fault_of(lasers.name):
+            known = lasers.sources
     for one in description.exposure.laser:
         if known and one.laser not in known:
             raise OptionError(

@@ -92,7 +92,7 @@ def _ply(data: bytes, where: str) -> FloatArray:
         raise FileFormatError(
             "the PLY file holds points but no faces: it is a cloud, not the model of a part",
             where=where,
-            remedy="give a mesh; `armscan mesh` makes one of a cloud",
+            remedy="give a mesh",
         )
     if order == "ascii":
         lines = [line for line in data[start:].split(b"\n") if line.strip()]

@@ -250,3 +250,10 @@ def test_a_growing_recording_is_whole_after_every_take(tmp_path: Path) -> None:
 def test_a_wrong_rig_is_one_sentence(address: str) -> None:
     with pytest.raises(ArmscanError):
         open_bench(address)
+
+
+def test_a_rig_of_three_cameras_is_refused_before_a_device_opens(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text('cameras = ["replay:a.mcap", "replay:b.mcap", "replay:c.mcap"]\n')
+    with pytest.raises(OptionError, match="3 cameras are more"):
+        open_bench(str(rig))

@@ -601,7 +601,9 @@ def refine_candidates(
     radius = taps.shape[1] // 2
     # whole registers: what is left over of a row would take as long as the rest
     padded = np.zeros((3, -(-taps.shape[1] // PATCH_LANES) * PATCH_LANES), np.float32)
-    padded[:, : taps.shape[1]] = taps
+    for row in range(taps.shape[0]):
+        for k in range(taps.shape[1]):
+            padded[row, k] = taps[row, k]
     derivatives = np.zeros(5, np.float32)
     ridges, states = np.zeros((CHUNK, 5)), np.zeros(CHUNK, np.int64)
     count = 0

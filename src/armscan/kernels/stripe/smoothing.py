@@ -189,7 +189,8 @@ def gather_moments(tile: Row, margin: int, windows_px: Row, lanes: RowOut, momen
         moments[COUNT * LANES + k] = ONE if weight > ZERO else ZERO
     for row in range(CHAIN + 1):
         own = row * TILE + MARGIN
-        lanes[row * LANES : (row + 1) * LANES] = tile[own : own + LANES]
+        for k in range(LANES):
+            lanes[row * LANES + k] = tile[own + k]
     for direction in (-1, 1):
         lanes[REACHED * LANES : (REACHED + 1) * LANES] = ZERO
         other = MARGIN + direction
@@ -368,7 +369,8 @@ def smooth_lanes(
         predict(tile[own : own + LANES], state)
         for row in range(SMOOTH_ROWS):
             at = (MOMENTS + row) * LANES
-            result[row, first : first + last] = state[at : at + last]
+            for k in range(last):
+                result[row, first + k] = state[at + k]
 
 
 @compiled(error_model="numpy")

@@ -55,14 +55,58 @@ def frozen_floats(
     InputError
         If the shape differs or a value is not finite.
     """
-    array: FloatArray = _frozen(values, np.dtype(np.float64), shape, name)
-    if allow_nan and allow_infinite:
-        return array
+    array: FloatArray = _frozen(values, _FLOAT)
+    _check_shape(array.shape, shape, name, {})
+    if not (allow_nan and allow_infinite):
+        _check_finite(array, name, allow_nan=allow_nan, allow_infinite=allow_infinite)
+    return array
+
+
+_FLOAT = np.dtype(np.float64)
+
+
+def _frozen(values: ArrayLike, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The values themselves where nobody can change them, else a copy of them."""
+    if isinstance(values, np.ndarray) and values.dtype == dtype:
+        flags = values.flags
+        if flags.c_contiguous and flags.owndata and not flags.writeable:
+            return values
+    array = np.array(values, dtype=dtype, order="C")
+    array.setflags(write=False)
+    return array
+
+
+def _given_away(array: NDArray[Any]) -> NDArray[Any]:
+    """A new array, which a record then takes without a copy; a view stays as it is."""
+    if array.flags.owndata:
+        array.setflags(write=False)
+    return array
+
+
+def _check_shape(actual: tuple[int, ...], shape: Shape, name: str, lengths: dict[str, int]) -> None:
+    """``lengths``: Of the axes named so far, to which those of this array are added."""
+    if len(actual) == len(shape):
+        for axis, length in zip(shape, actual, strict=True):
+            if axis is None:
+                continue
+            if (lengths.setdefault(axis, length) if isinstance(axis, str) else axis) != length:
+                break
+        else:
+            return
+    known = dict(zip(shape, actual, strict=False)) | lengths
+    named = (known.get(axis, axis) if isinstance(axis, str) else axis for axis in shape)
+    wanted = "(" + ", ".join("N" if axis is None else str(axis) for axis in named) + ")"
+    raise InputError(f"{name} has shape {actual}, expected {wanted}")
+
+
+def _check_finite(
+    array: FloatArray, name: str, *, allow_nan: bool = False, allow_infinite: bool = False
+) -> None:
     with np.errstate(all="ignore"):
         total = float(array.sum())
     # a sum is finite only where all its terms are, and needs no array of answers
     if math.isfinite(total) or np.isfinite(array).all():
-        return array
+        return
     bad = ~np.isfinite(array)
     if allow_nan or allow_infinite:
         bad = np.isinf(array) if allow_nan else np.isnan(array)
@@ -72,28 +116,6 @@ def frozen_floats(
             f"{name} holds {n} value{'s that are' if n > 1 else ' that is'} not finite",
             remedy="remove or mask these entries",
         )
-    return array
-
-
-def _frozen(values: ArrayLike, dtype: np.dtype[Any], shape: Shape, name: str) -> NDArray[Any]:
-    if (
-        isinstance(values, np.ndarray)
-        and values.dtype == dtype
-        and values.flags.c_contiguous
-        and values.flags.owndata
-        and not values.flags.writeable
-    ):
-        array = values
-    else:
-        array = np.array(values, dtype=dtype, order="C")
-        array.setflags(write=False)
-    actual = array.shape
-    if len(actual) != len(shape) or any(
-        isinstance(want, int) and want != have for want, have in zip(shape, actual, strict=True)
-    ):
-        wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ")"
-        raise InputError(f"{name} has shape {actual}, expected {wanted}")
-    return array
 
 
 def homogeneous(points: FloatArray) -> FloatArray:
@@ -115,6 +137,21 @@ class _Column:
     dtype: np.dtype[Any] | None
     allow_nan: bool = False
     allow_infinite: bool = False
+
+    def owned(self, value: Any, name: str, lengths: dict[str, int]) -> Any:
+        """A value that was checked and that nobody can change; ``lengths`` of `_check_shape`."""
+        if self.dtype is None:
+            entries, (axis,) = tuple(value), self.shape
+            length = len(entries)
+            if (lengths.setdefault(axis, length) if isinstance(axis, str) else axis) != length:
+                wanted = lengths[axis] if isinstance(axis, str) else axis
+                raise InputError(f"{name} holds {length} entries, expected {wanted}")
+            return entries
+        array = _frozen(value, self.dtype)
+        _check_shape(array.shape, self.shape, name, lengths)
+        if self.dtype == _FLOAT and not (self.allow_nan and self.allow_infinite):
+            _check_finite(array, name, allow_nan=self.allow_nan, allow_infinite=self.allow_infinite)
+        return array
 
 
 def floats(
@@ -194,32 +231,8 @@ class ArrayRecord:
         lengths: dict[str, int] = {}
         for name, column in self._columns.items():
             value = getattr(self, name)
-            if value is None:
-                continue
-            actual = np.shape(value) if column.dtype is not None else (len(value),)
-            for axis, length in zip(column.shape, actual, strict=False):
-                if isinstance(axis, str):
-                    lengths.setdefault(axis, length)
-            shape = tuple(lengths.get(n, n) if isinstance(n, str) else n for n in column.shape)
-            frozen = _owned(value, column, shape, name)
-            object.__setattr__(self, name, frozen)
-
-
-def _owned(value: Any, column: _Column, shape: Shape, name: str) -> Any:
-    if column.dtype is None:
-        entries = tuple(value)
-        if isinstance(shape[0], int) and len(entries) != shape[0]:
-            raise InputError(f"{name} holds {len(entries)} entries, expected {shape[0]}")
-        return entries
-    if column.dtype == np.float64:
-        return frozen_floats(
-            value,
-            shape,
-            name,
-            allow_nan=column.allow_nan,
-            allow_infinite=column.allow_infinite,
-        )
-    return _frozen(value, column.dtype, shape, name)
+            if value is not None:
+                object.__setattr__(self, name, column.owned(value, name, lengths))
 
 
 class RowRecord(ArrayRecord):
@@ -227,11 +240,10 @@ class RowRecord(ArrayRecord):
 
     def __len__(self) -> int:
         """Count of rows."""
-        return next(
-            len(value)
-            for name, column in self._columns.items()
-            if column.shape[0] == ROWS and (value := getattr(self, name)) is not None
-        )
+        for name, column in self._columns.items():
+            if column.shape[0] == ROWS and (value := getattr(self, name)) is not None:
+                return len(value)
+        raise TypeError(f"{type(self).__name__} has no field of rows")
 
     def select(self, rows: RowChoice) -> Self:
         """The rows of a mask (N,), of indices (M,) or of a slice; other fields stay."""
@@ -251,7 +263,7 @@ class RowRecord(ArrayRecord):
             if column.dtype is None:
                 chosen[name] = tuple(value[k] for k in np.arange(len(value))[rows])
             else:
-                chosen[name] = value[rows]
+                chosen[name] = _given_away(value[rows])
         return dataclasses.replace(self, **chosen)
 
     @classmethod
@@ -300,7 +312,7 @@ class RowRecord(ArrayRecord):
             elif column.dtype is None:
                 values[entry.name] = tuple(entry for value in each for entry in value)
             else:
-                values[entry.name] = np.concatenate(each)
+                values[entry.name] = _given_away(np.concatenate(each))
         return cls(**values, **changes)
 
 

@@ -62,7 +62,7 @@ def draw_ball(axes: Axes, scan: FolderRecording, scanner: ScannerCalibration) ->
     micrometres = 1000.0 * ball.nominal.deviations_mm
     axes.hist(micrometres, bins=np.arange(-50.0, 51.0, 1.0), color=LINE)
     axes.set_title(
-        f"3  {len(micrometres):,} points, diameter {ball.diameter.value_mm:.3f} mm",
+        f"3  {len(micrometres):,} points: {ball.diameter.value_mm:.3f} mm for {BALL_MM} mm",
         loc="left",
         fontsize=10,
     )

@@ -40,7 +40,7 @@ LASER_EXAMPLE = (
     "laser and which camera took part."
 )
 HAND_EYE_EXAMPLE = (
-    "\b\nExample:\n"
+    "\b\nExamples:\n"
     "  armscan calibrate hand-eye scan --sensor sensor.json --plate plate.csv -o scanner.json\n"
     "  armscan calibrate hand-eye --profiles 'p*.yml' --poses RobPoses.rob \\\n"
     "      --euler extrinsic-xyz --sphere-diameter 80 -o scanner.json\n\n"

@@ -15,16 +15,16 @@ from armscan.cli.options import AsJson, Force, refuse_vain
 
 INFO_EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
 CONVERT_EXAMPLE = (
-    "\b\nExample:\n"
+    "\b\nExamples:\n"
     "  armscan convert cloud.ply cloud.e57\n"
     "  armscan convert camera.json camera_info.yaml\n"
     "  armscan convert scan/ scan.mcap"
 )
-DEVICES_EXAMPLE = "\b\nExample:\n  armscan devices\n  armscan devices --kind camera --json"
+DEVICES_EXAMPLE = "\b\nExamples:\n  armscan devices\n  armscan devices --kind camera --json"
 RECOVER_EXAMPLE = "\b\nExample:\n  armscan recover broken.mcap -o scan"
 SUFFIX_OF_RECORDING = ".mcap"
 DOCTOR_EXAMPLE = (
-    "\b\nExample:\n"
+    "\b\nExamples:\n"
     "  armscan doctor --warm\n"
     "  armscan doctor --bundle question.zip --with scanner.json --with scan.mcap"
 )

@@ -18,12 +18,12 @@ CIRCLE_EXAMPLE = (
     "-o rim.html"
 )
 CYLINDER_EXAMPLE = (
-    "\b\nExample:\n  armscan inspect cylinder part.ply --diameter 20 -o boss.html\n"
+    "\b\nExamples:\n  armscan inspect cylinder part.ply --diameter 20 -o boss.html\n"
     "  armscan inspect cylinder part.ply --seed=26,15,-5 --diameter-range 8,16"
 )
 CONE_EXAMPLE = "\b\nExample:\n  armscan inspect cone part.ply --half-angle 25 -o cone.html"
 RELATION_EXAMPLE = (
-    "\b\nExample:\n"
+    "\b\nExamples:\n"
     "  armscan inspect relation part.ply cylinder:diameter=12 cylinder:diameter=20 -o bores.html\n"
     "  armscan inspect relation part.ply plane:seed=5,5,0 cone:half-angle=25\n\n"
     "\b\nA feature is KIND:WORD=VALUE:... with the kinds plane, line, circle, sphere, cylinder,\n"

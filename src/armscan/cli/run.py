@@ -163,7 +163,8 @@ def _sentence(error: BaseException) -> str:
     message = cast(str, getattr(error, "format_message", error.__str__)())
     message = message.replace(": Value error, ", ": ")
     hint = "Put quotes around patterns" if "unexpected extra arg" in message else "Add -h for help"
-    return f"{message.replace(chr(10), ' ').rstrip('.')}. {hint}."
+    message = message.replace("\n", " ").rstrip(".")
+    return f"{message}{'' if message.endswith('?') else '.'} {hint}."
 
 
 def _fail(sentence: str, code: int, prefix: str = "error: ") -> int:

@@ -13,7 +13,7 @@ from armscan.cli.inspect import CloudArgument
 from armscan.cli.options import RegionOption, given, numbers
 
 CLEAN_EXAMPLE = (
-    "\b\nExample:\n  armscan clean part.ply -o cleaned.ply --max-incidence 60 --isolated 0.5 "
+    "\b\nExamples:\n  armscan clean part.ply -o cleaned.ply --max-incidence 60 --isolated 0.5 "
     "--edge 0.3\n"
     "  armscan clean part.ply -o thin.ply --overlap 1 --line-to-line 0.2 --density 0.1"
 )

@@ -66,7 +66,7 @@ _FLOAT = np.dtype(np.float64)
 
 
 def _frozen(values: ArrayLike, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """The values themselves where nobody can change them, else a copy of them."""
+    """The values themselves if they are read-only and own their memory, else a copy."""
     if isinstance(values, np.ndarray) and values.dtype == dtype:
         flags = values.flags
         if flags.c_contiguous and flags.owndata and not flags.writeable:
@@ -93,8 +93,10 @@ def _check_shape(actual: tuple[int, ...], shape: Shape, name: str, lengths: dict
                 break
         else:
             return
-    known = dict(zip(shape, actual, strict=False)) | lengths
-    named = (known.get(axis, axis) if isinstance(axis, str) else axis for axis in shape)
+    for axis, length in zip(shape, actual, strict=False):
+        if isinstance(axis, str):
+            lengths.setdefault(axis, length)
+    named = (lengths.get(axis, axis) if isinstance(axis, str) else axis for axis in shape)
     wanted = "(" + ", ".join("N" if axis is None else str(axis) for axis in named) + ")"
     raise InputError(f"{name} has shape {actual}, expected {wanted}")
 
@@ -234,6 +236,13 @@ class ArrayRecord:
             if value is not None:
                 object.__setattr__(self, name, column.owned(value, name, lengths))
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # what was pickled or copied comes back writable
+        for name, value in state.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
 
 class RowRecord(ArrayRecord):
     """An `ArrayRecord` of N rows: fields whose first axis is ``"N"`` hold one entry a row."""
@@ -243,7 +252,7 @@ class RowRecord(ArrayRecord):
         for name, column in self._columns.items():
             if column.shape[0] == ROWS and (value := getattr(self, name)) is not None:
                 return len(value)
-        raise TypeError(f"{type(self).__name__} has no field of rows")
+        raise TypeError(f"{type(self).__name__} holds no field that counts rows")
 
     def select(self, rows: RowChoice) -> Self:
         """The rows of a mask (N,), of indices (M,) or of a slice; other fields stay."""

@@ -277,7 +277,7 @@ class _Side:
 
     @staticmethod
     def of(profile: Profile) -> _Side:
-        segments = cut_segments(profile)
+        segments = cut_segments(profile, at_light=True)
         return _Side(profile, segments, take_samples(segments, SAMPLE_POINTS))
 
     def __len__(self) -> int:

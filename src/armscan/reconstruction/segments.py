@@ -6,9 +6,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.kernels.naming import find_steps, number_segments, take_every
+from armscan.kernels.naming import (
+    compare_light,
+    cut_at_largest,
+    find_steps,
+    number_segments,
+    take_every,
+)
 from armscan.records.profile import Profile, StripeFlag
 
 GAP_PX, GAP_STEPS = 6.0, 3.0
@@ -19,6 +26,15 @@ KINK_POINTS = 8
 KINK_RAD = np.radians(20.0)
 JUMP_PX, JUMP_SIGMAS = 0.6, 4.0
 """A line steps where it is off by more than both, the second in sigmas of its points."""
+LIGHT_POINTS = 24
+"""Points on either side of which the brightness is compared."""
+LIGHT_STEP, LIGHT_SIGMAS = float(np.log(1.2)), 3.5
+"""A line becomes another one's where its brightness changes by more than both, the second in usual
+changes of it, which speckle makes."""
+NORMAL_MEDIAN = 0.6745
+"""Median of the size of a normal number of variance 1."""
+FAINTEST = 1.0
+"""Grey level below which lines are equally dark."""
 PIECE_PX, SAMPLE_PX = 24.0, 8.0
 """Lengths of pieces that are judged by themselves, and between samples on them."""
 
@@ -40,7 +56,7 @@ class StripeSegments:
     number: IntArray
 
 
-def cut_segments(profile: Profile) -> StripeSegments:
+def cut_segments(profile: Profile, *, at_light: bool = False) -> StripeSegments:
     """Cut the chains of a profile where they may pass from one line to another.
 
     That is where they end; at gaps; where rejected points near another line lie between, because
@@ -51,6 +67,10 @@ def cut_segments(profile: Profile) -> StripeSegments:
     ----------
     profile
         Stripe points in the order of their chains.
+    at_light
+        Also where the line becomes brighter or darker at once. At the edge of a thing the line on
+        it may happen to go on as another line on what lies behind, too smoothly for a kink or a
+        step; that the two are equally bright is another chance.
     """
     row = np.flatnonzero(profile.is_accepted)
     if not len(row):
@@ -61,12 +81,24 @@ def cut_segments(profile: Profile) -> StripeSegments:
     linked = step[is_cut == 0]
     usual = float(np.median(linked)) if len(linked) else 0.0
     is_cut[step > max(GAP_PX, GAP_STEPS * usual)] = 1
+    if at_light:
+        _cut_at_light(np.log(np.maximum(profile.intensity[row], FAINTEST)), is_cut)
     jump_px = max(JUMP_PX, JUMP_SIGMAS * float(np.median(profile.sigma_px[row])))
     normals = profile.normals_px
     if n < len(points):
         points, normals = points[row], normals[row]
     number_segments(points, normals, is_cut, KINK_POINTS, float(KINK_RAD), jump_px, number)
     return StripeSegments(row, number)
+
+
+def _cut_at_light(light: FloatArray, is_cut: NDArray[np.uint8]) -> None:
+    """Mark in ``is_cut`` (A,) where the logarithm of the brightness (A,) changes at once."""
+    change = np.zeros(len(light))
+    compare_light(light, is_cut, LIGHT_POINTS, change)
+    told = change[change >= 0.0]
+    if len(told):
+        usual = float(np.median(told)) / NORMAL_MEDIAN
+        cut_at_largest(change, max(LIGHT_STEP, LIGHT_SIGMAS * usual), LIGHT_POINTS, is_cut)
 
 
 def _is_beside(profile: Profile) -> BoolArray:

@@ -75,10 +75,10 @@ THESIS: Mapping[str, Mapping[str, str]] = {
 
 SCENE_TEXTS = {
     "camera": "the circle grid, to calibrate the camera or cameras",
-    "laser": "the laser on the grid, to calibrate the light sheets",
+    "laser": "the grid with the laser on, to calibrate the light sheets (its line: sensor.html)",
     "hand-eye": "a posture over the flat plate, to calibrate the hand-eye",
     "plate": "the plate again, scanned by hand",
-    "ball": "the ball",
+    "ball": "a ball of known diameter",
     "steps": "gauge blocks",
     "still-step": "a gauge block, standing still",
     "part": "the free-form part",
@@ -460,8 +460,8 @@ def _photographs(demo: HeadDemo, photographs: Mapping[str, Exposure]) -> Gallery
         if demo.naming
     }
     pictures = []
-    for scene, exposure in photographs.items():
-        marks, text = [], SCENE_TEXTS[scene]
+    for scene in (known for known in SCENE_TEXTS if known in photographs):
+        exposure, marks, text = photographs[scene], [], SCENE_TEXTS[scene]
         for (of_scene, source), image in profiles.items():
             if (of_scene, source) == (scene, exposure.source):
                 measured = image.status == PointStatus.MEASURED

@@ -183,9 +183,9 @@ def _evidence(hand_eye: HandEyeCalibration) -> tuple[Quantity, ...]:
         position, at_scan_point, at_tool = np.sqrt(arm.variances).tolist()
         noise = fact(
             "Arm's scatter",
-            _arm_scatter(position, at_scan_point, at_tool, digits=2),
-            "an axis, estimated from the residuals, which therefore test nothing: compare it with "
-            "the arm's certificate",
+            significant(position, "mm", 2),
+            f"{_turns(at_scan_point, at_tool, digits=2)}, an axis, estimated from the residuals, "
+            "which therefore test nothing: compare it with the arm's certificate",
         )
     else:
         fits = "no" if known.chi2_probability < 0.001 else "yes"
@@ -361,14 +361,15 @@ def _residual_section(fit: HandEyeFit, scanner: ScannerCalibration) -> Section:
     return Section("How well it fits", tuple(blocks))
 
 
-def _arm_scatter(shift_mm: float, scan_rad: float, tool_rad: float, digits: int = 3) -> str:
-    """The arm's scatter in words: shift, turns about the origin of Tool and the scan point."""
+def _turns(scan_rad: float, tool_rad: float, digits: int = 3) -> str:
+    """Turns of the arm about the origin of Tool and about the scan point, in words."""
     tool_deg, scan_deg = np.degrees([tool_rad, scan_rad]).tolist()
     tool, scan = significant(tool_deg, digits=digits), significant(scan_deg, digits=digits)
-    return (
-        f"{significant(shift_mm, digits=digits)} mm, {tool}° about the origin of Tool, {scan}° "
-        "about the scan point"
-    )
+    return f"{tool}° about the origin of Tool, {scan}° about the scan point"
+
+
+def _arm_scatter(shift_mm: float, scan_rad: float, tool_rad: float) -> str:
+    return f"{significant(shift_mm, 'mm')}, {_turns(scan_rad, tool_rad)}"
 
 
 def _noise_facts(fit: HandEyeFit) -> tuple[Quantity, ...]:

@@ -164,8 +164,11 @@ def read_cloud_file(path: Path) -> CloudFile:
     # a PLY file says so itself, whatever its name
     known = BY_SUFFIX.get(".ply" if data.startswith(b"ply") else path.suffix.lower())
     if known is None:
+        is_document = data.lstrip().startswith(b"{")
         raise FileFormatError(
-            "this is no point cloud that armscan knows",
+            "this is a JSON document, such as a calibration, where a point cloud is asked for"
+            if is_document
+            else "this is no point cloud that armscan knows",
             where=str(path),
             remedy=f"give a file {', '.join(BY_SUFFIX)} with x y z in mm",
         )

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import pickle
+from copy import deepcopy
 from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
@@ -156,3 +158,25 @@ def test_what_differs_between_the_parts_must_be_given() -> None:
 def test_a_records_own_check_runs_on_what_is_chosen_too() -> None:
     with pytest.raises(InputError, match="twice"):
         cloud().select(np.array([1, 1]))
+
+
+def test_copies_and_pickled_records_are_read_only_too() -> None:
+    for copied in (pickle.loads(pickle.dumps(cloud())), deepcopy(cloud())):
+        assert isinstance(copied, Cloud)
+        assert (copied.points_mm == cloud().points_mm).all() and copied.names == cloud().names
+        for array in (copied.points_mm, copied.ids, copied.table, copied.is_good):
+            assert array is not None and not array.flags.writeable
+        with pytest.raises(ValueError, match="read-only"):
+            copied.points_mm[0, 0] = np.nan
+
+
+def test_chosen_rows_are_the_records_own() -> None:
+    """A record takes new arrays without a copy, but not what is a part of another's memory."""
+    whole = cloud(6)
+    for part in (
+        whole.select(np.array([4, 1])),
+        whole.select(slice(1, 3)),
+        whole.select(whole.ids > 2),
+    ):
+        assert part.points_mm.flags.owndata and not part.points_mm.flags.writeable
+        assert not np.shares_memory(part.points_mm, whole.points_mm)

@@ -11,6 +11,8 @@ from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.kernels.chains import best_states
 from armscan.kernels.naming import (
     choose_sheets,
+    compare_light,
+    cut_at_largest,
     find_nearest,
     find_steps,
     number_segments,
@@ -81,6 +83,25 @@ def test_segments_are_cut_where_fits_of_both_sides_disagree() -> None:
     # the step, both kinks, the cut; and none that a hair would decide
     assert number[-1] == 4
     assert np.abs(size - 1.0).min() > 1e-3
+
+
+def test_brightness_is_compared_within_a_chain() -> None:
+    rng, reach = np.random.default_rng(5), 6
+    light, is_cut = rng.normal(size=90), np.zeros(90, np.uint8)
+    is_cut[[0, 40, 48]] = 1
+    change, expected = np.zeros(90), np.full(90, -1.0)
+    compare_light(light, is_cut, reach, change)
+    for i in range(reach, 91 - reach):
+        if not is_cut[i - reach + 1 : i + reach].any():
+            expected[i] = abs(light[i : i + reach].mean() - light[i - reach : i].mean())
+    np.testing.assert_allclose(change, expected, atol=1e-12)
+    # the chain of eight is too short
+    assert (change[35:54] == -1.0).all() and (change[6:35] >= 0.0).all()
+    cut_at_largest(change, 0.5, reach, is_cut)
+    largest = [
+        i for i in range(90) if change[i] > 0.5 and change[i] >= change[max(i - 6, 0) : i + 7].max()
+    ]
+    assert set(np.flatnonzero(is_cut)) == {0, 40, 48, *largest} and len(largest) >= 2
 
 
 def test_steps_are_those_between_chosen_points() -> None:

@@ -12,6 +12,9 @@ import pytest
 from armscan.errors import InputError
 from armscan.geometry.arrays import IntArray
 from armscan.models.calibration import SensorCalibration
+from armscan.pipeline.scan import measure_scan
+from armscan.pipeline.simulate import SimulatedPart, TwinName
+from armscan.pipeline.truth import naming_errors, true_names
 from armscan.reconstruction.epipolar import EpipolarOffset
 from armscan.reconstruction.label_stereo import StereoLabeller, log_ratio
 from armscan.reconstruction.labels import LabelledInstant, PointStatus
@@ -21,6 +24,7 @@ from armscan.records.profile import Profile
 from rigs.placing_rig import scanner
 from rigs.stereo_head import StereoHead
 from rigs.stereo_scenes import KINDS, Noise, SeenProfile, draw_surfaces, expose
+from rigs.true_scanner import true_scanner
 
 MOST_WRONG = 0.001
 LEAST_NAMED = 0.97
@@ -81,6 +85,20 @@ def test_shared_points_get_their_sheets_and_hardly_any_a_wrong_one(kind: str) ->
         named += found.n_labelled()
     assert right_names >= LEAST_NAMED * shared
     assert wrong <= MOST_WRONG * named
+
+
+def test_a_line_that_goes_on_as_the_next_one_behind_an_edge_does_not_take_its_name() -> None:
+    """Rendered: line 8 on the floor goes on as line 7 on a block, with a step of 0.2 px.
+
+    The right camera sees the floor's line only in part. As one line, 249 points bore the name of
+    the other.
+    """
+    twin = TwinName("thesis-multi", "thesis", 502).build()
+    whole, sensor = twin.scan("steps"), true_scanner(twin)
+    scan = measure_scan(SimulatedPart(whole, (28, 29)), sensor)
+    found = naming_errors(scan, whole, true_names(sensor.sensor, twin.truth.sheet_points_mm))
+    assert found.n_named > 5000
+    assert found.n_wrong == 0
 
 
 def test_stray_lines_get_no_name() -> None:

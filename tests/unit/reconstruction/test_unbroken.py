@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.kernels.chains import best_states
-from armscan.reconstruction.segments import cut_segments, take_samples
+from armscan.reconstruction.segments import LIGHT_POINTS, cut_segments, take_samples
 from armscan.records.profile import Profile
 from rigs.sheet_rig import make_profile
 
@@ -65,6 +66,37 @@ def test_noise_is_no_step() -> None:
     normals = np.tile([0.0, 1.0], (2000, 1))
     noisy = make_profile("noisy", [(points, normals)], 0.35)
     assert cut_segments(noisy).number.max() <= 1
+
+
+def speckled(light: FloatArray, rng: np.random.Generator) -> Profile:
+    """A straight line of this brightness, with speckle of 20 % that three neighbours share."""
+    white = rng.normal(0.0, 0.2 * np.sqrt(3.0), len(light) + 2)
+    speckle = np.convolve(white, np.full(3, 1.0 / 3.0), mode="valid")
+    return replace(line(course(np.zeros(len(light)))), intensity=light * np.exp(speckle))
+
+
+def test_a_line_that_goes_on_as_a_brighter_one_is_two() -> None:
+    """Of 100 draws: two lines that meet in place and direction, one 1.7 times as bright."""
+    rng, found, others = np.random.default_rng(6), 0, 0
+    for _ in range(100):
+        profile = speckled(np.where(np.arange(1500) < 710, 60.0, 102.0), rng)
+        assert cut_segments(profile).number.max() == 0
+        number = cut_segments(profile, at_light=True).number
+        # a third of the points that are compared: speckle moves the largest change
+        is_there = np.abs(np.flatnonzero(np.diff(number)) + 1 - 710) <= LIGHT_POINTS // 3
+        found, others = found + int(is_there.any()), others + int((~is_there).sum())
+    assert found >= 90
+    # beyond 3.5 sigmas by chance at one of some 150 independent places: one in 14 lines
+    assert others <= 20
+
+
+def test_speckle_and_a_slow_change_of_brightness_are_no_other_line() -> None:
+    rng = np.random.default_rng(7)
+    counts = [
+        cut_segments(speckled(60.0 * np.exp(np.linspace(0.0, slope, 400)), rng), at_light=True)
+        for slope in np.repeat([0.0, 1.0], 100)
+    ]
+    assert np.mean([pieces.number.max() for pieces in counts]) < 0.1
 
 
 def test_samples_stand_for_every_point_of_their_own_piece() -> None:

@@ -601,7 +601,7 @@ def refine_candidates(
     radius = taps.shape[1] // 2
     # whole registers: what is left over of a row would take as long as the rest
     padded = np.zeros((3, -(-taps.shape[1] // PATCH_LANES) * PATCH_LANES), np.float32)
-    for row in range(taps.shape[0]):
+    for row in range(3):
         for k in range(taps.shape[1]):
             padded[row, k] = taps[row, k]
     derivatives = np.zeros(5, np.float32)

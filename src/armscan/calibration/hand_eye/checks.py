@@ -77,6 +77,8 @@ VARY_POSTURES = (
 LARGE_ARM_MM = 0.1
 MOST_ARM_MM = 0.25
 """An estimated scatter that is surely (two sigma) larger is no arm's. Robots reach 0.15."""
+FAR_ARM_MM = 1.0
+"""Nor is one that is larger than this, however badly it is known."""
 UNKNOWN_ARM = 0.6
 """Standard deviation of the logarithm of the arm's scatter from which it is hardly known: a factor
 of 1.8."""
@@ -385,7 +387,7 @@ def estimate_and_check(
     moved = find_contradiction(found, checked.fit, plate.reference)
     checked = _with_plane_check(checked, problem, found)
     if moved is None:
-        refusal = _refuse_scatter(checked.fit)
+        refusal = refuse_scatter(checked.fit)
         return checked if refusal is None else refusal
     if moved.is_refused:
         return moved.failure
@@ -530,11 +532,12 @@ def _left_out_in_words(
     return tuple(warnings)
 
 
-def _refuse_scatter(fit: HandEyeSolution) -> FitFailure | None:
+def refuse_scatter(fit: HandEyeSolution) -> FitFailure | None:
     """Refuse residuals that no arm explains; none where the arm's scatter was given."""
     arm_mm, sigma_log = fit.arm_mm, fit.log_arm_mm
     is_given = fit.problem.options.arm_position_mm is not None
-    if is_given or arm_mm * np.exp(-2.0 * sigma_log) < MOST_ARM_MM:
+    is_likely = arm_mm * np.exp(-2.0 * sigma_log) < MOST_ARM_MM and arm_mm < FAR_ARM_MM
+    if is_given or is_likely:
         return None
     return FitFailure(
         f"the arm would have to scatter by {arm_mm:.2f} mm an axis to explain the stripes: no "

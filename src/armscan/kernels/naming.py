@@ -130,43 +130,6 @@ def number_segments(
 
 
 @compiled()
-def compare_light(light: Floats, is_cut: Bytes, reach: int, change: FloatsOut) -> None:
-    """Difference of the means of ``reach`` points before each point and from it on.
-
-    ``light``: (A,). ``is_cut``: (A,) 1 for the first point of each chain. ``change``: (A,) output;
-    -1 where the chain begins or ends nearer.
-    """
-    n, since = light.shape[0], 0
-    change[:] = -1.0
-    before = after = 0.0
-    for i in range(n):
-        # of the points i - 2 reach + 1 to i, the later half and the earlier one
-        since = 1 if is_cut[i] != 0 else since + 1
-        after += light[i]
-        if i >= reach:
-            after -= light[i - reach]
-            before += light[i - reach]
-        if i >= 2 * reach:
-            before -= light[i - 2 * reach]
-        if since >= 2 * reach:
-            change[i - reach + 1] = abs(after - before) / reach
-
-
-@compiled()
-def cut_at_largest(change: Floats, limit: float, reach: int, is_cut: BytesOut) -> None:
-    """Cut where a change (A,) is beyond the limit and the largest within ``reach`` points."""
-    n = change.shape[0]
-    for i in range(n):
-        if not change[i] > limit:
-            continue
-        is_largest = True
-        for k in range(max(i - reach, 0), min(i + reach + 1, n)):
-            is_largest = is_largest and change[i] >= change[k]
-        if is_largest:
-            is_cut[i] = 1
-
-
-@compiled()
 def take_every(number: Ints, every: int, at: IntsOut, weight: FloatsOut, nearest: IntsOut) -> int:
     """Samples of segments: every so many points, more densely on short ones; their count.
 

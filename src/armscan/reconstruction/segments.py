@@ -9,13 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.kernels.naming import (
-    compare_light,
-    cut_at_largest,
-    find_steps,
-    number_segments,
-    take_every,
-)
+from armscan.kernels.chains import compare_light, cut_at_largest
+from armscan.kernels.naming import find_steps, number_segments, take_every
 from armscan.records.profile import Profile, StripeFlag
 
 GAP_PX, GAP_STEPS = 6.0, 3.0

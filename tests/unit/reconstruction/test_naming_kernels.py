@@ -8,11 +8,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.kernels.chains import best_states
+from armscan.kernels.chains import best_states, compare_light, cut_at_largest
 from armscan.kernels.naming import (
     choose_sheets,
-    compare_light,
-    cut_at_largest,
     find_nearest,
     find_steps,
     number_segments,

@@ -55,10 +55,7 @@ def frozen_floats(
     InputError
         If the shape differs or a value is not finite.
     """
-    array: FloatArray = _frozen(values, _FLOAT)
-    _check_shape(array.shape, shape, name, {})
-    if not (allow_nan and allow_infinite):
-        _check_finite(array, name, allow_nan=allow_nan, allow_infinite=allow_infinite)
+    array: FloatArray = _Column(shape, _FLOAT, allow_nan, allow_infinite).owned(values, name, {})
     return array
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import compare_light, cut_at_largest
 from armscan.kernels.naming import find_steps, number_segments, take_every
 from armscan.records.profile import Profile, StripeFlag
@@ -26,8 +27,6 @@ LIGHT_POINTS = 24
 LIGHT_STEP, LIGHT_SIGMAS = float(np.log(1.2)), 3.5
 """A line becomes another one's where its brightness changes by more than both, the second in usual
 changes of it, which speckle makes."""
-NORMAL_MEDIAN = 0.6745
-"""Median of the size of a normal number of variance 1."""
 FAINTEST = 1.0
 """Grey level below which lines are equally dark."""
 PIECE_PX, SAMPLE_PX = 24.0, 8.0
@@ -92,8 +91,8 @@ def _cut_at_light(light: FloatArray, is_cut: NDArray[np.uint8]) -> None:
     compare_light(light, is_cut, LIGHT_POINTS, change)
     told = change[change >= 0.0]
     if len(told):
-        usual = float(np.median(told)) / NORMAL_MEDIAN
-        cut_at_largest(change, max(LIGHT_STEP, LIGHT_SIGMAS * usual), LIGHT_POINTS, is_cut)
+        limit = max(LIGHT_STEP, LIGHT_SIGMAS * robust_sigma(told))
+        cut_at_largest(change, limit, LIGHT_POINTS, is_cut)
 
 
 def _is_beside(profile: Profile) -> BoolArray:

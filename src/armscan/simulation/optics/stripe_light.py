@@ -27,6 +27,7 @@ from armscan.simulation.optics.render import (
     camera_rays,
     cells_near_sheet,
     enlarged,
+    marked,
 )
 from armscan.simulation.optics.scene import FAINTEST, Hits, Material, Scene
 from armscan.simulation.optics.tracing import LightNumbers, SceneNumbers
@@ -171,16 +172,16 @@ def trace_sheet(
     near = _dilated(is_lit, _AROUND)
     known = np.ascontiguousarray(near[::STRIDE_PX, ::STRIDE_PX])
     half_reach, half_peak = np.zeros(known.shape, np.float32), np.zeros(known.shape, np.float32)
-    at = np.nonzero(known.view(np.bool_))
+    at = marked(known.view(np.bool_))
     half_reach[at], half_peak[at] = shaded(at, STRIDE_PX)
     reach, peak = np.zeros(is_lit.shape, np.float32), np.zeros(is_lit.shape, np.float32)
     fill_between(half_reach, half_peak, known, FAR_SIGMAS, reach, peak)
     rough = enlarged(_rough(half_reach, half_peak, known, STRIDE_PX), STRIDE_PX)
     traced = _dilated(rough, _SQUARE) & _dilated(is_lit, _SQUARE)
-    at = np.nonzero(traced.view(np.bool_))
+    at = marked(traced.view(np.bool_))
     reach[at], peak[at] = shaded(at, 1)
     found = _rough(reach, peak, near, 1) & cv2.erode(is_lit, _SQUARE).astype(np.uint8, copy=False)
-    at = np.nonzero(found.view(np.bool_))
+    at = marked(found.view(np.bool_))
     edges = np.zeros(is_lit.shape, np.int32)
     edges[at] = np.arange(1, len(at[0]) + 1)
     pixels = region.pixels_px(at[0] + rows.start, at[1])
@@ -193,7 +194,7 @@ def _rows_around(is_lit: Bytes) -> slice:
 
     They begin and end where the coarse samples do.
     """
-    lit = np.flatnonzero(is_lit.any(axis=1))
+    lit = np.flatnonzero(is_lit.view(np.bool_).any(axis=1))
     if len(lit) == 0:
         return slice(0, STRIDE_PX)
     step = 2 * STRIDE_PX

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.least_squares import pseudo_inverse
 from rigs.instruments import Instrument, Light, Placement, in_camera, lens_of
 
 STEPS = np.array([1e-2, 1e-2, 1e-2, 1e-2, 1e-6, 1e-6, 1e-7, 1e-7, 1e-6])
@@ -83,7 +84,7 @@ def bound(information: FloatArray, n: int) -> FloatArray:
     """(n, n) smallest covariance of the first n unknowns."""
     scale = 1.0 / np.sqrt(np.diag(information))
     scaled = information * np.outer(scale, scale)
-    inverse = np.linalg.pinv(scaled, rcond=1e-15, hermitian=True)
+    inverse = pseudo_inverse(scaled, 1e-15)
     return np.asarray((inverse * np.outer(scale, scale))[:n, :n])
 
 

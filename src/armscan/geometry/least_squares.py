@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import eigh, solve_triangular
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
@@ -49,6 +49,29 @@ def huber_weights(residuals: FloatArray, limit: float = HUBER_LIMIT) -> FloatArr
     return np.asarray(limit / np.maximum(np.abs(residuals), limit))
 
 
+def eigen(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Ascending eigenvalues (N,) of a symmetric matrix (N, N), and its eigenvectors as columns.
+
+    NumPy divides and conquers, which in some builds of its library fails to converge on well
+    conditioned matrices of more than 25 rows; then it is done by QR steps.
+    """
+    try:
+        return np.linalg.eigh(matrix)
+    except np.linalg.LinAlgError:
+        return eigh(matrix, driver="ev")
+
+
+def pseudo_inverse(matrix: FloatArray, share: float) -> FloatArray:
+    """Inverse (N, N) of a symmetric matrix in the space of its eigenvalues that count.
+
+    Those of a size up to ``share`` of the largest one's do not.
+    """
+    values, vectors = eigen(matrix)
+    size = np.abs(values)
+    kept = size > share * size.max(initial=0.0)
+    return np.asarray((vectors[:, kept] / values[kept]) @ vectors[:, kept].T)
+
+
 def square_root(covariance: FloatArray, name: str = "the covariance") -> FloatArray:
     """(P, R) matrix L with ``L L' = covariance`` (P, P), also for one without full rank R.
 
@@ -61,7 +84,7 @@ def square_root(covariance: FloatArray, name: str = "the covariance") -> FloatAr
     """
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     unit = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    values, vectors = eigen(covariance / np.outer(unit, unit))
     largest = max(float(values[-1]), 0.0) if len(values) else 0.0
     if len(values) and float(values[0]) < -1e-6 * max(largest, 1.0):
         raise InputError(f"{name} is not positive semi-definite")

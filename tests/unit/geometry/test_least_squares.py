@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.optimize
 from scipy.stats import norm
 
@@ -14,9 +15,11 @@ from armscan.geometry.least_squares import (
     HUBER_LIMIT,
     MAD_TO_SIGMA,
     Whitening,
+    eigen,
     huber_weights,
     levenberg_marquardt,
     minimise,
+    pseudo_inverse,
     robust_sigma,
     square_root,
 )
@@ -158,3 +161,30 @@ def test_robust_constants_are_those_of_the_normal_distribution() -> None:
     variance = inside - 2.0 * HUBER_LIMIT * norm.pdf(HUBER_LIMIT) + clipped
     np.testing.assert_allclose(inside**2 / variance, 0.95, atol=1e-3)
     np.testing.assert_allclose(huber_weights(np.array([-0.5, 1.345, -2.69])), [1.0, 1.0, 0.5])
+
+
+def test_eigenvalues_come_also_where_divide_and_conquer_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Some builds of the library under NumPy do not converge on well conditioned matrices."""
+    root = np.random.default_rng(RNG_SEED).standard_normal((40, 60))
+    matrix = root @ root.T
+    expected = scipy.linalg.eigvalsh(matrix)
+
+    def fail(_matrix: FloatArray) -> None:
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    for _ in range(2):
+        values, vectors = eigen(matrix)
+        np.testing.assert_allclose(values, expected, rtol=1e-11)
+        np.testing.assert_allclose((vectors * values) @ vectors.T, matrix, atol=1e-11 * values[-1])
+        monkeypatch.setattr(np.linalg, "eigh", fail)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_pseudo_inverse_is_scipys(sign: float) -> None:
+    root = np.random.default_rng(RNG_SEED).standard_normal((12, 5))
+    matrix = sign * root @ root.T
+    np.testing.assert_allclose(
+        pseudo_inverse(matrix, 1e-10), scipy.linalg.pinvh(matrix, rtol=1e-10), atol=1e-12
+    )

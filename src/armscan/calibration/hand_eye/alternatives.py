@@ -39,6 +39,7 @@ from armscan.calibration.hand_eye.search import (
 from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface, dresidual_dsensor
 from armscan.geometry.arrays import FloatArray, homogeneous
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import pseudo_inverse
 from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention, euler_from_rotations, rotations_from_euler
 from armscan.models.calibration import SHEET_PARAMETER_NAMES
@@ -181,7 +182,7 @@ def _likeliest_change(fit: HandEyeSolution) -> _Unknowns | None:
         jacobian = (observations.posture >= first)[:, None] * fit.placed.by_surface
         weight = jacobian.T @ fit.linear.projected @ jacobian
         score = jacobian.T @ fit.explained
-        statistic = float(score @ np.linalg.pinv(weight, rcond=1e-9, hermitian=True) @ score)
+        statistic = float(score @ pseudo_inverse(weight, 1e-9) @ score)
         if statistic > best_score:
             best, best_score = _Unknowns("change", jacobian, int(first), len(numbers)), statistic
     return best

@@ -37,7 +37,14 @@ from armscan.calibration.hand_eye.surface import (
     place,
 )
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.geometry.least_squares import DenseSystem, Minimum, Whitening, levenberg_marquardt
+from armscan.geometry.least_squares import (
+    DenseSystem,
+    Minimum,
+    Whitening,
+    eigen,
+    levenberg_marquardt,
+    pseudo_inverse,
+)
 from armscan.geometry.poses import Pose, Sensor, Tool
 
 MAX_STEPS = 60
@@ -445,7 +452,7 @@ def leave_out(solution: HandEyeSolution, posture: int) -> LeftOut:
     observations, weights = solution.problem.observations, solution.problem.weights
     rows = np.flatnonzero(observations.posture == posture)
     block, explained = solution.linear.projected[np.ix_(rows, rows)], solution.explained[rows]
-    values, vectors = np.linalg.eigh(block)
+    values, vectors = eigen(block)
     used = values > 1e-10 * values[-1]
     inverse = (vectors[:, used] / values[used]) @ vectors[:, used].T
     predicted = inverse @ explained
@@ -453,11 +460,11 @@ def leave_out(solution: HandEyeSolution, posture: int) -> LeftOut:
     weighted = block @ shape
     if weights is not None and weights[posture] < 1.0:
         lent = (1.0 - weights[posture]) * solution.scatter_of("arm", rows)
-        weighted = np.linalg.pinv(inverse - lent, rcond=1e-10, hermitian=True) @ shape
+        weighted = pseudo_inverse(inverse - lent, 1e-10) @ shape
     weight, score = shape.T @ weighted, weighted.T @ predicted
     strength = np.linalg.eigvalsh(weight)
     rank = max(int((strength > 1e-6 * strength[-1]).sum()), 1)
-    statistic = float(score @ np.linalg.pinv(weight, rcond=1e-6, hermitian=True) @ score)
+    statistic = float(score @ pseudo_inverse(weight, 1e-6) @ score)
     size = float(explained @ predicted)
     return LeftOut(
         change=solution.linear.gain[:, rows] @ predicted,

@@ -25,7 +25,7 @@ from armscan.calibration.sheets.labels import SheetAssignment, board_numbers
 from armscan.calibration.sheets.stripes_on_board import BoardImage
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.least_squares import huber_weights, robust_sigma, square_root
+from armscan.geometry.least_squares import eigen, huber_weights, robust_sigma, square_root
 from armscan.models.light_sheet import LightSheet
 
 ITERATIONS = 12
@@ -565,7 +565,7 @@ def _inverse(matrix: FloatArray, scaled_by: FloatArray) -> FloatArray | None:
     if not (diagonal > 0.0).all():
         return None
     scale = 1.0 / np.sqrt(diagonal)
-    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    values, vectors = eigen(matrix * np.outer(scale, scale))
     if not values[0] > MIN_EIGENVALUE:
         return None
     return np.asarray(np.outer(scale, scale) * ((vectors / values) @ vectors.T))

@@ -12,6 +12,7 @@ import numpy as np
 
 from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, floats, ints
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import pseudo_inverse
 from armscan.geometry.poses import Cad, Part, Pose
 from armscan.geometry.rotations import skew, vector_from_rotation
 from armscan.inspection.cad.distance import PartSurface, SurfaceDistance
@@ -417,7 +418,7 @@ def _inverse(normal: FloatArray, radius: float, basis: FloatArray) -> FloatArray
     """(6, 6) inverse of the normal matrix in the motions that are held; basis (6, K), scaled."""
     unit = np.repeat([1.0 / radius, 1.0], 3)
     scaled = basis.T @ (normal * np.outer(unit, unit)) @ basis
-    inside = basis @ np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) @ basis.T
+    inside = basis @ pseudo_inverse(scaled, 1e-14) @ basis.T
     return np.asarray(inside * np.outer(unit, unit))
 
 

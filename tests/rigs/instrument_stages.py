@@ -23,6 +23,7 @@ from armscan.calibration.sheets.solve import BOW_SHARES, LIKELY_BOW
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import pseudo_inverse
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import BOW_TERMS
@@ -476,7 +477,7 @@ def _given_camera(fit: LaserFit, n_shared: int) -> list[FloatArray]:
     sigma = np.sqrt(np.diag(fit.covariance)[camera])
     cross = fit.covariance[sheets, camera] / sigma
     alike = fit.covariance[np.ix_(camera, camera)] / np.outer(sigma, sigma)
-    given = fit.covariance[sheets, sheets] - cross @ np.linalg.pinv(alike, hermitian=True) @ cross.T
+    given = fit.covariance[sheets, sheets] - cross @ pseudo_inverse(alike, 1e-15) @ cross.T
     return [given[N_TERMS * k :, N_TERMS * k :][:N_TERMS, :N_TERMS] for k in range(len(fit.sheets))]
 
 
@@ -498,11 +499,14 @@ def _likely_bows(made: Instrument, fit: LaserFit, names: Sequence[int]) -> dict[
 
 
 def points_of_light(made: Instrument, lines: Sequence[SeenLine], k: int) -> FloatArray:
-    """(N, 3) true points of one line on the boards."""
-    places = {id(line.place): line.place for line in lines if line.light == k}
-    return np.concatenate(
-        [lit_on_board(made, made.lights[k], place, 60) for place in places.values()]
-    )
+    """(N, 3) true points of one line on the boards that a camera sees: no scan has others."""
+    shown = []
+    for line in lines:
+        if line.light == k:
+            points = lit_on_board(made, made.lights[k], line.place, 60)
+            seen = lens_of(made, line.side).project(in_camera(made, points, line.side))
+            shown.append(points[lens_of(made, line.side).sees(seen)])
+    return np.concatenate(shown)
 
 
 def lights_of(made: Instrument, fit: LaserFit, lines: Sequence[SeenLine]) -> list[int]:

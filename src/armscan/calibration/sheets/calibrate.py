@@ -73,6 +73,8 @@ from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import StereoCalibration
 
 OUTLIER_ROUNDS = 4
+MOST_CAST_OUT = 0.2
+"""Share of a stripe's points beyond which these are no outliers, but the stripe lies elsewhere."""
 NOTED_FACTOR = 1.5
 """Scatter of boards over its claim from which on it is told."""
 STRAY_FACTOR = 2.5
@@ -185,25 +187,52 @@ def _case_of(
     for k, start in enumerate(starts):
         of_sheet = observations.sheet == k
         points = observations.select(of_sheet)
-        near = _without_outliers(points, start, errors)
-        model: SheetModel | FitFailure
-        if isinstance(near, FitFailure):
-            model = near
-        else:
-            kept[of_sheet] = near
-            is_bow_allowed = options.is_bow_allowed
-            model = choose_model(points.select(near), start, errors, is_bow_allowed=is_bow_allowed)
-        if isinstance(model, FitFailure):
-            reason = f"sheet {assignment.names[k]}: {model.reason}"
-            return _Refused(k, FitFailure(reason, model.remedy))
+        chosen = _points_and_model(points, start, errors, is_bow_allowed=options.is_bow_allowed)
+        if isinstance(chosen, FitFailure):
+            reason = f"sheet {assignment.names[k]}: {chosen.reason}"
+            return _Refused(k, FitFailure(reason, chosen.remedy))
+        kept[of_sheet], model = chosen
         models.append(model)
     return _Case(images, assignment, observations, scatter, kept, models, errors, cameras, options)
 
 
+def _points_and_model(
+    points: SheetObservations, start: LightSheet, errors: CommonErrors, *, is_bow_allowed: bool
+) -> tuple[BoolArray, SheetModel] | FitFailure:
+    """Which points of a sheet are kept, and its model.
+
+    A stripe most of which lies off the plane that the others fit may be a stray, or the only one
+    out where a bowed sheet bends away: it is kept where a bow explains it with all others to the
+    noise.
+    """
+    near = _without_outliers(points, start, errors)
+    if isinstance(near, FitFailure):
+        return near
+    model = choose_model(points.select(near), start, errors, is_bow_allowed=is_bow_allowed)
+    if not is_bow_allowed or not _loses_a_stripe(points, near):
+        return model if isinstance(model, FitFailure) else (near, model)
+    wider = _without_outliers(points, start, errors, is_bowed=True)
+    if not isinstance(wider, FitFailure) and not _loses_a_stripe(points, wider):
+        bowed = choose_model(points.select(wider), start, errors, is_bow_allowed=True)
+        if not isinstance(bowed, FitFailure) and bowed.explains_all:
+            return wider, bowed
+    return model if isinstance(model, FitFailure) else (near, model)
+
+
+def _loses_a_stripe(points: SheetObservations, kept: BoolArray) -> bool:
+    """Whether more than single points of some stripe are cast out."""
+    stripe = np.unique(points.stripe, return_inverse=True)[1]
+    return bool(np.any(np.bincount(stripe, ~kept) > MOST_CAST_OUT * np.bincount(stripe)))
+
+
 def _without_outliers(
-    observations: SheetObservations, start: LightSheet, errors: CommonErrors
+    observations: SheetObservations,
+    start: LightSheet,
+    errors: CommonErrors,
+    *,
+    is_bowed: bool = False,
 ) -> BoolArray | FitFailure:
-    """Keep the points near the plane; a bow widens the robust scale and so keeps its points."""
+    """Keep the points near the plane, or bow; a bow widens the robust scale off a plane."""
     keep = np.ones(len(observations), dtype=np.bool_)
     alone = observations.as_one_sheet()
     # Stripes that scatter more than they claim must not drag the boards along.
@@ -211,7 +240,7 @@ def _without_outliers(
     for _ in range(OUTLIER_ROUNDS):
         used = alone.select(keep)
         solution = solve_sheets(
-            used, [start], errors, [False], sigma_factor=noise.sigma_factor, is_robust=True
+            used, [start], errors, [is_bowed], sigma_factor=noise.sigma_factor, is_robust=True
         )
         if isinstance(solution, FitFailure):
             return solution

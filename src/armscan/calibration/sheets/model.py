@@ -335,6 +335,11 @@ class SheetModel:
     board_factors: tuple[float, ...]
 
     @property
+    def explains_all(self) -> bool:
+        """Whether it leaves no more than the noise of stripes and boards that err as claimed."""
+        return self.final_test.p_value >= LACK_OF_FIT_P and self.board_factor <= 1.0
+
+    @property
     def board_factor(self) -> float:
         """What is common to all boards: of the one that strays least."""
         return min(self.board_factors)

@@ -11,6 +11,7 @@ import numpy as np
 from armscan.calibration.hand_eye.alternatives import find_mirror
 from armscan.calibration.hand_eye.checks import (
     LIKELIER,
+    MOST_OPEN_MM,
     NO_SOLUTION,
     VARY_POSTURES,
     CheckedFit,
@@ -23,6 +24,7 @@ from armscan.calibration.hand_eye.checks import (
     likeliest_start,
     point_warnings,
     refuse_few_postures,
+    refuse_hardly_determined,
     refuse_underdetermined,
     scatter_warnings,
 )
@@ -183,6 +185,9 @@ def _fit_on_plate(
     if held is None:
         return NO_SOLUTION
     conditioning, left = _conditioning(fit), leave_each_out(fit)
+    refused = refuse_hardly_determined(conditioning, MOST_OPEN_MM, cause, VARY_POSTURES)
+    if refused is not None:
+        return refused
     rows = [np.flatnonzero(mark) for mark in kept]
     found = _evidence(
         checked,
@@ -344,15 +349,8 @@ def _is_apart(one: HandEyeState, other: HandEyeState) -> bool:
 def _refuse_open(conditioning: Conditioning, diameter_mm: float) -> FitFailure | None:
     """Refuse postures that leave a combination of the unknowns open or nearly so."""
     cause = ": the tool hardly turns, or about one axis only"
-    refused = refuse_underdetermined(conditioning, cause, TURN_THE_TOOL)
-    least_mm = max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM)
-    if refused is None and conditioning.singular_values[-1] * least_mm < 1.0:
-        return FitFailure(
-            f"the postures hardly determine the hand-eye{cause} (least known: "
-            f"{conditioning.weakest})",
-            TURN_THE_TOOL,
-        )
-    return refused
+    most_mm = max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM)
+    return refuse_hardly_determined(conditioning, most_mm, cause, TURN_THE_TOOL)
 
 
 def _refuse_far(problem: Problem, state: HandEyeState) -> FitFailure | None:

@@ -79,6 +79,9 @@ MOST_ARM_MM = 0.25
 """An estimated scatter that is surely (two sigma) larger is no arm's. Robots reach 0.15."""
 FAR_ARM_MM = 1.0
 """Nor is one that is larger than this, however badly it is known."""
+MOST_OPEN_MM = 10.0
+"""A hand-eye in which something is known worse measures nothing; as a turn it is six degrees, at
+which a linearised covariance ends, too."""
 UNKNOWN_ARM = 0.6
 """Standard deviation of the logarithm of the arm's scatter from which it is hardly known: a factor
 of 1.8."""
@@ -116,6 +119,23 @@ def refuse_underdetermined(
         f"(least known: {conditioning.weakest})",
         remedy,
     )
+
+
+def refuse_hardly_determined(
+    conditioning: Conditioning, most_mm: float, cause: str, remedy: str
+) -> FitFailure | None:
+    """Refuse what leaves a combination of the unknowns open, or known worse than ``most_mm``.
+
+    Turns are counted as everywhere in `Conditioning`.
+    """
+    refused = refuse_underdetermined(conditioning, cause, remedy)
+    if refused is None and conditioning.singular_values[-1] * most_mm < 1.0:
+        return FitFailure(
+            f"the postures hardly determine the hand-eye{cause} (least known: "
+            f"{conditioning.weakest})",
+            remedy,
+        )
+    return refused
 
 
 def refuse_few_postures(problem: Problem, remedy: str) -> FitFailure | None:

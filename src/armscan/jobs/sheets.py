@@ -358,6 +358,8 @@ def sheets_summary(
     told = [Quantity("laser_colour", "", fit.laser_colour)]
     if fit.channel_reason:
         told.append(fact("stripes in", sentence(fit.channel_reason)))
+    if fit.print_reason:
+        told.append(fact("target's print", sentence(fit.print_reason)))
     for sheet in fit.sheets:
         told.append(fact(f"sheet {sheet.name}", ""))
         told += [fact(f"  {q.label}", q.line) for q in for_people(sheet_quantities(sheet))]
@@ -380,6 +382,7 @@ def sheets_summary(
             "unnamed_points": sum(image.count(PointUse.UNNAMED) for image in fit.images),
             "noise_factor": fit.diagnostics.noise_factor,
             "channel_reason": fit.channel_reason,
+            "print_reason": fit.print_reason,
             "skipped": [{"source": source, "reason": reason} for source, reason in reasons],
         },
     )

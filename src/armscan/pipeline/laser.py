@@ -12,7 +12,13 @@ from typing import cast, get_args
 import numpy as np
 
 from armscan.calibration.cameras.start import estimate_board_pose
-from armscan.calibration.sheets.board_points import HeadCameras, SeenBoard, place_board, poses_chi2
+from armscan.calibration.sheets.board_points import (
+    HeadCameras,
+    SeenBoard,
+    place_board,
+    pose_lit_board,
+    poses_chi2,
+)
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import (
     BoardStripes,
@@ -42,6 +48,7 @@ from armscan.storage.observations import Observations
 from armscan.vision.stripe.image import SIGMA_RANGE_PX, StripeOptions
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import numberings, renumbered
+from armscan.vision.targets.repeated_print import predict_print
 from armscan.vision.targets.target import CircleEdges, Target, TargetView
 
 BOARDS_STAGE = "boards"
@@ -126,11 +133,17 @@ def calibrate_sheets_from_pairs(
             return wrong
 
     def stripes_of(
-        pair: ExposurePair, colour: LaserColour, line_sigma_px: float | None = None
+        pair: ExposurePair,
+        colour: LaserColour,
+        line_sigma_px: float | None = None,
+        *,
+        less_print: bool = False,
     ) -> BoardStripes | FitFailure:
         sigma = options.stripes.line_sigma_px or line_sigma_px
         chosen = replace(options.stripes, laser_colour=colour, line_sigma_px=sigma, on_print=True)
         place = places[placement_of(pair)]
+        if less_print:
+            pair = _with_predicted_print(pair, place, target, cameras)
         return _board_stripes(pair, place, target, cameras, chosen, cache=cache)
 
     colour, reason = options.stripes.laser_colour, ""
@@ -143,14 +156,21 @@ def calibrate_sheets_from_pairs(
         colour, reason = choose_channel(
             len(shown), lambda k, channel: stripes_of(shown[k], channel), cameras, options.sheets
         )
+    bare = [pair for pair in shown if pair[1] is None]
+    less_print, about_print = choose_print(
+        len(bare),
+        lambda k, less: stripes_of(bare[k], colour, less_print=less),
+        cameras,
+        options.sheets,
+    )
     found: list[BoardStripes | FitFailure] = []
     for done, pair in enumerate(pairs):
         progress(ProgressEvent(STRIPES_STAGE, done, len(pairs), pair[0].source))
-        found.append(stripes_of(pair, colour))
+        found.append(stripes_of(pair, colour, less_print=less_print))
     progress(ProgressEvent(STRIPES_STAGE, len(pairs), len(pairs)))
     if options.stripes.line_sigma_px is None:
         for k, sigma_px in _poor_images(found, cameras, options.sheets):
-            again = stripes_of(pairs[k], colour, sigma_px)
+            again = stripes_of(pairs[k], colour, sigma_px, less_print=less_print)
             if _n_clean(again) > _n_clean(found[k]):
                 found[k] = again
     boards = [item for item in found if isinstance(item, BoardStripes)]
@@ -170,7 +190,13 @@ def calibrate_sheets_from_pairs(
         lost = "; ".join(f"{image.source}: {image.reason}" for image in skipped)
         return FitFailure(f"{fit.reason} (not used: {lost})", fit.remedy) if lost else fit
     skipped += fit.skipped
-    return replace(fit, skipped=tuple(skipped), laser_colour=colour, channel_reason=reason)
+    return replace(
+        fit,
+        skipped=tuple(skipped),
+        laser_colour=colour,
+        channel_reason=reason,
+        print_reason=about_print,
+    )
 
 
 def calibrate_sheets_again(
@@ -340,7 +366,8 @@ def find_placements(
         failures: list[FitFailure] = []
         for image in images:
             view = cached_target(image, target, cache)
-            found = view if isinstance(view, FitFailure) else _posed(camera, view, cameras)
+            is_lit = any(image is pair[0] for pair in pairs)
+            found = _posed(camera, view, cameras, is_lit=is_lit)
             if not isinstance(found, FitFailure):
                 return found
             failures.append(found)
@@ -356,10 +383,17 @@ def find_placements(
         yield BoardPlacement(name, seen, place_board(found, cameras) if found else None)
 
 
-def _posed(camera: int, view: TargetView, cameras: HeadCameras) -> SeenBoard | FitFailure:
+def _posed(
+    camera: int, view: TargetView | FitFailure, cameras: HeadCameras, *, is_lit: bool
+) -> SeenBoard | FitFailure:
+    if isinstance(view, FitFailure):
+        return view
     model = cameras.model(camera)
     if view.edges is not None:
         view = correct_centres(view, model)
+    if is_lit:
+        lit = pose_lit_board(view, model)
+        return lit if isinstance(lit, FitFailure) else (camera, *lit)
     pose = estimate_board_pose(view, model)
     return pose if isinstance(pose, FitFailure) else (camera, view, pose)
 
@@ -378,7 +412,7 @@ def _same_placement(
         key=lambda n: float(np.trace(right_from_left @ n.new_from_found.rotation.T)),
     )
     if best.quarter_turns:
-        again = _posed(1, renumbered(right[1], target, best), cameras)
+        again = _posed(1, renumbered(right[1], target, best), cameras, is_lit=False)
         if isinstance(again, FitFailure):
             return again
         right = again
@@ -407,7 +441,7 @@ def choose_channel(
     With the channel comes why it was taken, in words; ``auto`` and nothing where no channel shows a
     straight stripe on a board.
     """
-    sample = np.unique(np.linspace(0, n_images - 1, min(SAMPLE, n_images)).round().astype(int))
+    sample = _sample(n_images)
     # The middle one and both ends first: they differ most.
     order = sorted(
         range(len(sample)), key=lambda k: k not in {0, len(sample) // 2, len(sample) - 1}
@@ -420,10 +454,10 @@ def choose_channel(
                 stripes.append(shown)
         share = LEAST_SHARE.get(tried + 1)
         if share is not None and len(order) > tried + 1:
-            weights = {c: _weigh(stripes, cameras, options)[0] for c, stripes in found.items()}
+            weights = {c: _weigh(s, tried + 1, cameras, options)[0] for c, s in found.items()}
             least = share * max(weights.values())
             found = {c: stripes for c, stripes in found.items() if weights[c] >= least}
-    evidence = [(_weigh(stripes, cameras, options), c) for c, stripes in found.items()]
+    evidence = [(_weigh(s, len(order), cameras, options), c) for c, s in found.items()]
     evidence.sort(key=lambda item: -item[0][0])
     (weight, n_shown, n_points, scatter_px), best = evidence[0]
     if weight <= 0.0:
@@ -438,20 +472,72 @@ def choose_channel(
     return best, reason
 
 
+def _sample(n_images: int) -> IntArray:
+    """Numbers of a few images, evenly spread over a set."""
+    return np.unique(np.linspace(0, n_images - 1, min(SAMPLE, n_images)).round().astype(np.int64))
+
+
+def choose_print(
+    n_images: int,
+    stripes_of: Callable[[int, bool], BoardStripes | FitFailure],
+    cameras: HeadCameras,
+    options: SheetOptions,
+) -> tuple[bool, str]:
+    """Whether a set shows its lines better where the target's print is taken away, and how so.
+
+    ``stripes_of`` gives the stripes of one of ``n_images`` photographs without a view without laser
+    as it is, or less its print as `predict_print` knows it. Judged as in `choose_channel`.
+    """
+    if not n_images:
+        return False, ""
+    sample = _sample(n_images)
+    evidence = []
+    for less_print in (False, True):
+        found = [stripes_of(int(k), less_print) for k in sample]
+        boards = [item for item in found if isinstance(item, BoardStripes)]
+        evidence.append(_weigh(boards, len(sample), cameras, options))
+    (as_is, n_before, points_before, _), (less, n_shown, n_points, scatter_px) = evidence
+    if less <= as_is:
+        return False, ""
+    return True, (
+        f"there are no images without laser: the print is told from its repetition and subtracted; "
+        f"the stripe on the common sheet in {n_shown} of {len(sample)} sampled photographs, "
+        f"{n_points} points that scatter {scatter_px:.2f} px, in place of {n_before} and "
+        f"{points_before}"
+    )
+
+
+def _with_predicted_print(
+    pair: ExposurePair, placement: BoardPlacement, target: Target, cameras: HeadCameras
+) -> ExposurePair:
+    """The pair, with the view without laser that the print's repetition tells where it has none."""
+    exposure, background = pair
+    seen = placement.seen[exposure.camera]
+    if background is not None or isinstance(seen, FitFailure):
+        return pair
+    camera, view, pose = seen
+    lit = around_board(view, exposure)
+    return exposure, predict_print(lit, view, target, pose.value, cameras.model(camera))
+
+
 def _weigh(
-    boards: Sequence[BoardStripes], cameras: HeadCameras, options: SheetOptions
+    boards: Sequence[BoardStripes], n_tried: int, cameras: HeadCameras, options: SheetOptions
 ) -> tuple[float, int, int, float]:
     """Weight of a channel's stripes on the common sheet, their photographs, points and scatter.
 
-    The weight is the points over the square of their scatter (rms, px), summed over the stripes:
-    the precision that the set gets from the channel.
+    The points over the square of their scatter (rms, px) are the precision that a photograph gets
+    from the channel. The weight is the square of the sum of its roots, over the photographs tried:
+    a short piece of some edge on two boards does not outweigh a line across all.
     """
     images = observe_boards(boards, cameras, options).images if boards else ()
     stripes = [(image, stripe.rows) for image in images for stripe in image.stripes]
     n = np.array([len(rows) for _, rows in stripes], dtype=np.int64)
     square = np.array([_scatter_px(image, rows) ** 2 for image, rows in stripes])
-    weight = float((n / (square + LEAST_SCATTER_PX**2)).sum())
     scatter_px = float(np.sqrt((n * square).sum() / n.sum())) if len(n) else 0.0
+    precision = n / (square + LEAST_SCATTER_PX**2)
+    of = np.repeat(np.arange(len(images)), [len(image.stripes) for image in images])
+    root = np.sqrt(np.bincount(of, precision, minlength=len(images))).sum()
+    weight = float(root**2 / n_tried)
     return weight, sum(1 for image in images if image.stripes), int(n.sum()), scatter_px
 
 

@@ -264,6 +264,8 @@ def _sheets_section(fit: LaserFit) -> Section:
     named = f"Named: {fit.diagnostics.naming}."
     if fit.channel_reason:
         named += f" Stripes in {fit.channel_reason}."
+    if fit.print_reason:
+        named += f" {sentence(fit.print_reason)}"
     blocks: list[Block] = [
         Facts(for_people(sheet_quantities(sheet)), f"Sheet {sheet.name}") for sheet in fit.sheets
     ]

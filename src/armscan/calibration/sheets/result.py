@@ -382,6 +382,8 @@ class LaserFit(ArrayRecord):
         The channel of colour images in which the stripes were found.
     channel_reason
         Why that channel, in words; empty where nothing was to be chosen.
+    print_reason
+        Why the target's print was subtracted, in words; empty where it was not.
     """
 
     sheets: tuple[SheetFit, ...]
@@ -396,6 +398,7 @@ class LaserFit(ArrayRecord):
     skipped: tuple[SkippedImage, ...] = ()
     laser_colour: LaserColour = "auto"
     channel_reason: str = ""
+    print_reason: str = ""
 
     @property
     def sheet_names(self) -> tuple[str, ...]:

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a lit target would show without the laser, told from the repetition of its print.
+
+Where no image without laser was taken, bright print beside and under a line pulls its centre, and
+discs and squares are taken for lines. But the print of a grid or chessboard repeats: what lies
+under the line in one cell is seen without it in most of the others. Their median, brought to the
+cell by pose and lens and to its brightness by the lamp's course over the board, is subtracted like
+an image without laser.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray, homogeneous
+from armscan.geometry.least_squares import robust_sigma
+from armscan.geometry.poses import Board, Pose
+from armscan.models.camera import CameraModel
+from armscan.records.exposure import Exposure
+from armscan.vision.targets.target import Charuco, Chessboard, Target, TargetView
+
+LEAST_CELLS = 8
+"""Of a kind: a median of fewer still shows the line where two of them are lit alike."""
+SAMPLES_PX = 1.5
+MOST_SAMPLES = 6_000_000
+STRAY_SIGMAS = 3.0
+"""A point farther than this off the others' scatter is pulled by the laser, not misprinted."""
+MOST_UNLIKE = 0.25
+"""A cell that differs by more from the print, of its contrast, is hidden or is none."""
+ROUNDS = 4
+LAMP_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+"""Powers of x and y in the logarithm of the lamp's light over a board."""
+
+
+def predict_print(
+    exposure: Exposure,
+    view: TargetView,
+    target: Target,
+    camera_from_board: Pose[Any, Board],
+    camera: CameraModel,
+) -> Exposure | None:
+    """The exposure with its target as it would be without laser.
+
+    Parameters
+    ----------
+    exposure
+        With the laser on.
+    view, target
+        The target as it was found in that exposure.
+    camera_from_board
+        Its pose.
+    camera
+        The camera's intrinsics.
+
+    Returns
+    -------
+    The same pixels with those of the print's cells replaced, so that a difference shows the laser
+    there and nothing elsewhere; None where the print does not repeat often enough.
+    """
+    if isinstance(target, Charuco):
+        return None
+    cells = _Cells.of(view, target, camera_from_board, camera)
+    if min(np.bincount(cells.kind)) < LEAST_CELLS:
+        return None
+    image = exposure.image if exposure.image.ndim == 3 else exposure.image[:, :, None]
+    seen, is_seen = _places_seen(cells, exposure)
+    spots = _Spots.of(cells, exposure)
+    predicted, is_told = image.copy(), False
+    for channel in range(image.shape[2]):
+        own = image[:, :, channel].astype(np.float32)
+        samples = map_coordinates(own, [seen[..., 1], seen[..., 0]], order=3, mode="nearest")
+        print_of = _Print.of(np.where(is_seen, samples, np.nan), cells)
+        if print_of is not None:
+            _lay_in(predicted[:, :, channel], print_of, cells, spots, exposure.full_scale)
+            is_told = True
+    return replace(exposure, image=predicted.reshape(exposure.image.shape)) if is_told else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cells:
+    """Squares of a board, one around each target point, that show one print.
+
+    ``centres_mm`` (K, 2), ``kind`` (K,) of the print in each, ``half_mm`` half of their side,
+    ``shift_px`` (K, 2) by which a cell lies beside where the pose puts it, ``step_mm`` between
+    samples of a cell, ``n_steps`` from its centre to its border.
+    """
+
+    centres_mm: FloatArray
+    kind: IntArray
+    half_mm: float
+    shift_px: FloatArray
+    step_mm: float
+    n_steps: int
+    camera_from_board: Pose[Any, Board]
+    camera: CameraModel
+
+    @staticmethod
+    def of(
+        view: TargetView, target: Target, camera_from_board: Pose[Any, Board], camera: CameraModel
+    ) -> _Cells:
+        points = target.points_board_mm[:, :2]
+        distance, other = (np.asarray(found)[:, 1] for found in cKDTree(points).query(points, k=2))
+        half = 0.5 * float(np.median(distance))
+        row, column = np.divmod(np.arange(len(points)), target.columns)
+        kind = (row + column) % 2 if isinstance(target, Chessboard) else np.zeros_like(row)
+        where = camera.project(camera_from_board.apply(target.points_board_mm))
+        width = np.linalg.norm(where - where[other], axis=1)
+        shift = np.zeros_like(where)
+        off = view.points_px - where[view.point_index]
+        near = np.abs(off).max(axis=1) < STRAY_SIGMAS * robust_sigma(off.ravel())
+        shift[view.point_index[near]] = off[near]
+        n = 0.5 * float(np.nanmedian(width)) * SAMPLES_PX
+        n = int(np.ceil(min(n, 0.5 * np.sqrt(MOST_SAMPLES / len(points)))))
+        return _Cells(
+            points, kind, half, shift, half / max(n, 1), max(n, 1), camera_from_board, camera
+        )
+
+    @property
+    def offsets_mm(self) -> FloatArray:
+        """(S * S, 2) of the samples of a cell from its centre, row by row."""
+        steps = np.arange(-self.n_steps, self.n_steps + 1) * self.step_mm
+        return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+
+    def on_board_mm(self, q_px: FloatArray) -> FloatArray:
+        """(N, 2) points of the board's plane behind full-sensor pixels (N, 2); NaN for none."""
+        xy, is_valid = self.camera.undistort(q_px)
+        turn, shift = self.camera_from_board.rotation, self.camera_from_board.translation_mm
+        ray_from_board = np.column_stack([turn[:, 0], turn[:, 1], shift])
+        places = homogeneous(xy) @ np.linalg.inv(ray_from_board).T
+        is_valid &= places[:, 2] > 0.0
+        return np.where(is_valid[:, None], places[:, :2] / places[:, 2:], np.nan)
+
+
+def _places_seen(cells: _Cells, exposure: Exposure) -> tuple[FloatArray, BoolArray]:
+    """(K, S * S, 2) image pixels of all samples, and which of them (K, S * S) are in the image."""
+    at = cells.centres_mm[:, None, :] + cells.offsets_mm
+    flat = np.concatenate([at, np.zeros((*at.shape[:2], 1))], axis=2).reshape(-1, 3)
+    q = cells.camera.project(cells.camera_from_board.apply(flat)).reshape(at.shape)
+    pixels = exposure.window.to_image(q + cells.shift_px[:, None, :])
+    last = np.array([exposure.width_px - 1, exposure.height_px - 1])
+    return pixels, np.all((pixels >= 0.0) & (pixels <= last), axis=2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Spots:
+    """Pixels of an image that lie in cells: ``rows``, ``columns`` (N,), the cell of each and where
+    in it, ``offsets_mm`` (N, 2) from its centre.
+    """
+
+    rows: IntArray
+    columns: IntArray
+    cell: IntArray
+    offsets_mm: FloatArray
+
+    @staticmethod
+    def of(cells: _Cells, exposure: Exposure) -> _Spots:
+        v, u = (part.ravel() for part in np.indices((exposure.height_px, exposure.width_px)))
+        q = exposure.window.to_full_sensor(np.stack([u, v], axis=1).astype(np.float64))
+        places = cells.on_board_mm(q)
+        low, high = cells.centres_mm.min(axis=0), cells.centres_mm.max(axis=0)
+        reach = 2.0 * cells.half_mm
+        with np.errstate(invalid="ignore"):
+            near = np.all(np.abs(places - 0.5 * (low + high)) < 0.5 * (high - low) + reach, axis=1)
+        chosen = np.flatnonzero(near)
+        cell = np.asarray(cKDTree(cells.centres_mm).query(places[chosen])[1])
+        places = cells.on_board_mm(q[chosen] - cells.shift_px[cell])
+        offsets = places - cells.centres_mm[cell]
+        with np.errstate(invalid="ignore"):
+            inside = np.all(np.abs(offsets) <= cells.half_mm, axis=1)
+        chosen = chosen[inside]
+        return _Spots(v[chosen], u[chosen], cell[inside], offsets[inside])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Print:
+    """A print in one channel: ``levels`` (kinds, S, S) under even light, ``lamp`` the light's
+    coefficients over ``LAMP_TERMS``, and which cells ``is_like`` (K,) the others.
+    """
+
+    levels: FloatArray
+    lamp: FloatArray
+    is_like: BoolArray
+
+    @staticmethod
+    def of(samples: FloatArray, cells: _Cells) -> _Print | None:
+        """From the samples (K, S * S) of all cells, NaN outside the image; None for none."""
+        whole: BoolArray = np.any(np.isfinite(samples), axis=1)
+        lamp, kinds = np.zeros(len(LAMP_TERMS)), range(int(cells.kind.max()) + 1)
+        levels = np.zeros((len(kinds), samples.shape[1]))
+        is_like = whole
+        for _ in range(ROUNDS):
+            even = samples / _lamp_at(lamp, cells.centres_mm, cells)[:, None]
+            for kind in kinds:
+                own = is_like & (cells.kind == kind)
+                if own.sum() < LEAST_CELLS:
+                    return None
+                levels[kind] = _median_over(even[own])
+            dark, light = np.nanquantile(levels, [0.05, 0.95])
+            if not light > max(dark, 1.0):
+                return None
+            expected = levels[cells.kind]
+            with np.errstate(invalid="ignore"):
+                is_light = expected > 0.5 * (dark + light)
+                unlike = _median_over(np.abs(even - expected).T) / (light - dark)
+            is_like = whole & (unlike < MOST_UNLIKE)
+            ratio = np.where(is_light, samples / np.maximum(expected, 1.0), np.nan)
+            lamp = _fit_lamp(_median_over(ratio.T), is_like, cells)
+        side = 2 * cells.n_steps + 1
+        return _Print(np.nan_to_num(levels).reshape(-1, side, side), lamp, is_like)
+
+
+def _median_over(values: FloatArray) -> FloatArray:
+    """(N,) median of columns (M, N), without what is not known; NaN for columns without any."""
+    ordered = np.sort(values, axis=0)
+    count = np.isfinite(values).sum(axis=0)
+    last, columns = len(values) - 1, np.arange(values.shape[1])
+    low = ordered[np.maximum(count - 1, 0) // 2, columns]
+    high = ordered[np.minimum(count // 2, last), columns]
+    return np.where(count > 0, 0.5 * (low + high), np.nan)
+
+
+def _lamp_design(places_mm: FloatArray, cells: _Cells) -> FloatArray:
+    middle = cells.centres_mm.mean(axis=0)
+    x, y = ((places_mm - middle) / np.ptp(cells.centres_mm, axis=0).max()).T
+    return np.stack([x**i * y**j for i, j in LAMP_TERMS], axis=1)
+
+
+def _lamp_at(lamp: FloatArray, places_mm: FloatArray, cells: _Cells) -> FloatArray:
+    """(N,) light at places (N, 2) of the board."""
+    return np.asarray(np.exp(_lamp_design(places_mm, cells) @ lamp))
+
+
+def _fit_lamp(light: FloatArray, is_like: BoolArray, cells: _Cells) -> FloatArray:
+    """Coefficients of the light that cells (K,) have, without those that stray."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        known = is_like & np.isfinite(light) & (light > 0.0)
+    design, wanted = _lamp_design(cells.centres_mm[known], cells), np.log(light[known])
+    use, lamp = np.ones(len(wanted), bool), np.zeros(len(LAMP_TERMS), np.float64)
+    for _ in range(ROUNDS):
+        if use.sum() < 2 * len(LAMP_TERMS):
+            return lamp
+        lamp = np.asarray(np.linalg.lstsq(design[use], wanted[use], rcond=None)[0])
+        rest = wanted - design @ lamp
+        use = np.abs(rest) <= STRAY_SIGMAS * max(robust_sigma(rest[use]), 1e-3)
+    return lamp
+
+
+def _lay_in(
+    image: ImageArray, print_of: _Print, cells: _Cells, spots: _Spots, full_scale: int
+) -> None:
+    """Replace the pixels of cells by what their print would show."""
+    likely = print_of.is_like[spots.cell]
+    places = cells.centres_mm[spots.cell] + spots.offsets_mm
+    at = (spots.offsets_mm / cells.step_mm + cells.n_steps)[:, ::-1]
+    for kind, levels in enumerate(print_of.levels):
+        own = np.flatnonzero(likely & (cells.kind[spots.cell] == kind))
+        level = map_coordinates(levels, at[own].T, order=3, mode="nearest")
+        level = np.clip(level * _lamp_at(print_of.lamp, places[own], cells), 0.0, full_scale)
+        image[spots.rows[own], spots.columns[own]] = np.rint(level).astype(image.dtype)

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What lies under a line, told from the print's repetition, against the rendering without line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from armscan.calibration.cameras.start import estimate_board_pose
+from armscan.geometry.estimate import FitFailure
+from armscan.records.exposure import Exposure, SensorWindow
+from armscan.simulation.objects.boards import CirclePattern, FlatPattern, Lighting
+from armscan.vision.targets.detect import detect_target
+from armscan.vision.targets.repeated_print import predict_print
+from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView, parse_target
+from rigs.flat_prints import ChessboardPattern
+from rigs.target_scenes import (
+    NOISE,
+    camera,
+    exposure,
+    line_distance,
+    model,
+    render,
+    with_laser_line,
+)
+
+LINE_PX = 2.0
+QUANTISATION = 1.0 / 12.0
+"""Variance of a rounded level."""
+
+
+def predicted(lit: Exposure, target: Target) -> Exposure | None:
+    view = detect_target(lit, target)
+    assert isinstance(view, TargetView), view
+    pose = estimate_board_pose(view, model(distorted=True))
+    assert not isinstance(pose, FitFailure)
+    return predict_print(lit, view, target, pose.value, model(distorted=True))
+
+
+@pytest.mark.parametrize(
+    ("target", "pattern", "distance_mm"),
+    [
+        (CircleGrid(9, 7, 3.75), CirclePattern(9, 7, 3.75, 1.2), 80.0),
+        (CircleGrid(9, 7, 3.75), CirclePattern(9, 7, 3.75, 1.2, is_light_on_dark=True), 80.0),
+        (Chessboard(9, 6, 4.0), ChessboardPattern(9, 6, 4.0), 90.0),
+    ],
+    ids=["dark discs", "light discs", "squares"],
+)
+@pytest.mark.parametrize("corner", [(0, 0), (120, 60)])
+def test_what_lies_under_the_line_is_told_to_the_noise(
+    target: Target, pattern: FlatPattern, distance_mm: float, corner: tuple[int, int]
+) -> None:
+    """Lens distorted, board tilted, lamp to one side; the laser pulls centres that it crosses."""
+    rendered = render(
+        pattern,
+        distance_mm,
+        tilt_deg=30.0,
+        azimuth_deg=50.0,
+        roll_deg=10.0,
+        render_camera=camera(distorted=True),
+        lighting=Lighting(gradient=0.3, gradient_azimuth_rad=1.0),
+    )
+    through = rendered.marks_px.mean(axis=0) + 3.0
+    with_line = with_laser_line(rendered.image, through, 0.4, LINE_PX, peak=60.0)
+    x, y = corner
+    lit = exposure(with_line[y:, x:], seed=3, window=SensorWindow(x, y))
+    found = predicted(lit, target)
+    assert found is not None
+    along, away = line_distance(rendered.image.shape, through, 0.4)
+    reach = 0.35 * float(np.ptp(rendered.marks_px, axis=0).max())
+    core = ((np.abs(away) < 2.0 * LINE_PX) & (np.abs(along) < reach))[y:, x:]
+    error = (found.image.astype(np.float64) - rendered.image[y:, x:])[core]
+    assert core.sum() > 2000
+    # The median of dozens of cells is quieter than one pixel, also where edges are resampled.
+    assert np.sqrt(np.mean(error**2)) < np.sqrt(NOISE**2 + QUANTISATION)
+    assert abs(error.mean()) < 0.2 * NOISE
+    beside = ((np.abs(away) > 8.0 * LINE_PX) & (np.abs(along) < reach))[y:, x:]
+    left = (found.image.astype(np.float64) - lit.image)[beside]
+    assert np.sqrt(np.mean(left**2)) < 1.5 * NOISE
+
+
+def test_misprinted_discs_are_found_where_they_are() -> None:
+    """Discs that miss their places by 0.5 px: what is left at their rims tells the sign."""
+    missed = np.random.default_rng(8).normal(0.0, 0.02, (63, 2))
+    pattern = CirclePattern(
+        9, 7, 3.75, 1.8, misplaced_mm=tuple((float(x), float(y)) for x, y in missed)
+    )
+    rendered = render(pattern, 80.0, tilt_deg=20.0, render_camera=camera(distorted=True))
+    lit = exposure(rendered.image, seed=5)
+    found = predicted(lit, CircleGrid(9, 7, 3.75))
+    assert found is not None
+    own = found.image != lit.image
+    error = (found.image.astype(np.float64) - rendered.image)[own]
+    assert np.sqrt(np.mean(error**2)) < NOISE
+
+
+def test_beyond_the_cells_nothing_is_changed() -> None:
+    rendered = render(CirclePattern(6, 5, 3.75, 1.2), 80.0, render_camera=camera(distorted=True))
+    lit = exposure(rendered.image)
+    found = predicted(lit, CircleGrid(6, 5, 3.75))
+    assert found is not None
+    low, high = rendered.marks_px.min(axis=0), rendered.marks_px.max(axis=0)
+    pitch = (high - low)[0] / 5
+    v, u = np.indices(lit.image.shape)
+    outside = (u < low[0] - 0.6 * pitch) | (u > high[0] + 0.6 * pitch)
+    outside |= (v < low[1] - 0.6 * pitch) | (v > high[1] + 0.6 * pitch)
+    np.testing.assert_array_equal(found.image[outside], lit.image[outside])
+
+
+def test_a_hand_over_some_discs_is_not_replaced() -> None:
+    """Cells that do not look like the print are left as they are."""
+    rendered = render(CirclePattern(9, 7, 3.75, 1.2), 80.0, render_camera=camera(distorted=True))
+    marks = rendered.marks_px.reshape(7, 9, 2)
+    image = rendered.image.copy()
+    left, top = (marks[2, 2] - 35.0).astype(int)
+    right, bottom = (marks[3, 3] + 35.0).astype(int)
+    whole = exposure(image)
+    view = detect_target(whole, CircleGrid(9, 7, 3.75))
+    assert isinstance(view, TargetView)
+    pose = estimate_board_pose(view, model(distorted=True))
+    assert not isinstance(pose, FitFailure)
+    image[top:bottom, left:right] = 90.0
+    lit = exposure(image, seed=1)
+    given = (view, CircleGrid(9, 7, 3.75), pose.value, model(distorted=True))
+    found = predict_print(lit, *given)
+    assert found is not None
+    x, y = marks[2, 2].astype(int)
+    own = np.s_[y - 15 : y + 15, x - 15 : x + 15]
+    np.testing.assert_array_equal(found.image[own], lit.image[own])
+
+
+def test_a_board_of_markers_does_not_repeat() -> None:
+    rendered = render(CirclePattern(9, 7, 3.75, 1.2), 80.0, render_camera=camera(distorted=True))
+    lit = exposure(rendered.image)
+    view = detect_target(lit, CircleGrid(9, 7, 3.75))
+    assert isinstance(view, TargetView)
+    pose = estimate_board_pose(view, model(distorted=True))
+    assert not isinstance(pose, FitFailure)
+    charuco = parse_target("charuco:10x7:4:3:DICT_4X4_50")
+    assert predict_print(lit, view, charuco, pose.value, model(distorted=True)) is None

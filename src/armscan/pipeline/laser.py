@@ -53,6 +53,7 @@ from armscan.vision.targets.target import CircleEdges, Target, TargetView
 
 BOARDS_STAGE = "boards"
 STRIPES_STAGE = "stripes"
+PRINT_STAGE = "stripes with and without the print"
 AGAIN_STAGE = "boards and stripes again"
 LITTLE = 0.5
 """Of the usual count of points on the common sheet: with fewer an image is looked at again."""
@@ -157,16 +158,22 @@ def calibrate_sheets_from_pairs(
             len(shown), lambda k, channel: stripes_of(shown[k], channel), cameras, options.sheets
         )
     bare = [pair for pair in shown if pair[1] is None]
-    less_print, about_print = choose_print(
-        len(bare),
-        lambda k, less: stripes_of(bare[k], colour, less_print=less),
-        cameras,
-        options.sheets,
-    )
+    known: dict[tuple[int, bool], BoardStripes | FitFailure] = {}
+
+    def tried(k: int, less: bool) -> BoardStripes | FitFailure:
+        exposure, done = bare[k][0], k + less * len(bare)
+        progress(ProgressEvent(PRINT_STAGE, done, 2 * len(bare), exposure.source))
+        stripes = known[id(exposure), less] = stripes_of(bare[k], colour, less_print=less)
+        return stripes
+
+    less_print, about_print = choose_print(len(bare), tried, cameras, options.sheets)
     found: list[BoardStripes | FitFailure] = []
     for done, pair in enumerate(pairs):
         progress(ProgressEvent(STRIPES_STAGE, done, len(pairs), pair[0].source))
-        found.append(stripes_of(pair, colour, less_print=less_print))
+        stripes = known.get((id(pair[0]), less_print))
+        if stripes is None:
+            stripes = stripes_of(pair, colour, less_print=less_print)
+        found.append(stripes)
     progress(ProgressEvent(STRIPES_STAGE, len(pairs), len(pairs)))
     if options.stripes.line_sigma_px is None:
         for k, sigma_px in _poor_images(found, cameras, options.sheets):

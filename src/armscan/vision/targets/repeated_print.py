@@ -11,9 +11,10 @@ an image without laser.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
@@ -24,8 +25,12 @@ from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.target import Charuco, Chessboard, Target, TargetView
 
+Floats32: TypeAlias = NDArray[np.float32]
+
 LEAST_CELLS = 8
 """Of a kind: a median of fewer still shows the line where two of them are lit alike."""
+NODE_PX = 8
+"""Between pixels so far apart lens and perspective bend a place by some thousandths of a pixel."""
 SAMPLES_PX = 1.5
 MOST_SAMPLES = 6_000_000
 STRAY_SIGMAS = 3.0
@@ -73,8 +78,10 @@ def predict_print(
     predicted, is_told = image.copy(), False
     for channel in range(image.shape[2]):
         own = image[:, :, channel].astype(np.float32)
-        samples = map_coordinates(own, [seen[..., 1], seen[..., 0]], order=3, mode="nearest")
-        print_of = _Print.of(np.where(is_seen, samples, np.nan), cells)
+        at = [seen[..., 1], seen[..., 0]]
+        samples = map_coordinates(own, at, np.float32, order=3, mode="nearest")
+        samples[~is_seen] = np.nan
+        print_of = _Print.of(samples, cells)
         if print_of is not None:
             _lay_in(predicted[:, :, channel], print_of, cells, spots, exposure.full_scale)
             is_told = True
@@ -136,14 +143,19 @@ class _Cells:
         return np.where(is_valid[:, None], places[:, :2] / places[:, 2:], np.nan)
 
 
-def _places_seen(cells: _Cells, exposure: Exposure) -> tuple[FloatArray, BoolArray]:
+def _places_seen(cells: _Cells, exposure: Exposure) -> tuple[Floats32, BoolArray]:
     """(K, S * S, 2) image pixels of all samples, and which of them (K, S * S) are in the image."""
-    at = cells.centres_mm[:, None, :] + cells.offsets_mm
-    flat = np.concatenate([at, np.zeros((*at.shape[:2], 1))], axis=2).reshape(-1, 3)
-    q = cells.camera.project(cells.camera_from_board.apply(flat)).reshape(at.shape)
-    pixels = exposure.window.to_image(q + cells.shift_px[:, None, :])
+    offsets = cells.offsets_mm
+    pixels = np.zeros((len(cells.centres_mm), *offsets.shape), np.float32)
     last = np.array([exposure.width_px - 1, exposure.height_px - 1])
-    return pixels, np.all((pixels >= 0.0) & (pixels <= last), axis=2)
+    is_seen = np.zeros(pixels.shape[:2], np.bool_)
+    for k, (centre, shift) in enumerate(zip(cells.centres_mm, cells.shift_px, strict=True)):
+        flat = np.column_stack([centre + offsets, np.zeros(len(offsets))])
+        q = cells.camera.project(cells.camera_from_board.apply(flat)) + shift
+        own = exposure.window.to_image(q)
+        is_seen[k] = np.all((own >= 0.0) & (own <= last), axis=1)
+        pixels[k, is_seen[k]] = own[is_seen[k]]
+    return pixels, is_seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,21 +171,40 @@ class _Spots:
 
     @staticmethod
     def of(cells: _Cells, exposure: Exposure) -> _Spots:
+        places = _Places.of(cells, exposure)
         v, u = (part.ravel() for part in np.indices((exposure.height_px, exposure.width_px)))
-        q = exposure.window.to_full_sensor(np.stack([u, v], axis=1).astype(np.float64))
-        places = cells.on_board_mm(q)
-        low, high = cells.centres_mm.min(axis=0), cells.centres_mm.max(axis=0)
-        reach = 2.0 * cells.half_mm
+        middle = 0.5 * (cells.centres_mm.min(axis=0) + cells.centres_mm.max(axis=0))
+        reach = 0.5 * np.ptp(cells.centres_mm, axis=0) + 2.0 * cells.half_mm
+        on_board = places.at(v, u)
         with np.errstate(invalid="ignore"):
-            near = np.all(np.abs(places - 0.5 * (low + high)) < 0.5 * (high - low) + reach, axis=1)
-        chosen = np.flatnonzero(near)
-        cell = np.asarray(cKDTree(cells.centres_mm).query(places[chosen])[1])
-        places = cells.on_board_mm(q[chosen] - cells.shift_px[cell])
-        offsets = places - cells.centres_mm[cell]
+            chosen = np.flatnonzero(np.all(np.abs(on_board - middle) < reach, axis=1))
+        v, u = v[chosen], u[chosen]
+        cell = np.asarray(cKDTree(cells.centres_mm).query(on_board[chosen])[1])
+        shift = cells.shift_px[cell] / exposure.window.binning
+        offsets = places.at(v - shift[:, 1], u - shift[:, 0]) - cells.centres_mm[cell]
         with np.errstate(invalid="ignore"):
             inside = np.all(np.abs(offsets) <= cells.half_mm, axis=1)
-        chosen = chosen[inside]
-        return _Spots(v[chosen], u[chosen], cell[inside], offsets[inside])
+        return _Spots(v[inside], u[inside], cell[inside], offsets[inside])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Places:
+    """Places on the board (H, W, 2) behind every `NODE_PX`-th pixel of an image."""
+
+    nodes_mm: FloatArray
+
+    @staticmethod
+    def of(cells: _Cells, exposure: Exposure) -> _Places:
+        size = (exposure.height_px // NODE_PX + 2, exposure.width_px // NODE_PX + 2)
+        v, u = NODE_PX * np.indices(size).astype(np.float64)
+        q = exposure.window.to_full_sensor(np.stack([u, v], axis=-1).reshape(-1, 2))
+        return _Places(cells.on_board_mm(q).reshape(*size, 2))
+
+    def at(self, rows: FloatArray | IntArray, columns: FloatArray | IntArray) -> FloatArray:
+        """(N, 2) places behind pixels, between the nodes by straight lines."""
+        where = [rows / NODE_PX, columns / NODE_PX]
+        parts = (self.nodes_mm[:, :, k] for k in range(2))
+        return np.stack([map_coordinates(one, where, order=1, mode="nearest") for one in parts], 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,14 +218,15 @@ class _Print:
     is_like: BoolArray
 
     @staticmethod
-    def of(samples: FloatArray, cells: _Cells) -> _Print | None:
+    def of(samples: Floats32, cells: _Cells) -> _Print | None:
         """From the samples (K, S * S) of all cells, NaN outside the image; None for none."""
         whole: BoolArray = np.any(np.isfinite(samples), axis=1)
         lamp, kinds = np.zeros(len(LAMP_TERMS)), range(int(cells.kind.max()) + 1)
         levels = np.zeros((len(kinds), samples.shape[1]))
         is_like = whole
         for _ in range(ROUNDS):
-            even = samples / _lamp_at(lamp, cells.centres_mm, cells)[:, None]
+            of_lamp = _lamp_at(lamp, cells.centres_mm, cells)
+            even = samples / of_lamp[:, None].astype(np.float32)
             for kind in kinds:
                 own = is_like & (cells.kind == kind)
                 if own.sum() < LEAST_CELLS:
@@ -214,7 +246,7 @@ class _Print:
         return _Print(np.nan_to_num(levels).reshape(-1, side, side), lamp, is_like)
 
 
-def _median_over(values: FloatArray) -> FloatArray:
+def _median_over(values: FloatArray | Floats32) -> FloatArray:
     """(N,) median of columns (M, N), without what is not known; NaN for columns without any."""
     ordered = np.sort(values, axis=0)
     count = np.isfinite(values).sum(axis=0)

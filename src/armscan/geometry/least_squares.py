@@ -54,10 +54,17 @@ def eigen(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     NumPy divides and conquers, which in some builds of its library fails to converge on well
     conditioned matrices of more than 25 rows; then it is done by QR steps.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the matrix holds what is no number.
     """
     try:
         return np.linalg.eigh(matrix)
     except np.linalg.LinAlgError:
+        if not np.isfinite(matrix).all():
+            raise
         return eigh(matrix, driver="ev")
 
 

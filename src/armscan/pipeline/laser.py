@@ -48,7 +48,7 @@ from armscan.storage.observations import Observations
 from armscan.vision.stripe.image import SIGMA_RANGE_PX, StripeOptions
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import numberings, renumbered
-from armscan.vision.targets.repeated_print import predict_print
+from armscan.vision.targets.repeated_print import does_repeat, predict_print
 from armscan.vision.targets.target import CircleEdges, Target, TargetView
 
 BOARDS_STAGE = "boards"
@@ -157,7 +157,7 @@ def calibrate_sheets_from_pairs(
         colour, reason = choose_channel(
             len(shown), lambda k, channel: stripes_of(shown[k], channel), cameras, options.sheets
         )
-    bare = [pair for pair in shown if pair[1] is None]
+    bare = [pair for pair in shown if pair[1] is None and does_repeat(target)]
     known: dict[tuple[int, bool], BoardStripes | FitFailure] = {}
 
     def tried(k: int, less: bool) -> BoardStripes | FitFailure:
@@ -167,6 +167,8 @@ def calibrate_sheets_from_pairs(
         return stripes
 
     less_print, about_print = choose_print(len(bare), tried, cameras, options.sheets)
+    if bare:
+        progress(ProgressEvent(PRINT_STAGE, 2 * len(bare), 2 * len(bare)))
     found: list[BoardStripes | FitFailure] = []
     for done, pair in enumerate(pairs):
         progress(ProgressEvent(STRIPES_STAGE, done, len(pairs), pair[0].source))
@@ -461,10 +463,10 @@ def choose_channel(
                 stripes.append(shown)
         share = LEAST_SHARE.get(tried + 1)
         if share is not None and len(order) > tried + 1:
-            weights = {c: _weigh(s, tried + 1, cameras, options)[0] for c, s in found.items()}
+            weights = {c: _weigh(s, cameras, options)[0] for c, s in found.items()}
             least = share * max(weights.values())
             found = {c: stripes for c, stripes in found.items() if weights[c] >= least}
-    evidence = [(_weigh(s, len(order), cameras, options), c) for c, s in found.items()]
+    evidence = [(_weigh(s, cameras, options), c) for c, s in found.items()]
     evidence.sort(key=lambda item: -item[0][0])
     (weight, n_shown, n_points, scatter_px), best = evidence[0]
     if weight <= 0.0:
@@ -502,15 +504,15 @@ def choose_print(
     for less_print in (False, True):
         found = [stripes_of(int(k), less_print) for k in sample]
         boards = [item for item in found if isinstance(item, BoardStripes)]
-        evidence.append(_weigh(boards, len(sample), cameras, options))
+        evidence.append(_weigh(boards, cameras, options))
     (as_is, n_before, points_before, _), (less, n_shown, n_points, scatter_px) = evidence
     if less <= as_is:
         return False, ""
     return True, (
-        f"there are no images without laser: the print is told from its repetition and subtracted; "
-        f"the stripe on the common sheet in {n_shown} of {len(sample)} sampled photographs, "
-        f"{n_points} points that scatter {scatter_px:.2f} px, in place of {n_before} and "
-        f"{points_before}"
+        f"{n_images} photographs have none without laser: their print is told from its repetition "
+        f"and subtracted; the stripe on the common sheet in {n_shown} of {len(sample)} that were "
+        f"tried, {n_points} points that scatter {scatter_px:.2f} px (as they are: in {n_before}, "
+        f"{points_before} points)"
     )
 
 
@@ -528,13 +530,13 @@ def _with_predicted_print(
 
 
 def _weigh(
-    boards: Sequence[BoardStripes], n_tried: int, cameras: HeadCameras, options: SheetOptions
+    boards: Sequence[BoardStripes], cameras: HeadCameras, options: SheetOptions
 ) -> tuple[float, int, int, float]:
     """Weight of a channel's stripes on the common sheet, their photographs, points and scatter.
 
     The points over the square of their scatter (rms, px) are the precision that a photograph gets
-    from the channel. The weight is the square of the sum of its roots, over the photographs tried:
-    a short piece of some edge on two boards does not outweigh a line across all.
+    from the channel. The weight is the square of the sum of its roots: a short piece of an edge on
+    two boards does not outweigh a line across all.
     """
     images = observe_boards(boards, cameras, options).images if boards else ()
     stripes = [(image, stripe.rows) for image in images for stripe in image.stripes]
@@ -544,7 +546,7 @@ def _weigh(
     precision = n / (square + LEAST_SCATTER_PX**2)
     of = np.repeat(np.arange(len(images)), [len(image.stripes) for image in images])
     root = np.sqrt(np.bincount(of, precision, minlength=len(images))).sum()
-    weight = float(root**2 / n_tried)
+    weight = float(root**2)
     return weight, sum(1 for image in images if image.stripes), int(n.sum()), scatter_px
 
 

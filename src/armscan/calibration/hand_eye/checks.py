@@ -131,8 +131,8 @@ def refuse_hardly_determined(
     refused = refuse_underdetermined(conditioning, cause, remedy)
     if refused is None and conditioning.singular_values[-1] * most_mm < 1.0:
         return FitFailure(
-            f"the postures hardly determine the hand-eye{cause} (least known: "
-            f"{conditioning.weakest})",
+            f"the postures hardly determine the hand-eye{cause} (limit {most_mm:.3g} mm; least "
+            f"known: {conditioning.weakest})",
             remedy,
         )
     return refused

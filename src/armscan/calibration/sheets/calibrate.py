@@ -73,6 +73,9 @@ from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import StereoCalibration
 
 OUTLIER_ROUNDS = 4
+BOARDS_TO_KEEP = 6
+"""With their shifts and slopes they tell twelve numbers of a bowed sheet's eight: of four boards, a
+bow explains any stray."""
 MOST_CAST_OUT = 0.2
 """Share of a stripe's points beyond which these are no outliers, but the stripe lies elsewhere."""
 NOTED_FACTOR = 1.5
@@ -209,7 +212,8 @@ def _points_and_model(
     if isinstance(near, FitFailure):
         return near
     model = choose_model(points.select(near), start, errors, is_bow_allowed=is_bow_allowed)
-    if not is_bow_allowed or not _loses_a_stripe(points, near):
+    is_told = len(np.unique(points.board)) >= BOARDS_TO_KEEP
+    if not is_bow_allowed or not is_told or not _loses_a_stripe(points, near):
         return model if isinstance(model, FitFailure) else (near, model)
     wider = _without_outliers(points, start, errors, is_bowed=True)
     if not isinstance(wider, FitFailure) and not _loses_a_stripe(points, wider):

@@ -5,7 +5,8 @@ Where no image without laser was taken, bright print beside and under a line pul
 discs and squares are taken for lines. But the print of a grid or chessboard repeats: what lies
 under the line in one cell is seen without it in most of the others. Their median, brought to the
 cell by pose and lens and to its brightness by the lamp's course over the board, is subtracted like
-an image without laser.
+an image without laser. Light is taken to scale it: of a camera with a black level, dark print keeps
+some levels. Many parallel lines a whole pitch apart lie alike in many cells, and go with the print.
 """
 
 from __future__ import annotations
@@ -13,17 +14,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray, homogeneous
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, homogeneous
 from armscan.geometry.least_squares import robust_sigma
 from armscan.geometry.poses import Board, Pose
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.target import Charuco, Chessboard, Target, TargetView
+from armscan.vision.targets.target import Charuco, Chessboard, CircleGrid, Target, TargetView
 
 Floats32: TypeAlias = NDArray[np.float32]
 
@@ -33,6 +35,11 @@ NODE_PX = 8
 """Between pixels so far apart lens and perspective bend a place by some thousandths of a pixel."""
 SAMPLES_PX = 1.5
 MOST_SAMPLES = 6_000_000
+STAGGERED_REACH = 1.25
+"""Of the diamond around a point of an asymmetric grid, a little more: the discs at the tips of the
+square around it stay out."""
+SLACK_STEPS = 3.0
+"""Beyond a cell's border, so that no gap is left between two that misprints move apart."""
 STRAY_SIGMAS = 3.0
 """A point farther than this off the others' scatter is pulled by the laser, not misprinted."""
 MOST_UNLIKE = 0.25
@@ -49,7 +56,7 @@ def predict_print(
     camera_from_board: Pose[Any, Board],
     camera: CameraModel,
 ) -> Exposure | None:
-    """The exposure with its target as it would be without laser.
+    """An exposure without what its laser lights up: its target's print, smooth light around it.
 
     Parameters
     ----------
@@ -64,28 +71,47 @@ def predict_print(
 
     Returns
     -------
-    The same pixels with those of the print's cells replaced, so that a difference shows the laser
-    there and nothing elsewhere; None where the print does not repeat often enough.
+    Cells that look like the others show their print, what is elsewhere its mean over squares of a
+    cell's size, in which a line hardly shows; None where no print is told.
     """
-    if isinstance(target, Charuco):
+    if not does_repeat(target):
         return None
-    cells = _Cells.of(view, target, camera_from_board, camera)
-    if min(np.bincount(cells.kind)) < LEAST_CELLS:
-        return None
+    cells = _Cells.of(view, target, camera_from_board, camera, exposure.window.binning)
     image = exposure.image if exposure.image.ndim == 3 else exposure.image[:, :, None]
     seen, is_seen = _places_seen(cells, exposure)
     spots = _Spots.of(cells, exposure)
-    predicted, is_told = image.copy(), False
+    predicted, is_told = np.zeros_like(image), False
     for channel in range(image.shape[2]):
         own = image[:, :, channel].astype(np.float32)
         at = [seen[..., 1], seen[..., 0]]
         samples = map_coordinates(own, at, np.float32, order=3, mode="nearest")
-        samples[~is_seen] = np.nan
+        samples[~is_seen | ~cells.is_own] = np.nan
         print_of = _Print.of(samples, cells)
+        is_open = np.ones(own.shape, np.bool_)
         if print_of is not None:
-            _lay_in(predicted[:, :, channel], print_of, cells, spots, exposure.full_scale)
+            _lay_in(own, is_open, print_of, cells, spots)
             is_told = True
+        own[is_open] = _smooth(own, is_open, cells.size_px)[is_open]
+        predicted[:, :, channel] = np.rint(np.clip(own, 0.0, exposure.full_scale))
     return replace(exposure, image=predicted.reshape(exposure.image.shape)) if is_told else None
+
+
+def _smooth(image: Floats32, is_open: BoolArray, size_px: tuple[int, int]) -> Floats32:
+    """Mean (H, W) over squares of what is open of an image."""
+    weight = is_open.astype(np.float32)
+    total = cv2.blur(image * weight, size_px)
+    return np.asarray(total / np.maximum(cv2.blur(weight, size_px), 1e-6), np.float32)
+
+
+def does_repeat(target: Target) -> bool:
+    """Whether a target's print is the same in cells enough to be told from them."""
+    return not isinstance(target, Charuco) and min(np.bincount(_kinds(target))) >= LEAST_CELLS
+
+
+def _kinds(target: Target) -> IntArray:
+    """(K,) which of its prints a target shows around each point."""
+    row, column = np.divmod(np.arange(len(target.points_board_mm)), target.columns)
+    return (row + column) % 2 if isinstance(target, Chessboard) else np.zeros_like(row)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +120,8 @@ class _Cells:
 
     ``centres_mm`` (K, 2), ``kind`` (K,) of the print in each, ``half_mm`` half of their side,
     ``shift_px`` (K, 2) by which a cell lies beside where the pose puts it, ``step_mm`` between
-    samples of a cell, ``n_steps`` from its centre to its border.
+    samples of a cell, ``n_steps`` from its centre to its border. Of an asymmetric grid the cells
+    overlap: what lies nearer to another centre is not their own.
     """
 
     centres_mm: FloatArray
@@ -103,34 +130,62 @@ class _Cells:
     shift_px: FloatArray
     step_mm: float
     n_steps: int
+    is_staggered: bool
     camera_from_board: Pose[Any, Board]
     camera: CameraModel
+    binning: int
 
     @staticmethod
     def of(
-        view: TargetView, target: Target, camera_from_board: Pose[Any, Board], camera: CameraModel
+        view: TargetView,
+        target: Target,
+        camera_from_board: Pose[Any, Board],
+        camera: CameraModel,
+        binning: int,
     ) -> _Cells:
         points = target.points_board_mm[:, :2]
         distance, other = (np.asarray(found)[:, 1] for found in cKDTree(points).query(points, k=2))
-        half = 0.5 * float(np.median(distance))
-        row, column = np.divmod(np.arange(len(points)), target.columns)
-        kind = (row + column) % 2 if isinstance(target, Chessboard) else np.zeros_like(row)
+        is_staggered = isinstance(target, CircleGrid) and target.is_asymmetric
+        nearest_mm = float(np.median(distance))
+        half = nearest_mm / np.sqrt(2.0) if is_staggered else 0.5 * nearest_mm
         where = camera.project(camera_from_board.apply(target.points_board_mm))
         width = np.linalg.norm(where - where[other], axis=1)
         shift = np.zeros_like(where)
         off = view.points_px - where[view.point_index]
         near = np.abs(off).max(axis=1) < STRAY_SIGMAS * robust_sigma(off.ravel())
         shift[view.point_index[near]] = off[near]
-        n = 0.5 * float(np.nanmedian(width)) * SAMPLES_PX
-        n = int(np.ceil(min(n, 0.5 * np.sqrt(MOST_SAMPLES / len(points)))))
+        half_px = half * float(np.nanmedian(width)) / nearest_mm / binning
+        most = 0.5 * np.sqrt(MOST_SAMPLES / len(points))
+        n = max(int(np.ceil(min(half_px * SAMPLES_PX, most))), 1)
         return _Cells(
-            points, kind, half, shift, half / max(n, 1), max(n, 1), camera_from_board, camera
+            *(points, _kinds(target), half, shift, half / n, n),
+            *(is_staggered, camera_from_board, camera, binning),
         )
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of a cell in the image, about."""
+        side = 2 * int(np.ceil(self.n_steps / SAMPLES_PX)) + 1
+        return side, side
+
+    @property
+    def is_own(self) -> BoolArray:
+        """(S * S,) samples that lie in the cell, or near its border."""
+        return self.holds(self.offsets_mm, (STAGGERED_REACH - 1.0) * self.half_mm)
+
+    def holds(self, offsets_mm: FloatArray, slack_mm: float) -> BoolArray:
+        """(N,) whether places (N, 2) from a centre lie in its cell, or that far beyond it."""
+        size = np.abs(offsets_mm)
+        with np.errstate(invalid="ignore"):
+            inside = np.all(size <= self.half_mm + slack_mm, axis=1)
+            if self.is_staggered:
+                inside &= size.sum(axis=1) <= self.half_mm + slack_mm
+        return np.asarray(inside)
 
     @property
     def offsets_mm(self) -> FloatArray:
         """(S * S, 2) of the samples of a cell from its centre, row by row."""
-        steps = np.arange(-self.n_steps, self.n_steps + 1) * self.step_mm
+        steps = np.linspace(-self.half_mm, self.half_mm, 2 * self.n_steps + 1)
         return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
 
     def on_board_mm(self, q_px: FloatArray) -> FloatArray:
@@ -182,8 +237,7 @@ class _Spots:
         cell = np.asarray(cKDTree(cells.centres_mm).query(on_board[chosen])[1])
         shift = cells.shift_px[cell] / exposure.window.binning
         offsets = places.at(v - shift[:, 1], u - shift[:, 0]) - cells.centres_mm[cell]
-        with np.errstate(invalid="ignore"):
-            inside = np.all(np.abs(offsets) <= cells.half_mm, axis=1)
+        inside = cells.holds(offsets, slack_mm=SLACK_STEPS * cells.step_mm)
         return _Spots(v[inside], u[inside], cell[inside], offsets[inside])
 
 
@@ -283,14 +337,15 @@ def _fit_lamp(light: FloatArray, is_like: BoolArray, cells: _Cells) -> FloatArra
 
 
 def _lay_in(
-    image: ImageArray, print_of: _Print, cells: _Cells, spots: _Spots, full_scale: int
+    image: Floats32, is_open: BoolArray, print_of: _Print, cells: _Cells, spots: _Spots
 ) -> None:
-    """Replace the pixels of cells by what their print would show."""
+    """Replace the pixels of cells by what their print would show; they are open no more."""
     likely = print_of.is_like[spots.cell]
     places = cells.centres_mm[spots.cell] + spots.offsets_mm
     at = (spots.offsets_mm / cells.step_mm + cells.n_steps)[:, ::-1]
     for kind, levels in enumerate(print_of.levels):
         own = np.flatnonzero(likely & (cells.kind[spots.cell] == kind))
         level = map_coordinates(levels, at[own].T, order=3, mode="nearest")
-        level = np.clip(level * _lamp_at(print_of.lamp, places[own], cells), 0.0, full_scale)
-        image[spots.rows[own], spots.columns[own]] = np.rint(level).astype(image.dtype)
+        where = spots.rows[own], spots.columns[own]
+        image[where] = level * _lamp_at(print_of.lamp, places[own], cells)
+        is_open[where] = False

@@ -57,6 +57,8 @@ PRINT_STAGE = "stripes with and without the print"
 AGAIN_STAGE = "boards and stripes again"
 LITTLE = 0.5
 """Of the usual count of points on the common sheet: with fewer an image is looked at again."""
+LEAST_SHOWN = 2
+"""Photographs that must show a stripe on the common sheet: one makes no sheet, and may be print."""
 LEAST_WIDTHS = 3
 """Images with a stripe on the common sheet from which on the line's width is known."""
 LARGEST_CHI2 = 900.0
@@ -182,6 +184,19 @@ def calibrate_sheets_from_pairs(
             again = stripes_of(pairs[k], colour, sigma_px, less_print=less_print)
             if _n_clean(again) > _n_clean(found[k]):
                 found[k] = again
+    fit = _fit_sheets(pairs, found, camera, options.sheets)
+    if isinstance(fit, FitFailure):
+        return fit
+    return replace(fit, laser_colour=colour, channel_reason=reason, print_reason=about_print)
+
+
+def _fit_sheets(
+    pairs: Sequence[ExposurePair],
+    found: Sequence[BoardStripes | FitFailure],
+    camera: CameraCalibration | StereoCalibration,
+    options: SheetOptions,
+) -> LaserFit | FitFailure:
+    """Calibrate from what each pair gave; the result, or why there is none, says what did not."""
     boards = [item for item in found if isinstance(item, BoardStripes)]
     skipped = [
         SkippedImage(pair[0].source, item.reason.removeprefix(f"{pair[0].source}: "))
@@ -194,18 +209,11 @@ def calibrate_sheets_from_pairs(
             f"{skipped[0].reason}",
             "check the target's description and that the board is lit in one image of each pair",
         )
-    fit = calibrate_sheets(boards, camera, options.sheets)
+    fit = calibrate_sheets(boards, camera, options)
     if isinstance(fit, FitFailure):
         lost = "; ".join(f"{image.source}: {image.reason}" for image in skipped)
         return FitFailure(f"{fit.reason} (not used: {lost})", fit.remedy) if lost else fit
-    skipped += fit.skipped
-    return replace(
-        fit,
-        skipped=tuple(skipped),
-        laser_colour=colour,
-        channel_reason=reason,
-        print_reason=about_print,
-    )
+    return replace(fit, skipped=(*skipped, *fit.skipped))
 
 
 def calibrate_sheets_again(
@@ -506,7 +514,7 @@ def choose_print(
         boards = [item for item in found if isinstance(item, BoardStripes)]
         evidence.append(_weigh(boards, cameras, options))
     (as_is, n_before, points_before, _), (less, n_shown, n_points, scatter_px) = evidence
-    if less <= as_is:
+    if less <= as_is or n_shown < LEAST_SHOWN:
         return False, ""
     return True, (
         f"{n_images} photographs have none without laser: their print is told from its repetition "

@@ -12,7 +12,7 @@ from armscan.calibration.sheets.result import BoardStripes, SheetOptions
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import LaserColour
-from armscan.pipeline.laser import choose_channel
+from armscan.pipeline.laser import choose_channel, choose_print
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
@@ -106,3 +106,61 @@ def test_nothing_is_chosen_where_nothing_is_straight() -> None:
     nothing = FitFailure("no stripe")
     found = choose_channel(len(clean), lambda k, channel: nothing, cameras, SheetOptions())
     assert found == ("auto", "")
+
+
+def cut_to(board: BoardStripes, n: int, scatter_px: float, seed: int) -> BoardStripes:
+    """The first n points of a board's stripe, with this scatter across the line."""
+    profile = board.profile.select(np.arange(len(board.profile)) < n)
+    rng = np.random.default_rng(seed)
+    off = rng.normal(0.0, scatter_px, len(profile))[:, None] * profile.normals_px
+    return replace(board, profile=replace(profile, points_px=profile.points_px + off), on_edge=None)
+
+
+def test_a_line_on_all_boards_wins_over_a_precise_piece_on_two() -> None:
+    """Two short pieces of print that scatter by 0.3 px, and a wide line of 1 px on all boards."""
+    rig = rig_of_vga()
+    boards = replace(rig, sigma_stripe_px=1e-3).boards(rig.camera, np.random.default_rng(2))
+    assert len(boards) >= 6
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+
+    def stripes_of(k: int, channel: LaserColour) -> BoardStripes | FitFailure:
+        if channel == "red-blue":
+            return cut_to(boards[k], 120, 1.0, k)
+        if channel == "grey" and k < 2:
+            return cut_to(boards[k], 40, 0.3, k)
+        return FitFailure("no stripe")
+
+    chosen, _ = choose_channel(len(boards), stripes_of, cameras, SheetOptions())
+    assert chosen == "red-blue"
+
+
+@pytest.mark.parametrize(
+    ("as_is", "less", "n_shown", "expected"),
+    [(1.0, 0.1, 8, True), (0.1, 1.0, 8, False), (None, 0.1, 1, False), (None, None, 0, False)],
+    ids=["clearer less its print", "clearer as it is", "on one board", "on none"],
+)
+def test_a_print_is_taken_away_where_that_shows_the_line_better(
+    as_is: float | None, less: float | None, n_shown: int, expected: bool
+) -> None:
+    rig = rig_of_vga()
+    boards = replace(rig, sigma_stripe_px=1e-3).boards(rig.camera, np.random.default_rng(2))
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+
+    def stripes_of(k: int, is_less: bool) -> BoardStripes | FitFailure:
+        scatter = less if is_less else as_is
+        if scatter is None or (is_less and k >= n_shown):
+            return FitFailure("no stripe")
+        return cut_to(boards[k], 120, scatter, k)
+
+    is_taken, reason = choose_print(len(boards), stripes_of, cameras, SheetOptions())
+    assert is_taken is expected
+    assert bool(reason) is expected
+
+
+def test_without_bare_photographs_no_print_is_asked_for() -> None:
+    rig = rig_of_vga()
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+    assert choose_print(0, lambda _k, _less: FitFailure("asked"), cameras, SheetOptions()) == (
+        False,
+        "",
+    )

@@ -18,7 +18,7 @@ from armscan.reconstruction.surface import (
     draw_surface,
     thinned_surface,
 )
-from armscan.report.inspection.cleaning import cleaning_page, cleaning_quantities, cleaning_table
+from armscan.report.cloud import cleaning_page, cleaning_quantities, cleaning_table
 from armscan.report.quantity import Quantity, Summary, sentences
 from armscan.storage.clouds import (
     CLOUD_SUFFIXES,

@@ -38,6 +38,9 @@ MOST_SAMPLES = 6_000_000
 STAGGERED_REACH = 1.25
 """Of the diamond around a point of an asymmetric grid, a little more: the discs at the tips of the
 square around it stay out."""
+FLAT_PX = (5, 5)
+FLATTEST = 2.0
+"""Variance of 25 pixels of noise over its expectation: 3.5 of its standard deviations more."""
 SLACK_STEPS = 3.0
 """Beyond a cell's border, so that no gap is left between two that misprints move apart."""
 STRAY_SIGMAS = 3.0
@@ -56,7 +59,7 @@ def predict_print(
     camera_from_board: Pose[Any, Board],
     camera: CameraModel,
 ) -> Exposure | None:
-    """An exposure without what its laser lights up: its target's print, smooth light around it.
+    """An exposure with its target as it would be without laser.
 
     Parameters
     ----------
@@ -71,8 +74,8 @@ def predict_print(
 
     Returns
     -------
-    Cells that look like the others show their print, what is elsewhere its mean over squares of a
-    cell's size, in which a line hardly shows; None where no print is told.
+    Cells that look like the others show their print. What is elsewhere loses its noise only, so
+    that a difference shows no line there. None where no print is told.
     """
     if not does_repeat(target):
         return None
@@ -87,20 +90,23 @@ def predict_print(
         samples = map_coordinates(own, at, np.float32, order=3, mode="nearest")
         samples[~is_seen | ~cells.is_own] = np.nan
         print_of = _Print.of(samples, cells)
-        is_open = np.ones(own.shape, np.bool_)
-        if print_of is not None:
-            _lay_in(own, is_open, print_of, cells, spots)
-            is_told = True
-        own[is_open] = _smooth(own, is_open, cells.size_px)[is_open]
-        predicted[:, :, channel] = np.rint(np.clip(own, 0.0, exposure.full_scale))
+        if print_of is None:
+            told = cv2.blur(own, cells.size_px)
+        else:
+            told, is_told = _laid_in(own, print_of, cells, spots), True
+        predicted[:, :, channel] = np.rint(np.clip(told, 0.0, exposure.full_scale))
     return replace(exposure, image=predicted.reshape(exposure.image.shape)) if is_told else None
 
 
-def _smooth(image: Floats32, is_open: BoolArray, size_px: tuple[int, int]) -> Floats32:
-    """Mean (H, W) over squares of what is open of an image."""
-    weight = is_open.astype(np.float32)
-    total = cv2.blur(image * weight, size_px)
-    return np.asarray(total / np.maximum(cv2.blur(weight, size_px), 1e-6), np.float32)
+def _less_noise(image: Floats32, sigma: float) -> Floats32:
+    """The image (H, W) without its noise: means where nothing else shows, edges as they are.
+
+    The filter of Lee (IEEE Trans. Pattern Anal. Mach. Intell. 2, 1980).
+    """
+    mean = cv2.blur(image, FLAT_PX)
+    variance = np.maximum(cv2.blur(image * image, FLAT_PX) - mean * mean, 1e-3)
+    keep = np.maximum(1.0 - FLATTEST * sigma**2 / variance, 0.0)
+    return np.asarray(mean + keep * (image - mean), np.float32)
 
 
 def does_repeat(target: Target) -> bool:
@@ -164,7 +170,7 @@ class _Cells:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height of a cell in the image, about."""
+        """Width and height of a cell in the image, about: a line hardly shows in such means."""
         side = 2 * int(np.ceil(self.n_steps / SAMPLES_PX)) + 1
         return side, side
 
@@ -336,16 +342,17 @@ def _fit_lamp(light: FloatArray, is_like: BoolArray, cells: _Cells) -> FloatArra
     return lamp
 
 
-def _lay_in(
-    image: Floats32, is_open: BoolArray, print_of: _Print, cells: _Cells, spots: _Spots
-) -> None:
-    """Replace the pixels of cells by what their print would show; they are open no more."""
+def _laid_in(image: Floats32, print_of: _Print, cells: _Cells, spots: _Spots) -> Floats32:
+    """What an image (H, W) is without laser in the cells of its print, elsewhere without noise."""
     likely = print_of.is_like[spots.cell]
     places = cells.centres_mm[spots.cell] + spots.offsets_mm
     at = (spots.offsets_mm / cells.step_mm + cells.n_steps)[:, ::-1]
+    level = np.zeros(len(places))
     for kind, levels in enumerate(print_of.levels):
         own = np.flatnonzero(likely & (cells.kind[spots.cell] == kind))
-        level = map_coordinates(levels, at[own].T, order=3, mode="nearest")
-        where = spots.rows[own], spots.columns[own]
-        image[where] = level * _lamp_at(print_of.lamp, places[own], cells)
-        is_open[where] = False
+        level[own] = map_coordinates(levels, at[own].T, order=3, mode="nearest")
+    level = (level * _lamp_at(print_of.lamp, places, cells))[likely]
+    where = spots.rows[likely], spots.columns[likely]
+    told = _less_noise(image, robust_sigma(image[where] - level))
+    told[where] = level
+    return told

@@ -150,6 +150,23 @@ DARKEST = 0.02
 """Black print reflects 3 % and more of what white paper does."""
 
 
+def local_moments(image: FloatImage) -> tuple[FloatImage, FloatImage]:
+    """Mean and variance (H, W) of an image in the square of `GROUND_PX` around each pixel."""
+    mean = uniform_filter(image, GROUND_PX)
+    return mean, np.maximum(uniform_filter(image * image, GROUND_PX) - mean * mean, 1e-3)
+
+
+def less_noise(
+    image: FloatImage, mean: FloatImage, variance: FloatImage, noise: FloatImage | float
+) -> FloatImage:
+    """An image (H, W) without its noise of this variance; an edge stays as it is (Lee 1980).
+
+    ``mean``, ``variance``: its `local_moments`.
+    """
+    keep = np.maximum(1.0 - noise / variance, 0.0)
+    return np.asarray(mean + keep * (image - mean), np.float32)
+
+
 def relative_reflectance(background: Exposure, colour: str) -> FloatImage:
     """Reflectance (H, W) of the ground relative to its brightest, from the view without laser.
 
@@ -164,8 +181,7 @@ def relative_reflectance(background: Exposure, colour: str) -> FloatImage:
         own = [CHANNELS.index(first)] if first in CHANNELS else range(3)
         levels = [_level(background, None, k) for k in own]
         dark = np.asarray(sum(levels) / np.float32(len(levels)), dtype=np.float32)
-    mean = uniform_filter(dark, GROUND_PX)
-    variance = np.maximum(uniform_filter(dark * dark, GROUND_PX) - mean * mean, 1e-3)
+    mean, variance = local_moments(dark)
     white = float(np.quantile(mean, WHITE_QUANTILE))
     if not white > 0.0:
         return EVEN
@@ -174,8 +190,7 @@ def relative_reflectance(background: Exposure, colour: str) -> FloatImage:
     per_level = float(flattest) / FLATTEST_VARIANCE
     if white < LEAST_WHITE_SIGMAS**2 * per_level:
         return EVEN
-    keep = np.maximum(1.0 - per_level * mean / variance, 0.0)
-    ground = (mean + keep * (dark - mean)) / np.float32(white)
+    ground = less_noise(dark, mean, variance, per_level * mean) / np.float32(white)
     return np.ascontiguousarray(np.maximum(ground, DARKEST), dtype=np.float32)
 
 

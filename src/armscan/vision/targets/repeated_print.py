@@ -25,6 +25,7 @@ from armscan.geometry.least_squares import robust_sigma
 from armscan.geometry.poses import Board, Pose
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
+from armscan.vision.stripe.image import less_noise, local_moments
 from armscan.vision.targets.target import Charuco, Chessboard, CircleGrid, Target, TargetView
 
 Floats32: TypeAlias = NDArray[np.float32]
@@ -38,7 +39,6 @@ MOST_SAMPLES = 6_000_000
 STAGGERED_REACH = 1.25
 """Of the diamond around a point of an asymmetric grid, a little more: the discs at the tips of the
 square around it stay out."""
-FLAT_PX = (5, 5)
 FLATTEST = 2.0
 """Variance of 25 pixels of noise over its expectation: 3.5 of its standard deviations more."""
 SLACK_STEPS = 3.0
@@ -96,17 +96,6 @@ def predict_print(
             told, is_told = _laid_in(own, print_of, cells, spots), True
         predicted[:, :, channel] = np.rint(np.clip(told, 0.0, exposure.full_scale))
     return replace(exposure, image=predicted.reshape(exposure.image.shape)) if is_told else None
-
-
-def _less_noise(image: Floats32, sigma: float) -> Floats32:
-    """The image (H, W) without its noise: means where nothing else shows, edges as they are.
-
-    The filter of Lee (IEEE Trans. Pattern Anal. Mach. Intell. 2, 1980).
-    """
-    mean = cv2.blur(image, FLAT_PX)
-    variance = np.maximum(cv2.blur(image * image, FLAT_PX) - mean * mean, 1e-3)
-    keep = np.maximum(1.0 - FLATTEST * sigma**2 / variance, 0.0)
-    return np.asarray(mean + keep * (image - mean), np.float32)
 
 
 def does_repeat(target: Target) -> bool:
@@ -353,6 +342,7 @@ def _laid_in(image: Floats32, print_of: _Print, cells: _Cells, spots: _Spots) ->
         level[own] = map_coordinates(levels, at[own].T, order=3, mode="nearest")
     level = (level * _lamp_at(print_of.lamp, places, cells))[likely]
     where = spots.rows[likely], spots.columns[likely]
-    told = _less_noise(image, robust_sigma(image[where] - level))
+    noise = FLATTEST * robust_sigma(image[where] - level) ** 2
+    told = less_noise(image, *local_moments(image), noise)
     told[where] = level
     return told

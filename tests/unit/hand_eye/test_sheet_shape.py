@@ -19,7 +19,6 @@ from armscan.calibration.hand_eye.observations import (
 )
 from armscan.calibration.hand_eye.surface import (
     PlateSurface,
-    dresidual_dsensor,
     hand_eye_difference,
     place,
 )
@@ -143,7 +142,7 @@ def _runs(options: HandEyeOptions, n_runs: int) -> tuple[FloatArray, FloatArray]
         problem = Problem(nodes, PlateSurface(plate), options)
         fit = estimate(problem, problem.start(TOOL_FROM_SENSOR))
         assert fit is not None
-        by_sensor = dresidual_dsensor(nodes, fit.placed)
+        by_sensor = fit.placed.by_sensor
         assert by_sensor is not None
         error = hand_eye_difference(fit.state.tool_from_sensor, TOOL_FROM_SENSOR)
         coupling = fit.linear.gain @ by_sensor

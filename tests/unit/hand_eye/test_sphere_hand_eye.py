@@ -17,6 +17,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 from rigs.sphere_rig import (
+    CENTRE_MM,
     DIAMETER_MM,
     HAND_EYE,
     POINT_NOISE_MM,
@@ -59,11 +60,12 @@ def test_exact_points_give_the_hand_eye_back(n_sheets: int) -> None:
 
 
 def test_slopes_are_the_derivatives() -> None:
-    rig = SphereRig(pose_noise_mm=0.5)
+    """Where the stripes lie on the sphere: elsewhere each has a centre of its own."""
+    rig = SphereRig()
     stripes = rig.stripes(turned_poses(rig, 4), np.random.default_rng(SEED))
     sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM)
     nodes = condense_sphere(sections, 8)
-    state = HandEyeState(HAND_EYE, np.array([650.3, -170.0, 35.5, 25.2]), 1.01)
+    state = HandEyeState(HAND_EYE, np.array([*CENTRE_MM, 0.5 * DIAMETER_MM]))
     placed = place(nodes, SPHERE, state)
     for column in range(placed.jacobian.shape[1]):
         step = np.zeros(placed.jacobian.shape[1])
@@ -78,7 +80,7 @@ def test_slopes_are_the_derivatives() -> None:
 def test_pose_slopes_are_the_derivatives_by_the_arms_pose() -> None:
     rig = SphereRig()
     stripe = rig.stripes(turned_poses(rig, 1), np.random.default_rng(SEED))[0]
-    state = HandEyeState(HAND_EYE, np.array([650.0, -170.5, 35.0, 25.0]))
+    state = HandEyeState(HAND_EYE, np.array([*CENTRE_MM, 0.5 * DIAMETER_MM]))
 
     def residual(moved: Pose) -> tuple[FloatArray, FloatArray, FloatArray]:
         changed = replace(stripe, base_from_tool=moved)
@@ -104,6 +106,61 @@ def test_pose_slopes_are_the_derivatives_by_the_arms_pose() -> None:
             ahead, behind = (residual(pose)[0] for pose in turned)
             expected = (ahead - behind) / 2e-5
             np.testing.assert_allclose(slopes[:, 3 + 3 * n + k], expected, atol=1e-4)
+
+
+def test_a_stripe_that_was_thrown_is_seen_from_its_own_centre() -> None:
+    """Its distances are linear in the shift then; from the common centre they are not.
+
+    By hand: d = s n, but for s t (s t) / (2 r) of the part s t along the sphere: 0.8 mm are 0.013
+    mm on 25 mm of radius, ten times what is left here.
+    """
+    rig = SphereRig()
+    stripe = rig.stripes(turned_poses(rig, 1), np.random.default_rng(SEED))[0]
+    shift = np.array([0.5, -0.5, 0.4])
+    pose = stripe.base_from_tool
+    thrown = replace(stripe, base_from_tool=Pose(pose.rotation, pose.translation_mm + shift))
+    nodes = condense_sphere(find_sections([thrown], 25.0)[0], 12)
+    state = HandEyeState(HAND_EYE, np.array([*CENTRE_MM, 0.5 * DIAMETER_MM]))
+    placed = place(nodes, SPHERE, state)
+    outward = (placed.points_base_mm - shift - CENTRE_MM) / (0.5 * DIAMETER_MM)
+    expected = nodes.mean(outward @ shift)
+    np.testing.assert_allclose(placed.residual_mm, expected, atol=1.3e-3)
+    plain = np.linalg.norm(placed.points_base_mm - CENTRE_MM, axis=1) - 0.5 * DIAMETER_MM
+    assert np.abs(nodes.mean(plain) - expected).max() > 5e-3
+
+
+def test_what_is_new_in_every_exposure_is_told_from_the_posture() -> None:
+    """Two exposures of each posture: their own part of the pose, which no form of a stripe is.
+
+    12 postures tell both scatters to a seventh of each; errors over their covariance.
+    """
+    sigma_mm, share = 0.08, 0.5
+    common = SphereRig(pose_noise_mm=sigma_mm)
+    own = SphereRig(pose_noise_mm=share * sigma_mm, point_noise_mm=0.005, n_points=60)
+    generator, squares, found = np.random.default_rng(SEED), [], []
+    for _ in range(4):
+        stripes = []
+        for k, pose in enumerate(turned_poses(own, 12)):
+            reported = common.stripes([pose], generator)[0].base_from_tool
+            for number in range(2):
+                one = own.stripes([pose], generator)[0]
+                error = one.base_from_tool @ pose.inverse()
+                stripes.append(
+                    replace(
+                        one,
+                        source=f"p{k}-{number}",
+                        posture=f"p{k}",
+                        base_from_tool=error @ reported,
+                    )
+                )
+        fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
+        error = error_of(fit)
+        squares.append(error @ np.linalg.solve(fit.calibration.covariance, error))
+        noise = fit.calibration.arm_noise
+        found.append([noise.position_mm, noise.exposure_position_mm])
+    assert np.mean(squares) < chi2.ppf(0.9995, 24) / 4
+    expected = [sigma_mm, share * sigma_mm]
+    assert np.mean(found, axis=0) == pytest.approx(expected, rel=4.0 / 7.0 / 2.0)
 
 
 def test_errors_scatter_as_predicted() -> None:

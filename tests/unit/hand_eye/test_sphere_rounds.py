@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rounds of scatter and solution on a sphere: swings settle, rounds that run away are taken back.
+"""Rounds of scatter and solution on a sphere: swings settle, and none runs away.
 
 A sphere of 50 mm seen from few postures with a sensor that is known to some tenths of a millimetre
-to millimetres only: its error explains what moves all points off the sphere. Of 350 drawn so, the
-ones here swing or run away.
+to millimetres only: its error explains what moves all points off the sphere. The first four swung,
+of 350 drawn so.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye import estimate as estimate_module
 from armscan.calibration.hand_eye.estimate import HandEyeSolution, Problem, estimate
 from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
@@ -75,23 +74,18 @@ def test_scatter_and_solution_that_swing_settle_in_the_middle(seed: int) -> None
     assert np.abs(moved / sigma).max() < 0.6
 
 
-@pytest.mark.parametrize("seed", [284, 305])
-def test_a_round_that_is_less_likely_is_taken_back(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Else the rounds end e^15 less likely and about twice as far off; the doubt stays.
+def test_a_sensor_that_is_hardly_known_does_not_lead_a_small_sphere_away() -> None:
+    """What it errs by moves the points by a part of the sphere's radius, and is solved for.
 
-    Likelier is not always nearer: of 52 draws that are taken back (seeds 200 to 353) 32 lie nearer
-    for it, 20 further off. These two are clear cases of what it is for.
+    Taken into the covariance, as linearised where the sensor is stored, it let the rounds run away:
+    of the draws of seeds 200 to 299, 43 settled, and their normalised squares had a mean of 88 and
+    a median of 12. Six are expected, of scatters that are taken as known a little more.
     """
-    problem = drawn(seed, (0.3, 12.0))
-    kept = solved(problem)
-    assert not kept.is_settled
-    monkeypatch.setattr(estimate_module, "LESS_LIKELY", np.inf)
-    led_away = solved(problem)
-    assert led_away.noise.log_posterior < kept.noise.log_posterior - 10.0
-    off, further_off = (
-        np.linalg.norm(hand_eye_difference(one.state.tool_from_sensor, HAND_EYE)[3:])
-        for one in (kept, led_away)
-    )
-    assert off < 0.7 * further_off
+    solutions = [solved(drawn(seed, (0.3, 12.0))) for seed in range(270, 310)]
+    assert sum(one.is_settled for one in solutions) > 36
+    squares = []
+    for one in solutions:
+        error = hand_eye_difference(one.state.tool_from_sensor, HAND_EYE)
+        squares.append(float(error @ np.linalg.solve(one.linear.covariance[:6, :6], error)))
+    assert 3.5 < float(np.median(squares)) < 9.0
+    assert max(squares) < 60.0

@@ -36,7 +36,7 @@ from armscan.calibration.hand_eye.search import (
     thinned,
     three_a_stripe,
 )
-from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface, dresidual_dsensor
+from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface
 from armscan.geometry.arrays import FloatArray, homogeneous
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import pseudo_inverse
@@ -158,7 +158,7 @@ def _all_unknowns(fit: HandEyeSolution) -> Iterator[_Unknowns]:
     if not problem.options.solve_plate:
         yield _Unknowns("plate", placed.by_surface)
         yield _Unknowns("offset", placed.by_surface[:, 2:])
-    by_sensor = dresidual_dsensor(observations, placed)
+    by_sensor = placed.by_sensor
     for sheet in np.unique(observations.sheet).tolist():
         first = len(CAMERA_PARAMETER_NAMES) + len(SHEET_PARAMETER_NAMES) * sheet
         if by_sensor is not None and first + 3 <= by_sensor.shape[1]:

@@ -346,10 +346,12 @@ def _is_apart(one: HandEyeState, other: HandEyeState) -> bool:
     return turn_rad > APART_ON_SPHERE_RAD
 
 
-def _refuse_open(conditioning: Conditioning, diameter_mm: float) -> FitFailure | None:
+def _refuse_open(
+    conditioning: Conditioning, diameter_mm: float, most_mm: float = np.inf
+) -> FitFailure | None:
     """Refuse postures that leave a combination of the unknowns open or nearly so."""
     cause = ": the tool hardly turns, or about one axis only"
-    most_mm = max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM)
+    most_mm = min(max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM), most_mm)
     return refuse_hardly_determined(conditioning, most_mm, cause, TURN_THE_TOOL)
 
 
@@ -393,7 +395,8 @@ def _likeliest(
     start, best = solved[0]
     refused = _refuse_far(problem, best.state)
     if refused is None:
-        refused = _refuse_open(_conditioning(best), 2.0 * float(start.surface[3]))
+        diameter_mm = 2.0 * float(start.surface[3])
+        refused = _refuse_open(_conditioning(best), diameter_mm, MOST_OPEN_MM)
     if refused is not None:
         return refused
     for _, other in solved[1:]:

@@ -32,7 +32,6 @@ from armscan.calibration.hand_eye.surface import (
     Placed,
     PlateSurface,
     ReferenceSurface,
-    dresidual_dsensor,
     free_columns,
     place,
 )
@@ -65,9 +64,6 @@ RANK_RATIO = 1e-4
 repeat another still turns by a hundredth of a degree."""
 NAMED_SHARE = 0.3
 """Parts of the weakest combination above this are named."""
-LESS_LIKELY = 3.0
-"""Logarithm of the posterior by which a round of the sphere may be less likely than the one before:
-residuals that the sensor's errors explain can lead a small sphere away step by step."""
 FAR_SIGMAS = 3.0
 """Of the points' typical error by the sensor, which may lie that far from the reference."""
 ROBUST_ROUNDS = 10
@@ -123,10 +119,19 @@ class Problem:
 
     def sensor_covariance(self, placed: Placed) -> FloatArray:
         """(M, M) covariance of the residuals by the sensor's calibration; 0 where it is exact."""
-        by_sensor = dresidual_dsensor(self.observations, placed)
-        if by_sensor is None or self.observations.sensor_covariance is None:
+        sensor = self.observations.sensor_covariance
+        if placed.by_sensor is None or sensor is None:
             return np.zeros((len(placed.residual_mm),) * 2)
-        return np.asarray(by_sensor @ self.observations.sensor_covariance @ by_sensor.T)
+        return np.asarray(placed.by_sensor @ sensor @ placed.by_sensor.T)
+
+    def free_sensor(self, state: HandEyeState) -> HandEyeState:
+        """The state with a sensor that may err, where the points tell what that does to them."""
+        covariance = self.observations.sensor_covariance
+        if state.sensor is not None or covariance is None:
+            return state
+        if self.observations.dpoint_dsensor is None:
+            return state
+        return replace(state, sensor=np.zeros(len(covariance)))
 
     def far_mm(self, placed: Placed) -> float:
         """Typical distance from the reference above which the data contradict each other.
@@ -258,23 +263,40 @@ def minimise_distances(
     """Minimise ``e' C^-1 e`` over the unknowns; None where the covariance is not definite.
 
     ``covariance`` (M, M) is that of the residuals e of eq. 2.74; ``columns`` are the entries of a
-    step that are solved for, those of the problem if None.
+    step that are solved for, those of the problem if None. Where the state lets the sensor err, its
+    error s is solved for too, ``s' S^-1 s`` added, and C is without the sensor's part: the same
+    minimum as with that part in C, but for curvature, where a small sphere is led far away by a
+    sensor that is linearised where it does not stand.
     """
     try:
         whiten = Whitening(covariance)
     except LinAlgError:
         return None
     free = problem.columns if columns is None else columns
-    n_all = N_HAND_EYE + len(start.surface) + 1
+    n_all, n_free = N_HAND_EYE + len(start.surface) + 1, len(free)
+    root = np.zeros((0, 0)) if start.sensor is None else problem.observations.sensor_root
+    units = np.linalg.pinv(root)
 
     def linearise(state: HandEyeState) -> tuple[FloatArray, FloatArray]:
         placed = problem.place(state)
-        return whiten(placed.residual_mm), whiten(placed.jacobian[:, free])
+        jacobian = whiten(placed.jacobian[:, free])
+        if state.sensor is None or placed.by_sensor is None:
+            return whiten(placed.residual_mm), jacobian
+        residual = whiten(placed.residual_mm + placed.moved_mm)
+        of_sensor = np.concatenate([np.zeros((len(units), n_free)), np.eye(len(units))], axis=1)
+        by_all = np.concatenate([jacobian, whiten(placed.by_sensor @ root)], axis=1)
+        return (
+            np.concatenate([residual, units @ state.sensor]),
+            np.concatenate([by_all, of_sensor]),
+        )
 
     def retract(state: HandEyeState, step: FloatArray) -> HandEyeState:
         whole = np.zeros(n_all)
-        whole[free] = step
-        return state.retract(whole)
+        whole[free] = step[:n_free]
+        moved = state.retract(whole)
+        if moved.sensor is None:
+            return moved
+        return replace(moved, sensor=moved.sensor + root @ step[n_free:])
 
     return levenberg_marquardt(start, linearise, retract, settled=SETTLED, max_steps=MAX_STEPS)
 
@@ -291,21 +313,21 @@ def estimate(
     It begins close to the solution, with ``sigmas`` (C,), typical ones if None, and keeps them with
     ``hold_noise``.
     """
-    state = start
+    state = problem.free_sensor(start)
     rounds, settled = NOISE_ROUNDS[problem.surface.method]
-    is_settled, last, previous = False, None, None
+    is_settled, last = False, None
     # On a sphere the typical scatter may be far from the true one, and would lead away from it.
     is_solved_first = problem.surface.method == "plate"
     for _ in range(rounds):
-        found_at, placed = state, problem.place(state)
+        placed = problem.place(state)
         components = problem.components(placed)
         if sigmas is None:
             sigmas = first_sigmas(problem, components, placed)
-        known = problem.surface_covariance(placed) + problem.sensor_covariance(placed)
         before = sigmas
         for is_solving in (is_solved_first, not is_solved_first):
+            prior = problem.surface_covariance(placed)
             if is_solving:
-                total = total_covariance(components, sigmas) + known
+                total = total_covariance(components, sigmas) + prior
                 found = minimise_distances(problem, state, total)
                 if found is None:
                     return None
@@ -314,23 +336,17 @@ def estimate(
                 noise = NoiseEstimate(sigmas, np.zeros((len(sigmas), len(sigmas))))
             else:
                 jacobian = placed.jacobian[:, problem.columns]
+                known = prior + problem.sensor_covariance(placed)
                 noise = estimate_noise(placed.residual_mm, jacobian, components, known, sigmas)
                 sigmas = noise.sigmas
         change = np.log((sigmas + 1e-12) / (before + 1e-12))
         is_settled = noise.is_settled and float(np.abs(change).max()) < settled
         if is_settled:
             break
-        if not is_solved_first:
-            if previous is not None and (
-                noise.log_posterior < previous[1].log_posterior - LESS_LIKELY
-            ):
-                state, noise, components, known = previous
-                break
-            previous = (found_at, noise, components, known)
         if not is_solved_first and last is not None and float(change @ last) < 0.0:
             sigmas = before * np.exp(change * _damping(change, last))
         last = change
-    solution = _solution(problem, state, components, noise, known)
+    solution = _solution(problem, state, components, noise)
     if solution is None:
         return None
     return replace(solution, is_settled=solution.is_settled and is_settled)
@@ -361,14 +377,15 @@ def _solution(
     start: HandEyeState,
     components: tuple[NoiseComponent, ...],
     noise: NoiseEstimate,
-    known: FloatArray,
 ) -> HandEyeSolution | None:
-    total = total_covariance(components, noise.sigmas) + known
-    found = minimise_distances(problem, start, total)
+    scatter = total_covariance(components, noise.sigmas)
+    prior = problem.surface_covariance(problem.place(start))
+    found = minimise_distances(problem, start, scatter + prior)
     if found is None:
         return None
     placed = problem.place(found.state)
-    linear = solve_linear(placed.residual_mm, placed.jacobian[:, problem.columns], total)
+    known = prior if found.state.sensor is None else prior + problem.sensor_covariance(placed)
+    linear = solve_linear(placed.residual_mm, placed.jacobian[:, problem.columns], scatter + known)
     if linear is None:
         return None
     return HandEyeSolution(
@@ -394,8 +411,8 @@ def hold_sensor(solution: HandEyeSolution) -> HandEyeSolution | None:
     problem = solution.problem
     if problem.observations.sensor_covariance is None:
         return solution
-    known = problem.surface_covariance(solution.placed)
-    held = _solution(problem, solution.state, solution.components, solution.noise, known)
+    stored = replace(solution.state, sensor=None)
+    held = _solution(problem, stored, solution.components, solution.noise)
     if held is None:
         return None
     return replace(held, is_settled=held.is_settled and solution.is_settled)
@@ -414,7 +431,7 @@ def held_covariance(checked: HandEyeSolution, held: HandEyeSolution) -> Solution
 
 def dhand_eye_dsensor(solution: HandEyeSolution) -> FloatArray | None:
     """(6, P) derivative of the hand-eye by the sensor's parameters, where the points carry it."""
-    by_sensor = dresidual_dsensor(solution.problem.observations, solution.placed)
+    by_sensor = solution.placed.by_sensor
     return None if by_sensor is None else -solution.linear.gain[:N_HAND_EYE] @ by_sensor
 
 

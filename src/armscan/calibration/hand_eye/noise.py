@@ -64,8 +64,6 @@ WIDE = 1.0
 of 30 to 300 mm lie within it."""
 ARM_WIDTH = 1.5
 """Of arms and robots, and of plates: a factor of 4.5."""
-TOUCHED_WIDTH = 1.0
-"""Of an arm whose touches of the plate are known: a factor of 2.7."""
 VERY_WIDE = 2.0
 """Of the form of stripes on a sphere: a factor of 7."""
 NARROW = 0.5
@@ -123,14 +121,6 @@ def noise_components(
         _component("arm", shift, options.arm_position_mm, *_expected_arm(surface)),
         options.arm_rotation_rad,
     )
-    own = np.diag(_stripe_variance_mm2(observations, placed))
-    is_plate = isinstance(surface, PlateSurface)
-    stripe = _component(
-        "stripe", own, options.stripe_noise_factor, 1.0, WIDE if is_plate else NARROW
-    )
-    if not isinstance(surface, PlateSurface):
-        form = _component("form", _same(observations.stripe), None, TYPICAL_FORM_MM, VERY_WIDE)
-        return (*components, form, stripe)
     if _has_exposure_part(observations, options):
         exposure = _same(observations.exposure)
         typical = TYPICAL_EXPOSURE_SHARE * components[0].sigma
@@ -140,6 +130,14 @@ def noise_components(
             replace(new, follows="arm"),
             options.exposure_rotation_rad,
         )
+    own = np.diag(_stripe_variance_mm2(observations, placed))
+    is_plate = isinstance(surface, PlateSurface)
+    stripe = _component(
+        "stripe", own, options.stripe_noise_factor, 1.0, WIDE if is_plate else NARROW
+    )
+    if not isinstance(surface, PlateSurface):
+        form = _component("form", _same(observations.stripe), None, TYPICAL_FORM_MM, VERY_WIDE)
+        return (*components, form, stripe)
     on_plate = (placed.points_base_mm - surface.plane.point_mm) @ surface.plane.axes[:2].T
     alike = _alike(on_plate, options.flatness_length_mm)
     return (
@@ -158,7 +156,7 @@ def _expected_arm(surface: ReferenceSurface) -> tuple[float, float]:
     if isinstance(surface, PlateSurface):
         touched_mm = surface.reference.rms_mm
         if touched_mm is not None and surface.reference.n_points >= LEAST_TOUCHES:
-            return max(touched_mm, LEAST_ARM_MM), TOUCHED_WIDTH
+            return max(touched_mm, LEAST_ARM_MM), ARM_WIDTH
     return TYPICAL_ARM_MM, ARM_WIDTH
 
 

@@ -24,7 +24,7 @@ from armscan.geometry.arrays import (
     ints,
 )
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.least_squares import robust_sigma
+from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.shapes import Plane, fit_circle, fit_plane
 
@@ -38,9 +38,10 @@ tighten it: more than the bow of any sheet."""
 MIN_ARC_DEG = 20.0
 """Shortest arc that makes a section of a sphere: a shorter one hardly tells its radius."""
 SAME_POSTURE_MM = 1.0
-SAME_POSTURE_RAD = float(np.radians(0.2))
-"""An arm that stands still reports its pose to some 0.02 mm and 0.002 degrees; a robot of 0.2 mm
-is within it too."""
+SAME_POSTURE_RAD = float(np.radians(0.5))
+"""An arm that stands still reports its pose to some 0.02 mm and 0.002 degrees; one whose exposures
+scatter by 0.06 mm, 30 mm from where its pose turns, is within it too. Other postures lie degrees
+apart."""
 STANDING_SIGMAS = 10.0
 N_PAIRS, MAX_COUNTED = 80, 400
 """Lines through so many pairs of points are tried, each counted on so many points."""
@@ -66,8 +67,8 @@ class HandEyeOptions:
         it estimated, about what moves a point at 100 mm by as much as the position scatters; it may
         turn about the scan point in part, then.
     exposure_position_mm, exposure_rotation_rad
-        The parts of both that are new in every exposure, on a plate. None: none if the arm's
-        position is given; else estimated where a posture has several exposures.
+        The parts of both that are new in every exposure. None: none if the arm's position is given;
+        else estimated where a posture has several exposures.
     plate_flatness_mm
         Standard deviation of the plate's smooth flatness error.
     flatness_length_mm
@@ -521,6 +522,21 @@ class CondensedObservations(ArrayRecord):
             posture=self.posture[kept],
             dpoint_dsensor=None if by_sensor is None else by_sensor[rows],
         )
+
+    @property
+    def sensor_root(self) -> FloatArray:
+        """(P, R) root of the covariance of those of the sensor's parameters that move a point.
+
+        The others' rows are zero. (0, 0) where the sensor is taken as exact.
+        """
+        covariance, by_sensor = self.sensor_covariance, self.dpoint_dsensor
+        if covariance is None or by_sensor is None:
+            return np.zeros((0, 0))
+        moving = np.flatnonzero(by_sensor.any(axis=(0, 1)))
+        of_moving = square_root(covariance[np.ix_(moving, moving)])
+        root = np.zeros((len(covariance), of_moving.shape[1]))
+        root[moving] = of_moving
+        return root
 
     @property
     def used_postures(self) -> IntArray:

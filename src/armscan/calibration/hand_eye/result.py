@@ -16,6 +16,7 @@ from armscan.calibration.hand_eye.estimate import (
     LeftOut,
     dhand_eye_dsensor,
     held_covariance,
+    minimise_distances,
 )
 from armscan.calibration.hand_eye.noise import (
     arm_noise,
@@ -320,16 +321,19 @@ def diameter_asked(fit: HandEyeSolution) -> tuple[float, float]:
     """
     columns = np.union1d(fit.problem.columns, [RADIUS_COLUMN])
     residual, jacobian = fit.placed.residual_mm, fit.placed.jacobian[:, columns]
-    known, sigmas = fit.problem.sensor_covariance(fit.placed), fit.noise.sigmas
-    noise = estimate_noise(residual, jacobian, fit.components, known, sigmas)
-    total = total_covariance(fit.components, noise.sigmas) + known
-    freed = solve_linear(residual, jacobian, total)
-    radius_mm = float(fit.state.surface[3])
+    noise = estimate_noise(residual, jacobian, fit.components, fit.known, fit.noise.sigmas)
+    scatter = total_covariance(fit.components, noise.sigmas)
+    freed = minimise_distances(fit.problem, fit.state, scatter, columns)
     if freed is None:
+        return 2.0 * float(fit.state.surface[3]), float("inf")
+    placed = fit.problem.place(freed.state)
+    total = scatter + fit.problem.sensor_covariance(placed)
+    linear = solve_linear(placed.residual_mm, placed.jacobian[:, columns], total)
+    radius_mm = float(freed.state.surface[3])
+    if linear is None:
         return 2.0 * radius_mm, float("inf")
     k = int(np.flatnonzero(columns == RADIUS_COLUMN)[0])
-    sigma_mm = float(np.sqrt(freed.covariance[k, k]))
-    return 2.0 * (radius_mm + float(freed.step[k])), 2.0 * sigma_mm
+    return 2.0 * radius_mm, 2.0 * float(np.sqrt(linear.covariance[k, k]))
 
 
 def sphere_warnings(

@@ -183,6 +183,9 @@ def test_a_wrong_diameter_is_noticed() -> None:
     assert any("the points ask for a sphere of" in text for text in found.warnings)
     failure = solve("extrinsic-xyz", 82.0)
     assert isinstance(failure, FitFailure)
+    assert "the points ask for a sphere of 79.98 mm diameter" in failure.reason
+    failure = solve("extrinsic-xyz", 84.0)
+    assert isinstance(failure, FitFailure)
     assert failure.reason.endswith("80.1 mm would fit")
 
 

@@ -144,14 +144,10 @@ def test_what_is_new_in_every_exposure_is_told_from_the_posture() -> None:
             reported = common.stripes([pose], generator)[0].base_from_tool
             for number in range(2):
                 one = own.stripes([pose], generator)[0]
-                error = one.base_from_tool @ pose.inverse()
+                moved = one.base_from_tool @ pose.inverse() @ reported
+                name = f"p{k}"
                 stripes.append(
-                    replace(
-                        one,
-                        source=f"p{k}-{number}",
-                        posture=f"p{k}",
-                        base_from_tool=error @ reported,
-                    )
+                    replace(one, source=f"{name}-{number}", posture=name, base_from_tool=moved)
                 )
         fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
         error = error_of(fit)
@@ -268,12 +264,15 @@ def test_diameter_and_scale_are_solved_along() -> None:
 def test_a_wrong_diameter_is_noticed() -> None:
     rig = SphereRig(pose_noise_mm=POSE_NOISE_MM, point_noise_mm=POINT_NOISE_MM)
     stripes = rig.stripes(turned_poses(rig, 12), np.random.default_rng(SEED))
-    fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM + 1.0, QUICK))
+    fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM + 0.4, QUICK))
     (warning,) = (text for text in fit.warnings if "the points ask for a sphere" in text)
     asked = float(warning.split("sphere of ")[1].split(" mm")[0])
     assert asked == pytest.approx(DIAMETER_MM, abs=0.05)
     fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
     assert not any("ask for" in text for text in fit.warnings)
+    wrong = calibrate_on_sphere(stripes, DIAMETER_MM + 1.0, QUICK)
+    assert isinstance(wrong, FitFailure)
+    assert "the points ask for a sphere of 50.0" in wrong.reason
     small = calibrate_on_sphere(stripes, 0.6 * DIAMETER_MM, QUICK)
     assert isinstance(small, FitFailure)
     assert "no section of a sphere of 30 mm" in small.reason

@@ -56,6 +56,7 @@ from armscan.calibration.hand_eye.result import (
     hand_eye_calibration,
     plate_facts,
     posture_results,
+    refuse_diameter,
     sphere_facts,
     sphere_warnings,
     stripe_residuals,
@@ -298,6 +299,9 @@ def calibrate_on_sphere(
     if isinstance(best, FitFailure):
         return best
     start, fit = best
+    refused = refuse_diameter(fit)
+    if refused is not None:
+        return refused
     held = hold_sensor(fit)
     return _OPEN if held is None else _fit_on_sphere(sections, left_out, start, fit, held)
 

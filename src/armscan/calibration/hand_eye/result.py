@@ -39,8 +39,10 @@ RADIUS_COLUMN, SCALE_COLUMN = N_HAND_EYE + 3, N_HAND_EYE + 4
 """Of a step on a sphere."""
 OUTLYING = 3.0
 """A posture whose pose errs by this many standard deviations is named."""
-WRONG_DIAMETER = 4.0
-"""A diameter given that lies this many standard deviations off what the points ask for is named."""
+WRONG_DIAMETER, NO_DIAMETER = 4.0, 10.0
+"""A diameter given that lies this many standard deviations off what the points ask for is named;
+that lies so many off is refused, if it is off by `NO_DIAMETER_PART` of it, too."""
+NO_DIAMETER_PART = 0.01
 REJECTED_SHARE = 0.015
 """A stripe that loses more than this part of its points is named."""
 SHORT_ARC = 0.6
@@ -336,6 +338,29 @@ def diameter_asked(fit: HandEyeSolution) -> tuple[float, float]:
     return 2.0 * radius_mm, 2.0 * float(np.sqrt(linear.covariance[k, k]))
 
 
+def refuse_diameter(fit: HandEyeSolution) -> FitFailure | None:
+    """Refuse a sphere of which the points say that it has quite another diameter."""
+    given_mm = 2.0 * float(fit.problem.surface.start[3])
+    asked_mm, sigma_mm = diameter_asked(fit)
+    off_mm = abs(asked_mm - given_mm)
+    if fit.problem.options.solve_diameter or off_mm < NO_DIAMETER_PART * given_mm:
+        return None
+    if off_mm < NO_DIAMETER * sigma_mm:
+        return None
+    return FitFailure(
+        f"{_diameter_in_words(asked_mm, sigma_mm)}, not {given_mm:g} mm",
+        "check the sphere's diameter, and that the sensor's calibration is this one: its points "
+        "may be too large or too small",
+    )
+
+
+def _diameter_in_words(asked_mm: float, sigma_mm: float) -> str:
+    return (
+        f"the points ask for a sphere of {asked_mm:.2f} mm diameter (standard deviation "
+        f"{sigma_mm:.2f} mm)"
+    )
+
+
 def sphere_warnings(
     fit: HandEyeSolution,
     held: HandEyeSolution,
@@ -369,8 +394,8 @@ def sphere_warnings(
     given = 2.0 * float(held.state.surface[3])
     if abs(asked - given) > WRONG_DIAMETER * uncertainty:
         found.append(
-            f"the points ask for a sphere of {asked:.2f} mm diameter (standard deviation "
-            f"{uncertainty:.2f} mm), not {given:g} mm: check the diameter and the sensor's scale"
+            f"{_diameter_in_words(asked, uncertainty)}, not {given:g} mm: check the diameter and "
+            "the sensor's scale"
         )
     if not held.is_settled:
         found.append("the refinement had not settled when its steps ran out")

@@ -212,6 +212,10 @@ def hand_eye(
         typer.Option("--solve-plate", help="Solve the plate along; a rough plane is enough then."),
     ] = False,
     sphere_diameter: SphereDiameter = None,
+    solve_diameter: Annotated[
+        bool,
+        typer.Option("--solve-diameter", help="Solve the sphere's diameter along."),
+    ] = False,
     profiles: Profiles = None,
     poses: PoseTable = None,
     euler: EulerAngles = None,
@@ -258,6 +262,7 @@ def hand_eye(
         arm_rotation_rad=rotation_rad,
         plate_flatness_mm=plate_flatness_mm,
         solve_plate=solve_plate,
+        solve_diameter=solve_diameter,
     )
     stripes = given(StripeOptions, method=stripe_method, laser_colour=laser_colour)
     return lambda job: calibrate_hand_eye(

@@ -218,6 +218,13 @@ class HandEyeInputs:
         return None if self.sensor is None else self.sensor.covariance
 
 
+def _check_solved_along(artefact: Artefact, options: HandEyeOptions) -> None:
+    if artefact.sphere_diameter_mm is not None and options.solve_plate:
+        raise OptionError("a sphere has no plate to solve", remedy="leave --solve-plate out")
+    if artefact.sphere_diameter_mm is None and options.solve_diameter:
+        raise OptionError("a plate has no diameter to solve", remedy="leave --solve-diameter out")
+
+
 def calibrate_hand_eye(
     job: Job,
     source: StripeSource,
@@ -247,9 +254,8 @@ def calibrate_hand_eye(
         hand-eye; no document is written then. Where it is the postures, a page shows them.
     """
     options, stripe_options = options or HandEyeOptions(), stripe_options or StripeOptions()
+    _check_solved_along(artefact, options)
     diameter = artefact.sphere_diameter_mm
-    if diameter is not None and options.solve_plate:
-        raise OptionError("a sphere has no plate to solve", remedy="leave --solve-plate out")
     places = job.places(".json", beside=(".npz", ".html"))
     inputs = read_hand_eye_inputs(source, artefact, stripe_options, job.progress)
     parents = () if inputs.sensor is None else (inputs.sensor.provenance,)

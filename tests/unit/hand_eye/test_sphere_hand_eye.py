@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
@@ -127,6 +128,42 @@ def test_a_stripe_that_was_thrown_is_seen_from_its_own_centre() -> None:
     np.testing.assert_allclose(placed.residual_mm, expected, atol=1.3e-3)
     plain = np.linalg.norm(placed.points_base_mm - CENTRE_MM, axis=1) - 0.5 * DIAMETER_MM
     assert np.abs(nodes.mean(plain) - expected).max() > 5e-3
+
+
+def test_the_gradient_is_that_of_a_least_squares_with_a_shift_of_each_stripe() -> None:
+    """J' C^-1 e, half a millimetre off the sphere, beside a minimum over shifts, by differences."""
+    noise_mm, throw_mm = 0.005, 0.5
+    rig = SphereRig(pose_noise_mm=throw_mm)
+    stripes = rig.stripes(turned_poses(rig, 4), np.random.default_rng(SEED))
+    nodes = condense_sphere(find_sections(stripes, 0.5 * DIAMETER_MM)[0], 40)
+    start = HandEyeState(HAND_EYE, np.array([650.3, -170.0, 35.5, 0.5 * DIAMETER_MM]))
+
+    def cost(state: HandEyeState) -> float:
+        points = place(nodes, SPHERE, state).points_base_mm
+        total = 0.0
+        for k in range(4):
+            own = points[nodes.of_points(nodes.stripe) == k]
+
+            def left(shift: FloatArray, own: FloatArray = own) -> FloatArray:
+                away = np.linalg.norm(own - state.surface[:3] - shift, axis=1) - state.surface[3]
+                weight = np.sqrt(40.0 / len(own)) / noise_mm
+                return np.concatenate([weight * away, shift / throw_mm])
+
+            total += least_squares(left, np.zeros(3), xtol=1e-12, ftol=1e-12).cost
+        return total
+
+    placed = place(nodes, SPHERE, start)
+    shifts = placed.dresidual_dpose[:, :3]
+    alike = nodes.stripe[:, None] == nodes.stripe[None, :]
+    covariance = noise_mm**2 * np.eye(len(nodes)) + throw_mm**2 * alike * (shifts @ shifts.T)
+    found = placed.jacobian[:, :9].T @ np.linalg.solve(covariance, placed.residual_mm)
+    expected = np.zeros(9)
+    for column in range(9):
+        step = np.zeros(placed.jacobian.shape[1])
+        step[column] = 1e-5 if column < 3 else 1e-3
+        ahead, behind = cost(start.retract(step)), cost(start.retract(-step))
+        expected[column] = (ahead - behind) / (2.0 * step[column])
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.01 * np.abs(expected[3:]).max())
 
 
 def test_what_is_new_in_every_exposure_is_told_from_the_posture() -> None:
@@ -266,13 +303,17 @@ def test_a_wrong_diameter_is_noticed() -> None:
     stripes = rig.stripes(turned_poses(rig, 12), np.random.default_rng(SEED))
     fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM + 0.4, QUICK))
     (warning,) = (text for text in fit.warnings if "the points ask for a sphere" in text)
-    asked = float(warning.split("sphere of ")[1].split(" mm")[0])
+    asked = float(warning.split("diameter of ")[1].split(" mm")[0])
     assert asked == pytest.approx(DIAMETER_MM, abs=0.05)
     fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
     assert not any("ask for" in text for text in fit.warnings)
     wrong = calibrate_on_sphere(stripes, DIAMETER_MM + 1.0, QUICK)
     assert isinstance(wrong, FitFailure)
-    assert "the points ask for a sphere of 50.0" in wrong.reason
+    assert "the points ask for a diameter of 50.0" in wrong.reason
+    freed = replace(QUICK, solve_diameter=True)
+    fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM + 1.0, freed))
+    assert ("Sphere's diameter, solved along", "50.0") in [(k, v[:4]) for k, v in fit.reference]
+    assert not any("ask for" in text for text in fit.warnings)
     small = calibrate_on_sphere(stripes, 0.6 * DIAMETER_MM, QUICK)
     assert isinstance(small, FitFailure)
     assert "no section of a sphere of 30 mm" in small.reason

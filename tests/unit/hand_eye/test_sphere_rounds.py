@@ -78,8 +78,7 @@ def test_a_sensor_that_is_hardly_known_does_not_lead_a_small_sphere_away() -> No
     """What it errs by moves the points by a part of the sphere's radius, and is solved for.
 
     Taken into the covariance, as linearised where the sensor is stored, it let the rounds run away:
-    of the draws of seeds 200 to 299, 43 settled, and their normalised squares had a mean of 88 and
-    a median of 12. Six are expected, of scatters that are taken as known a little more.
+    17 of these 40 settled, and their normalised squares had a mean of 83. Six are expected.
     """
     solutions = [solved(drawn(seed, (0.3, 12.0))) for seed in range(270, 310)]
     assert sum(one.is_settled for one in solutions) > 36
@@ -88,4 +87,4 @@ def test_a_sensor_that_is_hardly_known_does_not_lead_a_small_sphere_away() -> No
         error = hand_eye_difference(one.state.tool_from_sensor, HAND_EYE)
         squares.append(float(error @ np.linalg.solve(one.linear.covariance[:6, :6], error)))
     assert 3.5 < float(np.median(squares)) < 9.0
-    assert max(squares) < 60.0
+    assert float(np.mean(squares)) < 12.0

@@ -27,6 +27,7 @@ from armscan.calibration.hand_eye.checks import (
     refuse_hardly_determined,
     refuse_underdetermined,
     scatter_warnings,
+    turns_about_two_axes,
 )
 from armscan.calibration.hand_eye.estimate import (
     Conditioning,
@@ -53,6 +54,7 @@ from armscan.calibration.hand_eye.observations import (
 )
 from armscan.calibration.hand_eye.result import (
     HandEyeFit,
+    diameter_asked,
     hand_eye_calibration,
     plate_facts,
     posture_results,
@@ -284,7 +286,7 @@ def calibrate_on_sphere(
     if refused is not None:
         return refused
     thinned = tuple(section.thinned(START_POINTS) for section in sections)
-    few = Problem(condense_sphere(thinned, START_PIECES), surface, options)
+    few = _plain(Problem(condense_sphere(thinned, START_PIECES), surface, options))
     refused = refuse_few_postures(few, TURN_THE_TOOL)
     if refused is not None:
         return refused
@@ -299,9 +301,6 @@ def calibrate_on_sphere(
     if isinstance(best, FitFailure):
         return best
     start, fit = best
-    refused = refuse_diameter(fit)
-    if refused is not None:
-        return refused
     held = hold_sensor(fit)
     return _OPEN if held is None else _fit_on_sphere(sections, left_out, start, fit, held)
 
@@ -341,7 +340,7 @@ def _search(
             kept.append(state if found is None else found.state)
     refused = _refuse_far(few, kept[0])
     if refused is None:
-        refused = _refuse_open(conditioning_at(few, kept[0]), 2.0 * radius_mm)
+        refused = _refuse_open(few, conditioning_at(few, kept[0]), 2.0 * radius_mm)
     return tuple(kept) if refused is None else refused
 
 
@@ -351,16 +350,27 @@ def _is_apart(one: HandEyeState, other: HandEyeState) -> bool:
 
 
 def _refuse_open(
-    conditioning: Conditioning, diameter_mm: float, most_mm: float = np.inf
+    problem: Problem, conditioning: Conditioning, diameter_mm: float, most_mm: float = np.inf
 ) -> FitFailure | None:
     """Refuse postures that leave a combination of the unknowns open or nearly so."""
     cause = ": the tool hardly turns, or about one axis only"
+    if turns_about_two_axes(problem.observations):
+        cause = (
+            ", though the tool turns: the scatter of arm and stripes or the sensor leaves it open"
+        )
     most_mm = min(max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM), most_mm)
     return refuse_hardly_determined(conditioning, most_mm, cause, TURN_THE_TOOL)
 
 
+def _plain(problem: Problem) -> Problem:
+    """With distances from the sphere's one centre, which need no noise model."""
+    radius_mm = float(problem.surface.start[3])
+    return replace(problem, surface=SphereSurface(radius_mm, has_own_centres=False))
+
+
 def _refuse_far(problem: Problem, state: HandEyeState) -> FitFailure | None:
     """Refuse points that stay away from any sphere; say whether another diameter would do."""
+    problem = _plain(problem)
     limit_mm = problem.far_mm(problem.place(state))
     typical_mm = _typical_mm(problem, state)
     if not typical_mm > limit_mm:
@@ -400,7 +410,7 @@ def _likeliest(
     refused = _refuse_far(problem, best.state)
     if refused is None:
         diameter_mm = 2.0 * float(start.surface[3])
-        refused = _refuse_open(_conditioning(best), diameter_mm, MOST_OPEN_MM)
+        refused = _refuse_open(problem, _conditioning(best), diameter_mm, MOST_OPEN_MM)
     if refused is not None:
         return refused
     for _, other in solved[1:]:
@@ -420,7 +430,11 @@ def _fit_on_sphere(
     start: HandEyeState,
     fit: HandEyeSolution,
     held: HandEyeSolution,
-) -> HandEyeFit:
+) -> HandEyeFit | FitFailure:
+    asked = diameter_asked(fit)
+    refused = None if asked is None else refuse_diameter(asked, fit)
+    if refused is not None:
+        return refused
     rows: dict[int, tuple[PosedStripe, IntArray]] = {}
     for section in sections:
         stripe, before = rows.get(id(section.stripe), (section.stripe, np.zeros(0, np.int64)))
@@ -434,11 +448,10 @@ def _fit_on_sphere(
         stripes=list(rows.values()),
         start=start.tool_from_sensor,
     )
-    given_mm = 2.0 * float(fit.problem.surface.start[3])
     warnings = (
         *left_out,
         *conditioning_warnings(conditioning, len(found.postures), ""),
         *scatter_warnings(held),
-        *sphere_warnings(fit, held, sections, found.postures),
+        *sphere_warnings(held, sections, found.postures, asked),
     )
-    return replace(found, reference=sphere_facts(fit, held, given_mm), warnings=warnings)
+    return replace(found, reference=sphere_facts(fit, held, asked), warnings=warnings)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from math import comb
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
 from armscan.calibration.hand_eye.alternatives import (
@@ -221,6 +222,15 @@ def conditioning_warnings(
             f"{conditioning.weakest}"
         )
     return tuple(warnings)
+
+
+def turns_about_two_axes(observations: CondensedObservations) -> bool:
+    """Whether the postures' orientations spread about two axes, by a few degrees each."""
+    stripes = observations.stripe[np.unique(observations.posture, return_index=True)[1]]
+    rotations = observations.rotations[stripes]
+    turns = Rotation.from_matrix(rotations[0].T @ rotations).as_rotvec()
+    extent = np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False) / np.sqrt(len(turns))
+    return len(extent) > 1 and float(np.degrees(extent[1])) > ALIKE_DEG
 
 
 def common_to_postures(observations: CondensedObservations, plane: Plane) -> str:

@@ -275,7 +275,9 @@ def minimise_distances(
     free = problem.columns if columns is None else columns
     n_all, n_free = N_HAND_EYE + len(start.surface) + 1, len(free)
     root = np.zeros((0, 0)) if start.sensor is None else problem.observations.sensor_root
-    units = np.linalg.pinv(root)
+    sizes = np.linalg.norm(root, axis=1)[:, None]
+    sizes[sizes == 0.0] = 1.0
+    units = np.linalg.pinv(root / sizes) / sizes.T
 
     def linearise(state: HandEyeState) -> tuple[FloatArray, FloatArray]:
         placed = problem.place(state)

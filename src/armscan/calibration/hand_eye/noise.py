@@ -118,7 +118,7 @@ def noise_components(
         posture = posture / weights[observations.posture][:, None]
     components: tuple[NoiseComponent, ...] = _pose_components(
         [posture * part for part in (shift, *turns)],
-        _component("arm", shift, options.arm_position_mm, *_expected_arm(surface)),
+        _component("arm", shift, options.arm_position_mm, _expected_arm_mm(surface), ARM_WIDTH),
         options.arm_rotation_rad,
     )
     if _has_exposure_part(observations, options):
@@ -148,16 +148,17 @@ def noise_components(
     )
 
 
-def _expected_arm(surface: ReferenceSurface) -> tuple[float, float]:
-    """Expected scatter of the arm's position in mm, and the width of its logarithm.
+def _expected_arm_mm(surface: ReferenceSurface) -> float:
+    """Expected scatter of the arm's position.
 
-    Touches of the plate scatter about their plane by what arm, tip and plate err by.
+    Touches of the plate scatter about their plane by what arm, tip and plate err by; but they tell
+    how the arm repeats itself nearby, so that they bind no more than what arms have in general.
     """
     if isinstance(surface, PlateSurface):
         touched_mm = surface.reference.rms_mm
         if touched_mm is not None and surface.reference.n_points >= LEAST_TOUCHES:
-            return max(touched_mm, LEAST_ARM_MM), ARM_WIDTH
-    return TYPICAL_ARM_MM, ARM_WIDTH
+            return max(touched_mm, LEAST_ARM_MM)
+    return TYPICAL_ARM_MM
 
 
 def _has_exposure_part(observations: CondensedObservations, options: HandEyeOptions) -> bool:

@@ -528,12 +528,17 @@ class CondensedObservations(ArrayRecord):
         """(P, R) root of the covariance of those of the sensor's parameters that move a point.
 
         The others' rows are zero. (0, 0) where the sensor is taken as exact.
+
+        Raises
+        ------
+        InputError
+            If that covariance has a negative eigenvalue.
         """
         covariance, by_sensor = self.sensor_covariance, self.dpoint_dsensor
         if covariance is None or by_sensor is None:
             return np.zeros((0, 0))
         moving = np.flatnonzero(by_sensor.any(axis=(0, 1)))
-        of_moving = square_root(covariance[np.ix_(moving, moving)])
+        of_moving = square_root(covariance[np.ix_(moving, moving)], "the sensor's covariance")
         root = np.zeros((len(covariance), of_moving.shape[1]))
         root[moving] = of_moving
         return root

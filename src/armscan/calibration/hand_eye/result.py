@@ -287,10 +287,26 @@ def _signed(value: float, digits: int = 6) -> str:
     return f"{'-' if value < 0.0 else '+'} {abs(value):.{digits}f}"
 
 
+@dataclass(frozen=True, slots=True)
+class AskedDiameter:
+    """Diameter that the points themselves ask for; ``sigma_mm`` takes the scatters as known."""
+
+    diameter_mm: float
+    sigma_mm: float
+
+    def __str__(self) -> str:
+        """In words."""
+        return (
+            f"{self.diameter_mm:.3f} mm, standard deviation {self.sigma_mm:.3f} mm if all scatters "
+            "are as estimated"
+        )
+
+
 def sphere_facts(
-    fit: HandEyeSolution, held: HandEyeSolution, diameter_mm: float
+    fit: HandEyeSolution, held: HandEyeSolution, asked: AskedDiameter | None
 ) -> tuple[tuple[str, str], ...]:
     """What the sphere was, as (label, value)."""
+    diameter_mm = 2.0 * float(fit.problem.surface.start[3])
     by_sensor = held.problem.sensor_covariance(held.placed)
     gain = held.linear.gain
     covariance = held_covariance(fit, held).matrix + gain @ by_sensor @ gain.T
@@ -301,10 +317,8 @@ def sphere_facts(
         ("Sphere's centre in Base", f"{x:.3f}, {y:.3f}, {z:.3f} mm"),
         ("Its standard deviation", ", ".join(f"{sigma[k]:.3f}" for k in range(6, 9)) + " mm"),
     ]
-    if RADIUS_COLUMN not in sigma:
-        found, uncertainty = diameter_asked(fit)
-        text = f"{found:.3f} mm, standard deviation {uncertainty:.3f} mm"
-        rows.append(("Diameter that the points ask for", text))
+    if asked is not None:
+        rows.append(("Diameter that the points ask for", str(asked)))
     else:
         deviation = 2.0 * sigma[RADIUS_COLUMN]
         text = f"{2.0 * radius_mm:.3f} mm, standard deviation {deviation:.3f} mm"
@@ -315,57 +329,50 @@ def sphere_facts(
     return tuple(rows)
 
 
-def diameter_asked(fit: HandEyeSolution) -> tuple[float, float]:
-    """Diameter that the points themselves ask for, and its standard deviation, both in mm.
+def diameter_asked(fit: HandEyeSolution) -> AskedDiameter | None:
+    """Solve the diameter along; None where it is anyway.
 
     The scatter is estimated anew: as long as the diameter is held, a wrong one counts as form of
     the stripes, and is hidden by it.
     """
+    if fit.problem.options.solve_diameter:
+        return None
     columns = np.union1d(fit.problem.columns, [RADIUS_COLUMN])
     residual, jacobian = fit.placed.residual_mm, fit.placed.jacobian[:, columns]
     noise = estimate_noise(residual, jacobian, fit.components, fit.known, fit.noise.sigmas)
     scatter = total_covariance(fit.components, noise.sigmas)
     freed = minimise_distances(fit.problem, fit.state, scatter, columns)
     if freed is None:
-        return 2.0 * float(fit.state.surface[3]), float("inf")
+        return AskedDiameter(2.0 * float(fit.state.surface[3]), float("inf"))
     placed = fit.problem.place(freed.state)
     total = scatter + fit.problem.sensor_covariance(placed)
     linear = solve_linear(placed.residual_mm, placed.jacobian[:, columns], total)
-    radius_mm = float(freed.state.surface[3])
+    diameter_mm = 2.0 * float(freed.state.surface[3])
     if linear is None:
-        return 2.0 * radius_mm, float("inf")
+        return AskedDiameter(diameter_mm, float("inf"))
     k = int(np.flatnonzero(columns == RADIUS_COLUMN)[0])
-    return 2.0 * radius_mm, 2.0 * float(np.sqrt(linear.covariance[k, k]))
+    return AskedDiameter(diameter_mm, 2.0 * float(np.sqrt(linear.covariance[k, k])))
 
 
-def refuse_diameter(fit: HandEyeSolution) -> FitFailure | None:
+def refuse_diameter(asked: AskedDiameter, fit: HandEyeSolution) -> FitFailure | None:
     """Refuse a sphere of which the points say that it has quite another diameter."""
     given_mm = 2.0 * float(fit.problem.surface.start[3])
-    asked_mm, sigma_mm = diameter_asked(fit)
-    off_mm = abs(asked_mm - given_mm)
-    if fit.problem.options.solve_diameter or off_mm < NO_DIAMETER_PART * given_mm:
-        return None
-    if off_mm < NO_DIAMETER * sigma_mm:
+    off_mm = abs(asked.diameter_mm - given_mm)
+    if off_mm < max(NO_DIAMETER_PART * given_mm, NO_DIAMETER * asked.sigma_mm):
         return None
     return FitFailure(
-        f"{_diameter_in_words(asked_mm, sigma_mm)}, not {given_mm:g} mm",
+        f"the points ask for a diameter of {asked}, not of {given_mm:g} mm",
         "check the sphere's diameter, and that the sensor's calibration is this one: its points "
-        "may be too large or too small",
-    )
-
-
-def _diameter_in_words(asked_mm: float, sigma_mm: float) -> str:
-    return (
-        f"the points ask for a sphere of {asked_mm:.2f} mm diameter (standard deviation "
-        f"{sigma_mm:.2f} mm)"
+        "may be too large or too small; where neither can be known better, solve the diameter "
+        "along (--solve-diameter)",
     )
 
 
 def sphere_warnings(
-    fit: HandEyeSolution,
     held: HandEyeSolution,
     sections: Sequence[CircleSection],
     postures: Sequence[PostureResult],
+    asked: AskedDiameter | None,
 ) -> tuple[str, ...]:
     """What is weak about postures, stripes and diameter."""
     found, weights = [], held.problem.weights
@@ -390,12 +397,11 @@ def sphere_warnings(
                 f"{section.stripe.source} is weak: its arc of {section.arc_deg:.0f} degrees is "
                 f"short, {usual_deg:.0f} are usual"
             )
-    asked, uncertainty = diameter_asked(fit)
-    given = 2.0 * float(held.state.surface[3])
-    if abs(asked - given) > WRONG_DIAMETER * uncertainty:
+    given_mm = 2.0 * float(held.problem.surface.start[3])
+    if asked and abs(asked.diameter_mm - given_mm) > WRONG_DIAMETER * asked.sigma_mm:
         found.append(
-            f"{_diameter_in_words(asked, uncertainty)}, not {given:g} mm: check the diameter and "
-            "the sensor's scale"
+            f"the points ask for a diameter of {asked}, not of {given_mm:g} mm: check the diameter "
+            "and the sensor's scale"
         )
     if not held.is_settled:
         found.append("the refinement had not settled when its steps ran out")

@@ -23,10 +23,11 @@ from armscan.geometry.shapes import Plane
 from armscan.models.calibration import HandEyeMethod
 
 N_HAND_EYE = 6
-OWN_CENTRE_STEPS = 4
+OWN_CENTRE_STEPS = 3
 NOISE_OVER_SHIFT = 0.01
-"""Of a stripe on a sphere: its noise over what arm and sensor shift it by; where it tells its own
-centre less well, the common one counts."""
+"""Of a stripe on a sphere: its noise over what arm and sensor shift it by; a direction in which it
+tells its own centre less well is left to the common one. Where the noise is the larger of both, the
+distances are nearly linear anyway."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,7 @@ class PlateSurface:
     def distance_of_stripes(
         self, points_mm: FloatArray, parameters: FloatArray, stripe: IntArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As `distance`, of points (N, 3) that belong to stripes (N,): alike for a plate."""
+        """As `distance`, of points (N, 3) that belong to stripes (N,), one after another."""
         return self.distance(points_mm, parameters)
 
     def scan_points(
@@ -113,10 +114,12 @@ class PlateSurface:
 class SphereSurface:
     """A sphere: centre in Base (mm) and radius (mm), K = 4, of which the centre is always solved.
 
-    Its members are those of `PlateSurface`.
+    Its members are those of `PlateSurface`. Without ``has_own_centres`` distances are those from
+    the common centre, as a sum of squares without a noise model takes them.
     """
 
     radius_mm: float
+    has_own_centres: bool = True
     method: HandEyeMethod = "sphere"
     per_stripe: int = 24
 
@@ -143,19 +146,24 @@ class SphereSurface:
         An arm throws a stripe by many times its noise: by 0.6 mm on a ball of 20 mm radius the
         distances from the common centre are 0.01 mm from linear, which no cause of scatter
         explains. About the stripe's own centre they are linear in what the arm and the sensor shift
-        it by. The derivatives are those for held own centres: a least squares that had the shifts
-        among its unknowns would have the same gradient.
+        it by. The derivatives are those for held own centres: under a covariance that holds the
+        shifts they make the gradient of a least squares that has the shifts among its unknowns.
         """
-        count = np.maximum(np.bincount(stripe), 1)[:, None, None]
-        shift_mm: FloatArray = np.zeros((len(count), 3))
+        if not self.has_own_centres:
+            return self.distance(points_mm, parameters)
+        starts = np.flatnonzero(np.diff(stripe, prepend=-1))
+        count = np.diff(starts, append=len(stripe))
+        shift_mm: FloatArray = np.zeros((len(starts), 3))
         for _ in range(OWN_CENTRE_STEPS):
-            residual, normals, _ = self._about(points_mm, parameters, shift_mm[stripe])
-            matrix = count * (NOISE_OVER_SHIFT**2 * np.eye(3))
-            np.add.at(matrix, stripe, normals[:, :, None] * normals[:, None, :])
-            right = np.zeros((len(count), 3))
-            np.add.at(right, stripe, normals * residual[:, None])
+            residual, normals, _ = self._about(
+                points_mm, parameters, shift_mm.repeat(count, axis=0)
+            )
+            pairs = normals[:, :, None] * normals[:, None, :]
+            matrix = np.add.reduceat(pairs, starts)
+            matrix += count[:, None, None] * (NOISE_OVER_SHIFT**2 * np.eye(3))
+            right = np.add.reduceat(normals * residual[:, None], starts)
             shift_mm = np.asarray(np.linalg.solve(matrix, right[:, :, None])[:, :, 0])
-        return self._about(points_mm, parameters, shift_mm[stripe])
+        return self._about(points_mm, parameters, shift_mm.repeat(count, axis=0))
 
     def _about(
         self, points_mm: FloatArray, parameters: FloatArray, shift_mm: FloatArray

@@ -34,7 +34,6 @@ from armscan.calibration.hand_eye.observations import (
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.surface import (
     PlateSurface,
-    dresidual_dsensor,
     hand_eye_difference,
 )
 from armscan.errors import EstimationError
@@ -62,7 +61,7 @@ def moved_pair(
     fit = estimate(problem, problem.start(stored.tool_from_sensor))
     if fit is None:
         raise EstimationError("the stripes do not determine the hand-eye")
-    by_sensor = dresidual_dsensor(nodes, fit.placed)
+    by_sensor = fit.placed.by_sensor
     if by_sensor is None:
         raise EstimationError("the stripes do not say how they follow the sensor")
     hand_eye = replace(

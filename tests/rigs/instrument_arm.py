@@ -113,10 +113,10 @@ def run_hand_eye(
     calibration = found.calibration
     covariance, follow = calibration.covariance, calibration.dhand_eye_dsensor
     granted = np.nan
-    if follow is not None:
+    if follow is not None and found.sensor_covariance is not None:
         stored = hand_eye_bound(made, seen, np.zeros_like(sensor.covariance), on_sphere)
         granted = _over(covariance, stored)
-        covariance = covariance + follow @ sensor.covariance @ follow.T
+        covariance = covariance + follow @ found.sensor_covariance @ follow.T
     pose, truth = calibration.tool_from_sensor, made.tool_from_sensor
     turn = Rotation.from_matrix(pose.rotation @ truth.rotation.T).as_rotvec()
     error = np.concatenate([turn, pose.translation_mm - truth.shift])

@@ -296,17 +296,21 @@ def calibrate_hand_eye(
     job.progress(ProgressEvent("solve", n_steps, n_steps))
     fit = replace(fit, warnings=(*inputs.warnings, *fit.warnings))
     provenance = job.provenance(inputs.files, used, parents=parents, warnings=fit.warnings)
-    scanner = ScannerCalibration(inputs.sensor, fit.calibration, provenance)
+    sensor = inputs.sensor
+    if sensor is not None:
+        sensor = fit.sensor_after(sensor, provenance)
+    scanner = ScannerCalibration(sensor, fit.calibration, provenance)
+    stripes = tuple(stripe.beside(fit.sensor_step) for stripe in inputs.stripes)
     page = hand_eye_page(
         fit,
         scanner,
-        inputs.stripes,
+        stripes,
         inputs.images,
         _shown_exposures(inputs),
         repeats=repeats or (),
         is_simulated=inputs.is_simulated,
     )
-    observations = pack_posed_stripes(inputs.stripes, {})
+    observations = pack_posed_stripes(stripes, {})
     document = scanner_document(scanner, (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     tables = (posture_table(fit),) if repeats is None else (repeats[0], posture_table(fit))
@@ -317,7 +321,7 @@ def calibrate_hand_eye(
         printed = (
             FitFailure("there is no plate")
             if reference is None
-            else as_printed(inputs.stripes, reference, pose)
+            else as_printed(stripes, reference, pose)
         )
         table, data = _beside_thesis(printed, pose)
         extra = {**summary.extra, "thesis": data}

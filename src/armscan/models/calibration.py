@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -247,6 +247,14 @@ class CameraCalibration(ArrayRecord):
     provenance: Provenance
     diagnostics: CameraDiagnostics | None = None
 
+    def updated(self, step: FloatArray, covariance: FloatArray) -> CameraCalibration:
+        """The camera with its parameters moved by a step (9,), known to another covariance."""
+        model = self.camera
+        moved = CameraModel.from_parameters(
+            model.parameters + step, model.width_px, model.height_px
+        )
+        return replace(self, camera=moved, covariance=covariance)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetCalibration:
@@ -365,6 +373,34 @@ class SensorCalibration(ArrayRecord):
         """Columns of ``covariance`` that belong to the second camera; empty without one."""
         start = self.sheet_parameter_slice(len(self.sheets)).start
         return slice(start, len(self.parameter_names))
+
+    def updated(
+        self, step: FloatArray, covariance: FloatArray, provenance: Provenance
+    ) -> SensorCalibration:
+        """The sensor with its parameters moved by a step (P,), known to another covariance (P, P).
+
+        ``provenance`` is that of what moved it.
+        """
+        n, of_second = len(CAMERA_PARAMETER_NAMES), self.second_parameter_slice
+        sheets = tuple(
+            replace(sheet, sheet=sheet.sheet.updated(step[self.sheet_parameter_slice(k)]))
+            for k, sheet in enumerate(self.sheets)
+        )
+        second = self.second
+        if second is not None:
+            of_camera = slice(of_second.start, of_second.start + n)
+            second = SecondCamera(
+                second.camera.updated(step[of_camera], covariance[of_camera, of_camera]),
+                second.right_from_sensor.retract(step[of_camera.stop :]),
+            )
+        return replace(
+            self,
+            camera=self.camera.updated(step[:n], covariance[:n, :n]),
+            sheets=sheets,
+            second=second,
+            covariance=covariance,
+            provenance=provenance,
+        )
 
 
 HAND_EYE_PARAMETER_NAMES = (

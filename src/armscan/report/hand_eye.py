@@ -411,7 +411,7 @@ def repeat_blocks(
         (P, P) of its parameters; None where it is taken as exact.
     """
     columns = ("calibration", "θ °", "γ °", "φ °", "tx mm", "ty mm", "tz mm")
-    study = study_repeats([fit.calibration for fit in fits], sensor_covariance)
+    study = study_repeats([fit.beside_given_sensor for fit in fits], sensor_covariance)
     if isinstance(study, FitFailure):
         return Table(columns, ()), Text(study.reason)
     lines = [(name, row, 3) for name, row in zip(names, study.values, strict=True)]
@@ -421,7 +421,8 @@ def repeat_blocks(
     rows = tuple((name, *(f"{value:.{n}f}" for value in row)) for name, row, n in lines)
     low, high = study.ratio_range
     text = (
-        "One calibration from each recording. The standard deviation is that of one calibration, "
+        "One calibration from each recording, beside the sensor as it was given. The standard "
+        "deviation is that of one calibration, "
         f"n - 1 = {len(fits) - 1} in the denominator; the prediction is what the calibrations "
         "state themselves; of the sensor's share, as all have one sensor, only what their postures "
         "make differ. If it is right, "

@@ -23,6 +23,7 @@ from armscan.calibration.hand_eye.estimate import (
     HandEyeSolution,
     Problem,
     estimate,
+    joint_covariance,
     minimise_distances,
 )
 from armscan.calibration.hand_eye.noise import estimate_noise, solve_linear, total_covariance
@@ -279,7 +280,8 @@ def find_contradiction(
         return None
     best = believed[0]
     change = best.hand_eye_change
-    variance = np.minimum(np.diag(fit.covariance)[:N_HAND_EYE], np.diag(best.hand_eye_covariance))
+    own = joint_covariance(fit).given_sensor
+    variance = np.minimum(np.diag(own), np.diag(best.hand_eye_covariance))
     is_refused = (
         best.probability < UNLIKELY
         and best.size_mm > ARM_ACCURACY_MM

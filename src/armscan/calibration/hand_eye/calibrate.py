@@ -12,7 +12,6 @@ from armscan.calibration.hand_eye.alternatives import find_mirror
 from armscan.calibration.hand_eye.checks import (
     LIKELIER,
     MOST_OPEN_MM,
-    NO_SOLUTION,
     VARY_POSTURES,
     CheckedFit,
     agreement_warnings,
@@ -32,11 +31,12 @@ from armscan.calibration.hand_eye.checks import (
 from armscan.calibration.hand_eye.estimate import (
     Conditioning,
     HandEyeSolution,
+    JointCovariance,
     LeftOut,
     Problem,
     conditioning_at,
     estimate_robustly,
-    hold_sensor,
+    joint_covariance,
     leave_each_out,
     minimise_distances,
 )
@@ -122,8 +122,9 @@ def calibrate_on_plate(
     sensor_covariance
         (P, P) of the sensor's parameters, in the order of the stripes' ``dpoint_dsensor``: its
         errors bend all stripes alike, and are not taken for something that moved. The hand-eye
-        returned, and its covariance, are for the sensor as it is; ``dhand_eye_dsensor`` carries its
-        errors on. None takes it as exact.
+        returned belongs to the sensor as the stripes move it within this covariance
+        (`HandEyeFit.sensor_step`); ``dhand_eye_dsensor`` carries on what it may still err by. None
+        takes it as exact.
 
     Returns
     -------
@@ -183,18 +184,15 @@ def _fit_on_plate(
     *,
     cause: str,
 ) -> HandEyeFit | FitFailure:
-    """Checks let the sensor err within its covariance; what is stored belongs to the sensor."""
-    fit, held = checked.fit, hold_sensor(checked.fit)
-    if held is None:
-        return NO_SOLUTION
+    fit = checked.fit
     conditioning, left = _conditioning(fit), leave_each_out(fit)
     refused = refuse_hardly_determined(conditioning, MOST_OPEN_MM, cause, VARY_POSTURES)
     if refused is not None:
         return refused
-    rows = [np.flatnonzero(mark) for mark in kept]
+    rows, joint = [np.flatnonzero(mark) for mark in kept], joint_covariance(fit)
     found = _evidence(
         checked,
-        held,
+        joint,
         conditioning,
         left,
         stripes=list(zip(stripes, rows, strict=True)),
@@ -203,9 +201,9 @@ def _fit_on_plate(
     warnings = (
         *checked.warnings,
         *conditioning_warnings(conditioning, len(found.postures), cause),
-        *agreement_warnings(held, plate),
-        *scatter_warnings(held),
-        *influence_warnings(fit.problem.observations.postures, left, fit.covariance),
+        *agreement_warnings(fit, plate),
+        *scatter_warnings(fit),
+        *influence_warnings(fit.problem.observations.postures, left, joint.given_sensor),
         *point_warnings(stripes, kept),
     )
     return replace(found, reference=plate_facts(checked, plate), warnings=warnings)
@@ -217,7 +215,7 @@ def _conditioning(fit: HandEyeSolution) -> Conditioning:
 
 def _evidence(
     checked: CheckedFit,
-    held: HandEyeSolution,
+    joint: JointCovariance,
     conditioning: Conditioning,
     left: dict[int, LeftOut],
     *,
@@ -225,10 +223,10 @@ def _evidence(
     start: Pose[Tool, Sensor],
 ) -> HandEyeFit:
     """The result without words; ``stripes`` with the rows of their points that were used."""
-    residuals = stripe_residuals(stripes, held)
-    postures = posture_results(held, residuals, left)
+    residuals = stripe_residuals(stripes, checked.fit)
+    postures = posture_results(checked.fit, residuals, left)
     calibration = hand_eye_calibration(
-        checked, held, conditioning, stripes=residuals, postures=postures
+        checked, joint, conditioning, stripes=residuals, postures=postures
     )
     return HandEyeFit(
         calibration=calibration,
@@ -237,6 +235,8 @@ def _evidence(
         postures=postures,
         singular_values=conditioning.singular_values,
         reference=(),
+        sensor_step=checked.fit.state.sensor,
+        sensor_covariance=joint.sensor,
     )
 
 
@@ -300,9 +300,7 @@ def calibrate_on_sphere(
     best = _likeliest(Problem(observations, surface, options), starts)
     if isinstance(best, FitFailure):
         return best
-    start, fit = best
-    held = hold_sensor(fit)
-    return _OPEN if held is None else _fit_on_sphere(sections, left_out, start, fit, held)
+    return _fit_on_sphere(sections, left_out, *best)
 
 
 def _refuse_sections(
@@ -429,7 +427,6 @@ def _fit_on_sphere(
     left_out: Sequence[str],
     start: HandEyeState,
     fit: HandEyeSolution,
-    held: HandEyeSolution,
 ) -> HandEyeFit | FitFailure:
     asked = diameter_asked(fit)
     refused = None if asked is None else refuse_diameter(asked, fit)
@@ -439,10 +436,10 @@ def _fit_on_sphere(
     for section in sections:
         stripe, before = rows.get(id(section.stripe), (section.stripe, np.zeros(0, np.int64)))
         rows[id(stripe)] = (stripe, np.concatenate([before, section.rows]))
-    conditioning, left = _conditioning(fit), leave_each_out(fit)
+    conditioning, left, joint = _conditioning(fit), leave_each_out(fit), joint_covariance(fit)
     found = _evidence(
         CheckedFit(fit),
-        held,
+        joint,
         conditioning,
         left,
         stripes=list(rows.values()),
@@ -451,7 +448,7 @@ def _fit_on_sphere(
     warnings = (
         *left_out,
         *conditioning_warnings(conditioning, len(found.postures), ""),
-        *scatter_warnings(held),
-        *sphere_warnings(held, sections, found.postures, asked),
+        *scatter_warnings(fit),
+        *sphere_warnings(fit, sections, found.postures, asked),
     )
-    return replace(found, reference=sphere_facts(fit, held, asked), warnings=warnings)
+    return replace(found, reference=sphere_facts(fit, joint, asked), warnings=warnings)

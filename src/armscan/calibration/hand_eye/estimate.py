@@ -18,7 +18,6 @@ from armscan.calibration.hand_eye.noise import (
     LinearSolution,
     NoiseComponent,
     NoiseEstimate,
-    SolutionCovariance,
     covariance_over_noise,
     estimate_noise,
     noise_components,
@@ -156,8 +155,8 @@ class HandEyeSolution:
     components, noise
         Causes of scatter and their standard deviations.
     known
-        (M, M) covariance of the residuals by what errs alike in all postures: a probed plane and,
-        unless it is held (`hold_sensor`), the sensor.
+        (M, M) covariance of the residuals by what errs alike in all postures: a probed plane and
+        the sensor.
     linear
         Linearised at the minimum, in the columns solved for.
     is_settled
@@ -237,18 +236,6 @@ class HandEyeSolution:
         return np.asarray(self.noise.sigmas[:2] ** 2 * seen / seen[0])
 
     @property
-    def covariance(self) -> FloatArray:
-        """(F, F) of the unknowns, estimated scatter not taken as known, without the sensor's part.
-
-        For a solution in which the sensor may err.
-        """
-        whole = covariance_over_noise(
-            self.placed.residual_mm, self.jacobian, self.components, self.known, self.noise
-        )
-        by_sensor = self.problem.sensor_covariance(self.placed)
-        return np.asarray(whole.matrix - self.linear.gain @ by_sensor @ self.linear.gain.T)
-
-    @property
     def surface_after(self) -> FloatArray:
         """(K,) parameters of the surface as the scan and what was known of it give them."""
         prior = self.problem.surface.prior(self.problem.options)
@@ -274,10 +261,9 @@ def minimise_distances(
         return None
     free = problem.columns if columns is None else columns
     n_all, n_free = N_HAND_EYE + len(start.surface) + 1, len(free)
-    root = np.zeros((0, 0)) if start.sensor is None else problem.observations.sensor_root
-    sizes = np.linalg.norm(root, axis=1)[:, None]
-    sizes[sizes == 0.0] = 1.0
-    units = np.linalg.pinv(root / sizes) / sizes.T
+    root, units = np.zeros((0, 0)), np.zeros((0, 0))
+    if start.sensor is not None:
+        root, units = problem.observations.sensor_numbers()
 
     def linearise(state: HandEyeState) -> tuple[FloatArray, FloatArray]:
         placed = problem.place(state)
@@ -402,39 +388,68 @@ def _solution(
     )
 
 
-def hold_sensor(solution: HandEyeSolution) -> HandEyeSolution | None:
-    """The hand-eye that belongs to the sensor as it is stored, under the scatter of ``solution``.
+@dataclass(frozen=True, slots=True, eq=False)
+class JointCovariance:
+    """What the unknowns of a solution and the sensor err by, estimated scatter not taken as known.
 
-    A solution that knows the sensor's covariance explains a part of the residuals by a sensor that
-    is moved within it: its hand-eye is that of the moved sensor, and beside the stored one it makes
-    wrong points. Here the sensor stands still and the hand-eye takes up what it can of the
-    sensor's errors. Its ``known`` is without the sensor's part.
+    Parameters
+    ----------
+    unknowns
+        (F, F) covariance of all that was solved for beside the sensor, its errors included.
+    region_factor
+        Of the hand-eye, as of `SolutionCovariance`.
+    given_sensor
+        (6, 6) covariance of the hand-eye, the sensor being held fixed.
+    dhand_eye_dsensor
+        (6, P) how the hand-eye follows the sensor's errors; None where the points do not say how
+        they follow them.
+    sensor
+        (P, P) covariance of the sensor's parameters after the scan; None where they were not
+        solved for.
     """
-    problem = solution.problem
-    if problem.observations.sensor_covariance is None:
-        return solution
-    stored = replace(solution.state, sensor=None)
-    held = _solution(problem, stored, solution.components, solution.noise)
-    if held is None:
-        return None
-    return replace(held, is_settled=held.is_settled and solution.is_settled)
+
+    unknowns: FloatArray
+    region_factor: float
+    given_sensor: FloatArray
+    dhand_eye_dsensor: FloatArray | None
+    sensor: FloatArray | None
 
 
-def held_covariance(checked: HandEyeSolution, held: HandEyeSolution) -> SolutionCovariance:
-    """Covariance (F, F) of a hand-eye whose sensor is held, without the sensor's errors.
-
-    What the sensor's errors leave in the residuals of ``checked``, where it may err, is the part of
-    `dhand_eye_dsensor`, not the scatter's.
-    """
-    by_sensor = checked.problem.sensor_covariance(checked.placed)
-    own = checked.placed.residual_mm - by_sensor @ checked.explained
-    return covariance_over_noise(own, held.jacobian, held.components, held.known, held.noise)
-
-
-def dhand_eye_dsensor(solution: HandEyeSolution) -> FloatArray | None:
-    """(6, P) derivative of the hand-eye by the sensor's parameters, where the points carry it."""
-    by_sensor = solution.placed.by_sensor
-    return None if by_sensor is None else -solution.linear.gain[:N_HAND_EYE] @ by_sensor
+def joint_covariance(solution: HandEyeSolution) -> JointCovariance:
+    """Covariance of hand-eye and sensor as one least squares has moved both."""
+    placed, observations = solution.placed, solution.problem.observations
+    n, hand_eye, by_sensor = len(solution.problem.columns), slice(0, N_HAND_EYE), placed.by_sensor
+    before = observations.sensor_covariance
+    if by_sensor is None or before is None or solution.state.sensor is None:
+        whole = covariance_over_noise(
+            placed.residual_mm,
+            solution.jacobian,
+            solution.components,
+            solution.known,
+            solution.noise,
+        )
+        follow = None if by_sensor is None else -solution.linear.gain[hand_eye] @ by_sensor
+        own = whole.matrix[hand_eye, hand_eye]
+        return JointCovariance(whole.matrix, whole.region_factor, own, follow, None)
+    root, units = observations.sensor_numbers()
+    whole = covariance_over_noise(
+        placed.residual_mm,
+        np.concatenate([solution.jacobian, by_sensor @ root], axis=1),
+        solution.components,
+        solution.problem.surface_covariance(placed),
+        solution.noise,
+        n_unit=len(units),
+    )
+    after, between = whole.matrix[n:, n:], whole.matrix[hand_eye, n:]
+    by_units = np.linalg.solve(after, between.T).T
+    learnt = root @ (np.eye(len(units)) - after) @ root.T
+    return JointCovariance(
+        unknowns=whole.matrix[:n, :n],
+        region_factor=whole.region_factor,
+        given_sensor=whole.matrix[hand_eye, hand_eye] - by_units @ between.T,
+        dhand_eye_dsensor=by_units @ units,
+        sensor=before - learnt,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

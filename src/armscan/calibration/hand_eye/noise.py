@@ -328,25 +328,33 @@ class _Solved:
     left: FloatArray
 
 
-def _solve(residual: FloatArray, jacobian: FloatArray, covariance: FloatArray) -> _Solved | None:
-    """As `solve_linear`, without what only the scoring and the checks need."""
+def _solve(
+    residual: FloatArray, jacobian: FloatArray, covariance: FloatArray, n_unit: int = 0
+) -> _Solved | None:
+    """As `solve_linear`, without what only the scoring and the checks need.
+
+    The last ``n_unit`` unknowns are known beforehand: 0 with a variance of 1.
+    """
+    known = np.zeros(jacobian.shape[1])
+    known[len(known) - n_unit :] = 1.0
     try:
         lower = cholesky(covariance, lower=True, check_finite=False)
         whitened = solve_triangular(
             lower, np.column_stack([jacobian, residual]), lower=True, check_finite=False
         )
         own, right = whitened[:, :-1], whitened[:, -1]
-        factor = cholesky(own.T @ own, lower=True)
+        factor = cholesky(own.T @ own + np.diag(known), lower=True)
     except LinAlgError:
         return None
     solved = np.asarray(cho_solve((factor, True), np.eye(len(factor))))
     step = -solved @ (own.T @ right)
     left = right + own @ step
+    squares = float(left @ left) + float(known @ step**2)
     determinants = np.log(np.diag(lower)).sum() + np.log(np.diag(factor)).sum()
     return _Solved(
         step=step,
         covariance=0.5 * (solved + solved.T),
-        log_likelihood=-0.5 * float(left @ left) - float(determinants),
+        log_likelihood=-0.5 * squares - float(determinants),
         lower=lower,
         whitened=own,
         left=left,
@@ -584,6 +592,8 @@ def covariance_over_noise(
     components: tuple[NoiseComponent, ...],
     known: FloatArray,
     estimate: NoiseEstimate,
+    *,
+    n_unit: int = 0,
 ) -> SolutionCovariance:
     """Covariance of the solution with the estimated scatter not taken as known.
 
@@ -591,7 +601,8 @@ def covariance_over_noise(
     covariance of the solutions that they lead to: an integral over their posterior by importance
     sampling. It is what the errors' squares are on average. No covariance says more of errors whose
     scatter is uncertain: of few postures, more than 5 % of them lie outside the usual 95 % region,
-    which therefore has its own factor.
+    which therefore has its own factor. The last ``n_unit`` unknowns of the ``jacobian`` are known
+    beforehand, to a variance of 1, and are not in ``known``, the covariance of the residuals.
 
     Raises
     ------
@@ -601,7 +612,7 @@ def covariance_over_noise(
     posterior = _Posterior.of(residual, jacobian, components, known)
     free = posterior.free
     total = total_covariance(components, estimate.sigmas) + known
-    centre = _solve(residual, jacobian, total)
+    centre = _solve(residual, jacobian, total, n_unit)
     if centre is None:
         raise EstimationError(
             "the covariance of the hand-eye's residuals is not positive definite",
@@ -620,7 +631,7 @@ def covariance_over_noise(
     mode, parts, moved, weights = posterior.logs(estimate.sigmas), [], [], []
     for draw in _normal_draws(len(free)):
         logs = mode + factor @ draw
-        one = _solve(residual, jacobian, posterior.covariance(logs))
+        one = _solve(residual, jacobian, posterior.covariance(logs), n_unit)
         if one is not None:
             likelihood = one.log_likelihood - 0.5 * float(logs @ posterior.precision @ logs)
             parts.append(one.covariance)

@@ -159,6 +159,12 @@ class PosedStripe(RowRecord):
     dpoint_dsensor: FloatArray | None = floats("N", 3, "P", default=None)
     instant: str = ""
 
+    def beside(self, sensor_step: FloatArray | None) -> PosedStripe:
+        """The stripe as the sensor gives it that is moved by a step (P,); None leaves it."""
+        if sensor_step is None or self.dpoint_dsensor is None:
+            return self
+        return replace(self, points_mm=self.points_mm + self.dpoint_dsensor @ sensor_step)
+
 
 class PlateReference(ArrayRecord):
     """The flat plate in Base, as it was probed (eq. 2.55).
@@ -523,11 +529,11 @@ class CondensedObservations(ArrayRecord):
             dpoint_dsensor=None if by_sensor is None else by_sensor[rows],
         )
 
-    @property
-    def sensor_root(self) -> FloatArray:
-        """(P, R) root of the covariance of those of the sensor's parameters that move a point.
+    def sensor_numbers(self) -> tuple[FloatArray, FloatArray]:
+        """What numbers of unit variance make of the sensor's parameters (P, R), and back (R, P).
 
-        The others' rows are zero. (0, 0) where the sensor is taken as exact.
+        Of the parameters that move a point the first is a root of their covariance; the others
+        follow as their covariance with these says. (0, 0) where the sensor is taken as exact.
 
         Raises
         ------
@@ -536,12 +542,15 @@ class CondensedObservations(ArrayRecord):
         """
         covariance, by_sensor = self.sensor_covariance, self.dpoint_dsensor
         if covariance is None or by_sensor is None:
-            return np.zeros((0, 0))
+            return np.zeros((0, 0)), np.zeros((0, 0))
         moving = np.flatnonzero(by_sensor.any(axis=(0, 1)))
-        of_moving = square_root(covariance[np.ix_(moving, moving)], "the sensor's covariance")
-        root = np.zeros((len(covariance), of_moving.shape[1]))
-        root[moving] = of_moving
-        return root
+        root = square_root(covariance[np.ix_(moving, moving)], "the sensor's covariance")
+        sizes = np.linalg.norm(root, axis=1)[:, None]
+        sizes[sizes == 0.0] = 1.0
+        units = np.linalg.pinv(root / sizes) / sizes.T
+        of_all, from_all = covariance[:, moving] @ units.T, np.zeros((len(units), len(covariance)))
+        of_all[moving], from_all[:, moving] = root, units
+        return of_all, from_all
 
     @property
     def used_postures(self) -> IntArray:

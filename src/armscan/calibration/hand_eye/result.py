@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
@@ -13,9 +13,8 @@ from armscan.calibration.hand_eye.checks import CheckedFit
 from armscan.calibration.hand_eye.estimate import (
     Conditioning,
     HandEyeSolution,
+    JointCovariance,
     LeftOut,
-    dhand_eye_dsensor,
-    held_covariance,
     minimise_distances,
 )
 from armscan.calibration.hand_eye.noise import (
@@ -32,7 +31,12 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import euler_from_rotations, nearest_rotation
 from armscan.geometry.shapes import Plane
-from armscan.models.calibration import HandEyeCalibration, HandEyeDiagnostics
+from armscan.models.calibration import (
+    HandEyeCalibration,
+    HandEyeDiagnostics,
+    Provenance,
+    SensorCalibration,
+)
 
 FINITE_CONDITION = 1e12
 RADIUS_COLUMN, SCALE_COLUMN = N_HAND_EYE + 3, N_HAND_EYE + 4
@@ -125,6 +129,9 @@ class HandEyeFit(ArrayRecord):
         What the reference was and how far the data agree with it, as (label, value) for a reader.
     warnings
         What is weak, in words.
+    sensor_step, sensor_covariance
+        (P,) by what the stripes move the sensor's parameters, and (P, P) their covariance after it;
+        None where the sensor was taken as exact. The calibration belongs to the moved sensor.
     """
 
     calibration: HandEyeCalibration
@@ -134,45 +141,58 @@ class HandEyeFit(ArrayRecord):
     singular_values: FloatArray = floats(None)
     reference: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...] = ()
+    sensor_step: FloatArray | None = floats("P", default=None)
+    sensor_covariance: FloatArray | None = floats("P", "P", default=None)
+
+    def sensor_after(self, sensor: SensorCalibration, provenance: Provenance) -> SensorCalibration:
+        """The sensor to which the hand-eye belongs."""
+        if self.sensor_step is None or self.sensor_covariance is None:
+            return sensor
+        return sensor.updated(self.sensor_step, self.sensor_covariance, provenance)
+
+    @property
+    def beside_given_sensor(self) -> HandEyeCalibration:
+        """The hand-eye that belongs to the sensor as it was given."""
+        follow = self.calibration.dhand_eye_dsensor
+        if self.sensor_step is None or follow is None:
+            return self.calibration
+        pose = self.calibration.tool_from_sensor.retract(-follow @ self.sensor_step)
+        return replace(self.calibration, tool_from_sensor=pose)
 
 
 def hand_eye_calibration(
     checked: CheckedFit,
-    held: HandEyeSolution,
+    joint: JointCovariance,
     conditioning: Conditioning,
     *,
     stripes: Sequence[StripeResidual],
     postures: Sequence[PostureResult],
 ) -> HandEyeCalibration:
-    """The document's part: hand-eye, covariance, coupling to the sensor, noise.
-
-    ``held`` is the hand-eye of the sensor as it is (`hold_sensor`); whether all is as given is
-    told by ``checked``, where the sensor may err.
-    """
+    """The document's part: hand-eye, covariance, coupling to the sensor, noise."""
+    fit = checked.fit
     used = {posture.posture for posture in postures}
     distances = np.concatenate([one.residual_mm for one in stripes if one.posture in used])
-    components, plane = held.components, plane_after(held)
-    covariance = held_covariance(checked.fit, held)
+    components, plane = fit.components, plane_after(fit)
     is_estimated = [component.is_estimated for component in components]
     diagnostics = HandEyeDiagnostics(
-        method=held.problem.surface.method,
+        method=fit.problem.surface.method,
         rank=conditioning.rank,
         condition=min(conditioning.condition, FINITE_CONDITION),
         weakest=conditioning.weakest,
-        plate_flatness_mm=held.sigma_of("flatness"),
-        flatness_length_mm=0.0 if plane is None else held.problem.options.flatness_length_mm,
+        plate_flatness_mm=fit.sigma_of("flatness"),
+        flatness_length_mm=0.0 if plane is None else fit.problem.options.flatness_length_mm,
         # On a sphere the form of the stripes is always estimated; what counts is the arm.
         is_noise_estimated=is_estimated[0] if plane is None else any(is_estimated),
         left_out_rotation_deg=max(one.left_out_rotation_deg for one in postures),
         left_out_translation_mm=max(one.left_out_translation_mm for one in postures),
-        chi2_probability=checked.fit.probability,
-        region_factor=covariance.region_factor,
+        chi2_probability=fit.probability,
+        region_factor=joint.region_factor,
     )
     return HandEyeCalibration(
-        tool_from_sensor=held.state.tool_from_sensor,
-        covariance=covariance.matrix[:N_HAND_EYE, :N_HAND_EYE] + checked.widening,
-        dhand_eye_dsensor=dhand_eye_dsensor(held),
-        arm_noise=arm_noise(components, held.noise.sigmas),
+        tool_from_sensor=fit.state.tool_from_sensor,
+        covariance=joint.given_sensor + checked.widening,
+        dhand_eye_dsensor=joint.dhand_eye_dsensor,
+        arm_noise=arm_noise(components, fit.noise.sigmas),
         rms_mm=float(np.sqrt((distances**2).mean())),
         n_postures=len(postures),
         n_exposures=sum(posture.n_exposures for posture in postures),
@@ -182,20 +202,21 @@ def hand_eye_calibration(
     )
 
 
-def plane_after(held: HandEyeSolution) -> Plane | None:
+def plane_after(fit: HandEyeSolution) -> Plane | None:
     """The plate as scan and probing together give it; None for a sphere."""
-    surface = held.problem.surface
-    return surface.plane_at(held.surface_after) if isinstance(surface, PlateSurface) else None
+    surface = fit.problem.surface
+    return surface.plane_at(fit.surface_after) if isinstance(surface, PlateSurface) else None
 
 
 def stripe_residuals(
-    stripes: Sequence[tuple[PosedStripe, IntArray]], held: HandEyeSolution
+    stripes: Sequence[tuple[PosedStripe, IntArray]], fit: HandEyeSolution
 ) -> tuple[StripeResidual, ...]:
     """Place the used points (rows) of every exposure and compare them with the reference."""
-    surface, parameters, result = held.problem.surface, held.surface_after, []
+    surface, parameters, result = fit.problem.surface, fit.surface_after, []
     for stripe, rows in stripes:
-        base_from_sensor = stripe.base_from_tool @ held.state.tool_from_sensor
-        placed = base_from_sensor.apply(held.state.scale * stripe.points_mm[rows])
+        base_from_sensor = stripe.base_from_tool @ fit.state.tool_from_sensor
+        points_mm = stripe.beside(fit.state.sensor).points_mm[rows]
+        placed = base_from_sensor.apply(fit.state.scale * points_mm)
         result.append(
             StripeResidual(
                 source=stripe.source,
@@ -208,19 +229,16 @@ def stripe_residuals(
 
 
 def posture_results(
-    held: HandEyeSolution, stripes: Sequence[StripeResidual], left_out: dict[int, LeftOut]
+    fit: HandEyeSolution, stripes: Sequence[StripeResidual], left_out: dict[int, LeftOut]
 ) -> tuple[PostureResult, ...]:
     """Summarise every posture that took part.
 
-    The hand-eye and the surface follow the errors that they can explain. With ``P`` of
+    Hand-eye, surface and sensor follow the errors that they can explain. With ``P`` of
     `LinearSolution` and ``D`` the covariance of the scatter alone, the residuals that are left are
-    ``D P e``. The errors ``e`` are those that the solution weighed, and the sensor's, which was
-    held.
+    ``D P e``.
     """
-    observations, plane = held.problem.observations, plane_after(held)
-    errors = held.scatter + held.known
-    if observations.sensor_covariance is not None:
-        errors = errors + held.problem.sensor_covariance(held.placed)
+    observations, plane = fit.problem.observations, plane_after(fit)
+    errors = fit.scatter + fit.known
     results = []
     for number, left in left_out.items():
         rows = observations.posture == number
@@ -228,12 +246,12 @@ def posture_results(
         of_posture = [stripe for stripe in stripes if stripe.posture == name]
         distances = np.concatenate([stripe.residual_mm for stripe in of_posture])
         share = rows * observations.count / observations.count[rows].sum()
-        remaining = share @ held.scatter @ held.linear.projected
+        remaining = share @ fit.scatter @ fit.linear.projected
         sigma_mm = float(np.sqrt(max(remaining @ errors @ remaining, 1e-18)))
         tilt_deg = azimuth_deg = float("nan")
         if plane is not None:
             rotation = observations.rotations[observations.stripe[rows][0]]
-            axis = plane.axes @ rotation @ held.state.tool_from_sensor.rotation[:, 2]
+            axis = plane.axes @ rotation @ fit.state.tool_from_sensor.rotation[:, 2]
             tilt_deg = float(np.degrees(np.arccos(np.clip(abs(axis[2]), 0.0, 1.0))))
             azimuth_deg = float(np.degrees(np.arctan2(axis[1], axis[0])))
         points = observations.points_mm[observations.of_points(observations.posture) == number]
@@ -274,6 +292,9 @@ def plate_facts(checked: CheckedFit, plate: PlateSurface) -> tuple[tuple[str, st
         facts.append(("plane", "as probed, weighted by its uncertainty"))
     if checked.plane_check:
         facts.append(("plane, checked", checked.plane_check))
+    moved = _sensor_in_words(fit)
+    if moved:
+        facts.append(("sensor, moved", moved))
     for component, sigma in zip(fit.components, fit.noise.sigmas, strict=True):
         unit = {"stripe": "times its own sigma"}.get(component.name, "mm")
         if "rotation" in component.name:
@@ -281,6 +302,20 @@ def plate_facts(checked: CheckedFit, plate: PlateSurface) -> tuple[tuple[str, st
         origin = "estimated" if component.is_estimated else "given"
         facts.append((f"scatter: {component.name}", f"{sigma:.3g} {unit} ({origin})"))
     return tuple(facts)
+
+
+def _sensor_in_words(fit: HandEyeSolution) -> str:
+    """By how much the stripes move the sensor's points; empty where it was taken as exact."""
+    observations, step = fit.problem.observations, fit.state.sensor
+    by_sensor, covariance = observations.dpoint_dsensor, observations.sensor_covariance
+    if step is None or by_sensor is None or covariance is None:
+        return ""
+    moved_mm = float(np.sqrt(((by_sensor @ step) ** 2).sum(axis=1).mean()))
+    stated = np.einsum("nip,pq,niq->n", by_sensor, covariance, by_sensor, optimize=True)
+    return (
+        f"its points by {moved_mm:.3f} mm (rms), where its calibration states "
+        f"{float(np.sqrt(stated.mean())):.3f} mm"
+    )
 
 
 def _signed(value: float, digits: int = 6) -> str:
@@ -303,15 +338,13 @@ class AskedDiameter:
 
 
 def sphere_facts(
-    fit: HandEyeSolution, held: HandEyeSolution, asked: AskedDiameter | None
+    fit: HandEyeSolution, joint: JointCovariance, asked: AskedDiameter | None
 ) -> tuple[tuple[str, str], ...]:
     """What the sphere was, as (label, value)."""
     diameter_mm = 2.0 * float(fit.problem.surface.start[3])
-    by_sensor = held.problem.sensor_covariance(held.placed)
-    gain = held.linear.gain
-    covariance = held_covariance(fit, held).matrix + gain @ by_sensor @ gain.T
-    sigma = dict(zip(held.problem.columns.tolist(), np.sqrt(np.diag(covariance)), strict=True))
-    x, y, z, radius_mm = held.state.surface
+    deviations = np.sqrt(np.diag(joint.unknowns))
+    sigma = dict(zip(fit.problem.columns.tolist(), deviations, strict=True))
+    x, y, z, radius_mm = fit.state.surface
     rows = [
         ("Sphere's diameter, given", f"{diameter_mm:g} mm"),
         ("Sphere's centre in Base", f"{x:.3f}, {y:.3f}, {z:.3f} mm"),
@@ -323,8 +356,11 @@ def sphere_facts(
         deviation = 2.0 * sigma[RADIUS_COLUMN]
         text = f"{2.0 * radius_mm:.3f} mm, standard deviation {deviation:.3f} mm"
         rows.append(("Sphere's diameter, solved along", text))
+    moved = _sensor_in_words(fit)
+    if moved:
+        rows.append(("Sensor, moved", moved))
     if SCALE_COLUMN in sigma:
-        text = f"{held.state.scale:.6f}, standard deviation {sigma[SCALE_COLUMN]:.6f}"
+        text = f"{fit.state.scale:.6f}, standard deviation {sigma[SCALE_COLUMN]:.6f}"
         rows.append(("Scale of the sensor's points", text))
     return tuple(rows)
 
@@ -369,13 +405,13 @@ def refuse_diameter(asked: AskedDiameter, fit: HandEyeSolution) -> FitFailure | 
 
 
 def sphere_warnings(
-    held: HandEyeSolution,
+    fit: HandEyeSolution,
     sections: Sequence[CircleSection],
     postures: Sequence[PostureResult],
     asked: AskedDiameter | None,
 ) -> tuple[str, ...]:
     """What is weak about postures, stripes and diameter."""
-    found, weights = [], held.problem.weights
+    found, weights = [], fit.problem.weights
     for k, posture in enumerate(postures):
         if posture.left_out_normalised > OUTLYING:
             weight = 1.0 if weights is None else weights[k]
@@ -397,13 +433,13 @@ def sphere_warnings(
                 f"{section.stripe.source} is weak: its arc of {section.arc_deg:.0f} degrees is "
                 f"short, {usual_deg:.0f} are usual"
             )
-    given_mm = 2.0 * float(held.problem.surface.start[3])
+    given_mm = 2.0 * float(fit.problem.surface.start[3])
     if asked and abs(asked.diameter_mm - given_mm) > WRONG_DIAMETER * asked.sigma_mm:
         found.append(
             f"the points ask for a diameter of {asked}, not of {given_mm:g} mm: check the diameter "
             "and the sensor's scale"
         )
-    if not held.is_settled:
+    if not fit.is_settled:
         found.append("the refinement had not settled when its steps ran out")
     return tuple(found)
 

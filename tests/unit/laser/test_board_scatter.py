@@ -44,10 +44,17 @@ def overrated(board: BoardStripes, factor: float) -> BoardStripes:
     return replace(board, sensor_from_board=claimed)
 
 
-def fits(bow_uu_mm: float, factor: float, options: SheetOptions | None = None) -> list[LaserFit]:
+def fits(
+    bow_uu_mm: float,
+    factor: float,
+    options: SheetOptions | None = None,
+    *,
+    corner_px: float = 0.05,
+    seeds: range = SEEDS,
+) -> list[LaserFit]:
     found = []
-    rig = rig_of_many(bow_uu_mm)
-    for seed in SEEDS:
+    rig = replace(rig_of_many(bow_uu_mm), sigma_corner_px=corner_px)
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         boards = [overrated(board, factor) for board in rig.boards(rig.camera, rng)]
         fit = calibrate_sheets(boards, rig.calibration(rig.camera), options)
@@ -115,6 +122,21 @@ def test_a_bow_is_a_bow_though_the_boards_scatter() -> None:
         sheet = fit.sheets[0].sheet
         truth_mm = 0.15 * (sheet.scale_mm / 20.0) ** 2
         assert abs(sheet.bow_mm[0]) == pytest.approx(truth_mm, rel=0.25)
+
+
+def test_a_faint_bow_shows_though_boards_err_by_thirty_times_their_claims() -> None:
+    """Boards 0.3 px off in their corners that claim 0.01 px; the bow curves stripes by 0.05 mm.
+
+    A sheet that follows the boards' errors, as they claim to have none, hides half of such bows.
+    """
+    seeds = range(4)
+    for fit in fits(0.05, 30.0, corner_px=0.3, seeds=seeds):
+        sheet = fit.sheets[0].sheet
+        assert sheet.is_bowed
+        truth_mm = 0.05 * (sheet.scale_mm / 20.0) ** 2
+        assert abs(sheet.bow_mm[0]) == pytest.approx(truth_mm, rel=0.25)
+    for fit in fits(0.0, 30.0, corner_px=0.3, seeds=seeds):
+        assert not fit.sheets[0].sheet.is_bowed
 
 
 def test_honest_boards_are_charged_nothing() -> None:

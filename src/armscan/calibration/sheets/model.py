@@ -463,7 +463,8 @@ def _bow_or_boards(
             f"a plane does not explain the stripes ({test}), but the boards do not spread enough "
             f"to determine a bow (condition {condition:.2g})"
         )
-    boards_bowed = data.board_scatter(bowed, noise)
+    _, boards = data.likelier(flat, noise, boards)
+    bowed, boards_bowed = data.likelier(bowed, noise, is_bowed=True)
     gain = 2.0 * (boards_bowed.log_likelihood - boards.log_likelihood)
     p_value = float(chdtrc(bowed.n_parameters - flat.n_parameters, max(gain, 0.0)))
     likelihood = f"likelihood ratio {gain:.1f}, p {p_value:.2g}"
@@ -510,6 +511,29 @@ class _OneSheet:
 
     def board_scatter(self, solution: SheetSolution, noise: StripeNoise) -> BoardScatter:
         return board_scatter(self.points, solution, self.errors, noise)
+
+    def likelier(
+        self,
+        solution: SheetSolution,
+        noise: StripeNoise,
+        scatter: BoardScatter | None = None,
+        *,
+        is_bowed: bool = False,
+    ) -> tuple[SheetSolution, BoardScatter]:
+        """The solution, or the one in which boards weigh as they scatter, if that is likelier.
+
+        Where boards err far more than claimed, a solution of the claims follows their errors, and a
+        bow that is there does not show in it.
+        """
+        scatter = scatter or self.board_scatter(solution, noise)
+        wider = replace(self, errors=self.errors.with_boards(scatter.of_boards))
+        other = wider.solve(solution.sheets[0], noise.sigma_factor, is_bowed=is_bowed)
+        if isinstance(other, FitFailure):
+            return solution, scatter
+        found = self.board_scatter(other, noise)
+        if found.log_likelihood > scatter.log_likelihood:
+            return other, found
+        return solution, scatter
 
     def likeliest_scatter(self, solution: SheetSolution, noise: StripeNoise) -> BoardScatter:
         """Of the solution, or of the sheet without one of the boards that seem to stray most.

@@ -4,6 +4,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
@@ -175,3 +176,22 @@ def test_saddle_fit_reports_a_corner_that_is_none() -> None:
     step = np.array([[40.0, 0.0]])
     _, _, is_good = fit_saddles(image, np.array([[100.0, 100.0]]), step, step[:, ::-1])
     assert not is_good.any()
+
+
+@pytest.mark.parametrize("between_edges_deg", [30.0, 40.0, 140.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_bright_corners_of_skewed_edges_are_good_whatever_their_parity(
+    between_edges_deg: float, sign: float
+) -> None:
+    true_px = np.array([40.3, 39.6])
+    angles = np.deg2rad([10.0, 10.0 + between_edges_deg])
+    edges_uv = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    v, u = np.mgrid[:80, :80]
+    away = np.stack([u, v], axis=-1) - true_px
+    beside = away[..., 0, None] * edges_uv[:, 1] - away[..., 1, None] * edges_uv[:, 0]
+    print_ = erf(beside / (np.sqrt(2.0) * 0.8)).prod(axis=-1)
+    image = np.rint(190.0 + 30.0 * sign * print_).astype(np.uint8)
+    steps = 40.0 * edges_uv[:, None, :]
+    points, _, is_good = fit_saddles(image, np.rint(true_px)[None], steps[0], steps[1])
+    assert is_good.all()
+    np.testing.assert_allclose(points[0], true_px, atol=0.05)

@@ -134,7 +134,7 @@ def fit_saddles(
     is_good &= parameters[:, 4] < radius
     turned = np.abs(np.arcsin(np.sin(parameters[:, 2:4] - start[:, 2:4]))).max(axis=1)
     is_good &= turned < np.maximum(_MAX_TURN_RAD, MAX_RESIDUAL_RATIO * np.median(turned))
-    is_good &= parameters[:, 6] * _initial_contrast(levels, offsets, step_x_px, step_y_px) > 0.0
+    is_good &= parameters[:, 6] * start[:, 6] > 0.0
     is_good &= contrast > _MIN_SIGNIFICANCE * np.sqrt(inverse[:, 6, 6])
     is_good &= contrast > _MIN_CONTRAST_RATIO * np.median(contrast)
     is_good &= ~_is_disturbed(np.sqrt(variance), contrast, is_good)
@@ -182,19 +182,10 @@ def _initial(
     edges = _edges(offsets, parameters)
     product = edges[0] * edges[1] * weights
     scale = np.maximum((product * product).sum(axis=1), 1e-9)
+    # sectors of skewed edges are unequal: without the level taken off they would decide the sign
     centred = levels - parameters[:, 5:6]
     parameters[:, 6] = (product * centred).sum(axis=1) / scale
     return parameters
-
-
-def _initial_contrast(
-    levels: FloatArray, offsets: FloatArray, step_x_px: FloatArray, step_y_px: FloatArray
-) -> FloatArray:
-    """Signed contrast (N,) of the quadrants between the steps' directions."""
-    normal_x = np.stack([-step_y_px[:, 1], step_y_px[:, 0]], axis=-1)
-    normal_y = np.stack([-step_x_px[:, 1], step_x_px[:, 0]], axis=-1)
-    sign = np.sign(normal_x @ offsets.T) * np.sign(normal_y @ offsets.T)
-    return np.asarray((sign * levels).sum(axis=1))
 
 
 def _edges(offsets: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -37,6 +37,7 @@ from armscan.storage.images import ImageOptions, check_same_size, read_exposures
 from armscan.storage.observations import pack_observations, read_observations
 from armscan.storage.recording import read_recording, recording_tables
 from armscan.thesis.ellipse import with_printed_centres
+from armscan.vision.targets.detect import settle_target
 from armscan.vision.targets.target import (
     Charuco,
     Chessboard,
@@ -105,6 +106,7 @@ def calibrate_camera(
     check_same_size(read.exposures)
     sources = [exposure.source for exposure in read.exposures]
     options = replace(options, leave_out=named_by(options.leave_out, sources, "--leave-out"))
+    plate = settle_target(read.exposures, plate)
     found = find_targets(read.exposures, plate, cache=job.cache, progress=job.progress)
     run = calibrate_camera_from_found(found, options, progress=job.progress)
     inputs = (*read.paths, *read.tables)

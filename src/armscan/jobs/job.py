@@ -25,7 +25,7 @@ from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.cloud import PointCloud
 from armscan.report.inspection.delivery import Delivery, delivery_of, pdf_bytes, require_pdf
 from armscan.report.page import Page, render_page
-from armscan.report.quantity import Summary, sentences, summary_json
+from armscan.report.quantity import Summary, fact, sentences, summary_json
 from armscan.storage.codec import parse_json
 from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.documents import new_provenance
@@ -37,6 +37,7 @@ from armscan.storage.files import (
     sole_writer,
     write_files,
 )
+from armscan.vision.targets.target import Charuco, Target, describe_target
 
 T = TypeVar("T")
 
@@ -395,3 +396,11 @@ def solved(result: T | FitFailure, where: object = "") -> T:
     if isinstance(result, FitFailure):
         raise EstimationError(result.reason, where=str(where), remedy=result.remedy)
     return result
+
+
+def with_old_layout(summary: Summary, target: Target) -> Summary:
+    """The summary that says so where the board has the old layout; a person may not have known."""
+    if not (isinstance(target, Charuco) and target.layout == "old"):
+        return summary
+    told = fact("target", describe_target(target))
+    return replace(summary, quantities=(*summary.quantities, told))

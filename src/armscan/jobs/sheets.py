@@ -17,7 +17,7 @@ from armscan.calibration.sheets.result import (
 )
 from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.jobs.job import Job, solved
+from armscan.jobs.job import Job, solved, with_old_layout
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, pair_by_view, pair_exposures
@@ -56,6 +56,7 @@ from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, read_exposures
 from armscan.storage.observations import pack_board_stripes, read_observations
 from armscan.storage.recording import read_recording, recording_tables
+from armscan.vision.targets.detect import settle_target
 from armscan.vision.targets.target import Target, parse_target
 
 REQUESTED = "left out by request"
@@ -126,6 +127,7 @@ def calibrate_sheets(
     camera = read_cameras(camera_file)
     read = _read(images, image_options, is_stereo=isinstance(camera, StereoCalibration))
     cache = job.cache
+    board = settle_target(read.exposures, board)
     fit = calibrate_sheets_from_pairs(
         read.pairs, board, camera, options=options, cache=cache, progress=job.progress
     )
@@ -165,7 +167,7 @@ def calibrate_sheets(
     document = sensor_document(fit.to_calibration(provenance), (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     summary = sheets_summary(fit, written, read.warnings, is_simulated=is_simulated)
-    return replace(summary, forced=provenance.forced)
+    return replace(with_old_layout(summary, board), forced=provenance.forced)
 
 
 def calibrate_sheets_from_file(

@@ -14,7 +14,7 @@ from armscan.calibration.cameras.pairs import StereoOptions
 from armscan.calibration.cameras.stereo_result import PairFit, reasons_to_refuse
 from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.jobs.job import Job
+from armscan.jobs.job import Job, with_old_layout
 from armscan.models.two_views import STEREO_PARAMETER_NAMES
 from armscan.pipeline.cameras import (
     ExposedPair,
@@ -43,6 +43,7 @@ from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording
+from armscan.vision.targets.detect import settle_target
 from armscan.vision.targets.target import parse_target
 
 
@@ -103,6 +104,7 @@ def calibrate_stereo(
     left_out = named_by(options.leave_out, list(by_source), "--leave-out")
     options = replace(options, leave_out=left_out)
     exposures = list(by_source.values())
+    plate = settle_target(exposures, plate)
     found = find_targets(exposures, plate, cache=job.cache, progress=job.progress)
     run = calibrate_stereo_from_found(
         read.pairs, found, plate, options, given, progress=job.progress
@@ -129,7 +131,7 @@ def calibrate_stereo(
     document = stereo_document(calibration, (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     summary = _stereo_summary(run, written, is_simulated=read.is_simulated)
-    return replace(summary, forced=provenance.forced)
+    return replace(with_old_layout(summary, plate), forced=provenance.forced)
 
 
 def _given(left: Path | None, right: Path | None) -> Given | None:

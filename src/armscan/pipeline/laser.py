@@ -47,7 +47,7 @@ from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.observations import Observations
 from armscan.vision.stripe.image import SIGMA_RANGE_PX, StripeOptions
 from armscan.vision.targets.circle_grid import correct_centres
-from armscan.vision.targets.detect import numberings, renumbered
+from armscan.vision.targets.detect import numberings, renumbered, settle_target
 from armscan.vision.targets.repeated_print import does_repeat, predict_print
 from armscan.vision.targets.target import CircleEdges, Target, TargetView
 
@@ -122,6 +122,7 @@ def calibrate_sheets_from_pairs(
     for pair in pairs:
         images = [image for image in pair if image is not None]
         check_sizes(images, cameras.model(pair[0].camera))
+    target = settle_target((image for pair in pairs for image in pair if image is not None), target)
     places: dict[str, BoardPlacement] = {}
     answers: list[TargetView | FitFailure] = []
     n_places = len({placement_of(pair) for pair in pairs})

@@ -19,7 +19,7 @@ from armscan.records.profile import Profile
 from armscan.storage.detection_cache import DetectionCache, detection_key
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
-from armscan.vision.targets.detect import detect_target
+from armscan.vision.targets.detect import detect_target, settle_target
 from armscan.vision.targets.target import (
     Charuco,
     OtherCountSeen,
@@ -171,7 +171,9 @@ def find_targets(
     Parameters
     ----------
     exposures
-        Taken one after the other, so that a generator needs to hold only a few at a time.
+        Taken one after the other, so that a generator needs to hold only a few at a time. What the
+        target's name leaves open (`settle_target`) is told from all of a sequence, and from each
+        exposure by itself of a generator.
     target
         What to look for.
     cache
@@ -180,6 +182,8 @@ def find_targets(
         Is told of each exposure.
     """
     total = len(exposures) if isinstance(exposures, Sized) else 0
+    if isinstance(exposures, Sequence):
+        target = settle_target(exposures, target)
     views: list[TargetView] = []
     not_found: list[tuple[str, str]] = []
     answers: list[TargetView | FitFailure] = []

@@ -27,6 +27,7 @@ from armscan.vision.targets.target import (
         ("chessboard:11x6:0.05mm", Chessboard(11, 6, 0.05)),
         ("charuco:10x7:4:3:DICT_4X4_50", Charuco(10, 7, 4.0, 3.0, "DICT_4X4_50")),
         ("charuco:10x7:4:3:4x4_50", Charuco(10, 7, 4.0, 3.0, "DICT_4X4_50")),
+        ("charuco:10x6:4:3:4x4_50:old", Charuco(10, 6, 4.0, 3.0, "DICT_4X4_50", "old")),
     ],
 )
 def test_right_spellings(text: str, target: object) -> None:
@@ -58,6 +59,8 @@ def test_every_example_is_right(kind: str) -> None:
         ("circle-grid:11x9:ten", "no pitch"),
         ("charuco:10x7:4:3", "needs 4 fields"),
         ("charuco:10x7:3:4:DICT_4X4_50", "does not fit"),
+        ("charuco:10x6:4:3:DICT_4X4_50:older", "no layout"),
+        ("chessboard:11x6:13:old", "needs 2 fields"),
         ("charuco:10x7:4:3:DICT_9X9_50", "no ArUco dictionary"),
         ("charuco:20x17:4:3:DICT_4X4_50", "needs 170 markers"),
     ],
@@ -76,7 +79,7 @@ def test_a_length_that_was_meant_in_metres_is_asked_about(text: str) -> None:
     assert f"{text.split(':')[2]}m " in str(caught.value)
 
 
-@pytest.mark.parametrize("text", EXAMPLES.values())
+@pytest.mark.parametrize("text", [*EXAMPLES.values(), "charuco:10x6:4:3:DICT_4X4_50:new"])
 def test_a_formatted_target_is_read_back(text: str) -> None:
     assert parse_target(format_target(parse_target(text))) == parse_target(text)
 

@@ -1,52 +1,191 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find a target in an exposure; ChArUco boards; targets that look the same after a turn."""
+"""Find a target in an exposure; ChArUco boards; targets that look the same after a turn.
+
+A ChArUco board of an even count of rows has its markers on other squares in OpenCV's old layout
+than in the new one. If then the count of columns is odd, both number alike but for a shift by one
+column: only markers that begin or end a row tell them apart.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray, IntArray, apply_homography
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, apply_homography
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.chessboard import detect_chessboard
 from armscan.vision.targets.circle_grid import detect_circle_grid
-from armscan.vision.targets.saddle import WINDOW_FRACTION, fit_saddles, grey_channels, to_grey8
-from armscan.vision.targets.target import Charuco, Chessboard, CircleGrid, Target, TargetView
+from armscan.vision.targets.saddle import (
+    WINDOW_FRACTION,
+    Grey8,
+    RawGrey,
+    fit_saddles,
+    grey_channels,
+    to_grey8,
+)
+from armscan.vision.targets.target import (
+    Charuco,
+    Chessboard,
+    CircleGrid,
+    Target,
+    TargetView,
+    format_target,
+)
 
 MIN_CORNERS = 6
 """Fewer corners make no view: four fix a homography and leave nothing to judge it by."""
+DECISIVE = 4
+"""So many more neighbours at their places prove a layout; a misread marker has none."""
 _CLEARANCE = 0.85
+_FITTING = 0.75
+"""Least share of neighbours at their places: of a wrong count half may be."""
+_NEAR = 0.5
+"""Farthest that a neighbour lies off its place, in squares; the nearest other place is at 1.4."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Markers:
+    """Markers read in an image.
+
+    ``ids``: (N,) numbers. ``corners_px``: (N, 4, 2) from the first corner, clockwise on the print.
+    """
+
+    ids: IntArray
+    corners_px: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Neighbours that both were read on a board, and how many of them lie where it says."""
+
+    board: Charuco
+    n_agreeing: int
+    n_neighbours: int
+
+    @property
+    def is_fitting(self) -> bool:
+        return 0 < _FITTING * self.n_neighbours <= self.n_agreeing
 
 
 def detect_charuco(exposure: Exposure, target: Charuco) -> TargetView | FitFailure:
-    """Find a ChArUco board, whole or in part; the markers number its corners."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
-    size = (target.columns, target.rows)
-    board = cv2.aruco.CharucoBoard(size, target.square_mm, target.marker_mm, dictionary)
-    detector = cv2.aruco.CharucoDetector(board)
-    n_markers = 0
-    n_corners = 0
+    """Find a ChArUco board, whole or in part; the markers number its corners.
+
+    A board that may have either layout is refused where the image does not tell which it has.
+    """
+    n_most, failure = -1, FitFailure("")
     for grey in grey_channels(exposure):
-        corners, ids, _, marker_ids = detector.detectBoard(to_grey8(grey, exposure.full_scale))
-        n_markers = max(n_markers, 0 if marker_ids is None else len(marker_ids))
-        if ids is None or len(ids) < MIN_CORNERS:
-            continue
+        grey8 = to_grey8(grey, exposure.full_scale)
+        markers = _read_markers(grey8, target)
+        found = _detect_in(exposure, target, (grey, grey8), markers)
+        if isinstance(found, TargetView):
+            return found
+        if len(markers.ids) > n_most:
+            n_most, failure = len(markers.ids), found
+    return failure
+
+
+def settle_layout(exposures: Iterable[Exposure], target: Charuco) -> Charuco:
+    """The board with the layout that the first exposures show that tell; as it is if none does."""
+    if not target.has_two_layouts or target.layout != "either":
+        return target
+    lead = 0
+    for exposure in exposures:
+        lead += _lead_of_old(exposure, target)
+        if abs(lead) >= DECISIVE:
+            return replace(target, layout="old" if lead > 0 else "new")
+    return target
+
+
+def _lead_of_old(exposure: Exposure, target: Charuco) -> int:
+    """By how many neighbours the old layout agrees better than the new; 0 if neither fits."""
+    lead = 0
+    for grey in grey_channels(exposure):
+        markers = _read_markers(to_grey8(grey, exposure.full_scale), target)
+        new, old = (_fit(markers, board) for board in _layouts(target))
+        seen = old.n_agreeing - new.n_agreeing if old.is_fitting or new.is_fitting else 0
+        lead = max(lead, seen, key=abs)
+        if abs(lead) >= DECISIVE:
+            break
+    return lead
+
+
+def _read_markers(grey8: Grey8, target: Charuco) -> Markers:
+    detector = cv2.aruco.ArucoDetector(_dictionary(target))
+    corners, ids, _ = detector.detectMarkers(grey8)
+    if ids is None or len(ids) == 0:
+        return Markers(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
+    return Markers(
+        np.asarray(ids, dtype=np.int64).ravel(),
+        np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2),
+    )
+
+
+def _dictionary(target: Charuco) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+
+
+def _detect_in(
+    exposure: Exposure, target: Charuco, grey: tuple[RawGrey, Grey8], markers: Markers
+) -> TargetView | FitFailure:
+    """The board in one grey image, raw and in 8 bits, whose markers are known."""
+    if len(markers.ids) == 0:
+        return FitFailure(
+            f"{exposure.source}: no marker of {target.dictionary} in view",
+            "check the dictionary's name, and that the print is neither mirrored nor blurred",
+        )
+    fitting = _fitting(markers, _layouts(target))
+    asked = _of_layout(fitting, target)
+    if not asked and _fit(markers, target).n_neighbours > 0:
+        return _misfit(exposure, target, markers, fitting)
+    view = _corners(exposure, (asked or [target])[0], grey, markers)
+    if isinstance(view, TargetView) and len(asked) > 1:
+        return FitFailure(
+            f"{exposure.source}: the markers in view lie alike in OpenCV's new and old layout",
+            "show a whole row of the board in an image, or write :new or :old after the dictionary",
+        )
+    return view
+
+
+def _of_layout(boards: list[Charuco], target: Charuco) -> list[Charuco]:
+    if target.layout == "either" or not target.has_two_layouts:
+        return boards
+    return [board for board in boards if board.layout == target.layout]
+
+
+def _corners(
+    exposure: Exposure, board: Charuco, grey: tuple[RawGrey, Grey8], markers: Markers
+) -> TargetView | FitFailure:
+    printed = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows), board.square_mm, board.marker_mm, _dictionary(board)
+    )
+    printed.setLegacyPattern(board.layout == "old")
+    raw, grey8 = grey
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(
+        grey8,
+        markerCorners=list(markers.corners_px.astype(np.float32)[:, None]),
+        markerIds=markers.ids.astype(np.int32)[:, None],
+    )
+    n_corners = 0
+    if ids is not None and len(ids) >= MIN_CORNERS:
         index = np.asarray(ids, dtype=np.int64).ravel()
         rough_px = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-        steps = _steps(target, index, rough_px)
-        if steps is None:
-            continue
-        refined, covariance, is_good = fit_saddles(grey, rough_px, *steps)
-        n_corners = max(n_corners, int(is_good.sum()))
-        if n_corners < MIN_CORNERS:
-            continue
-        found, number = refined[is_good], index[is_good]
-        return TargetView.of_image(exposure, target, number, found, covariance[is_good])
-    return _failure(exposure, target, n_markers, n_corners)
+        steps = _steps(board, index, rough_px)
+        if steps is not None:
+            refined, covariance, is_good = fit_saddles(raw, rough_px, *steps)
+            n_corners = int(is_good.sum())
+            if n_corners >= MIN_CORNERS:
+                found, number = refined[is_good], index[is_good]
+                return TargetView.of_image(exposure, board, number, found, covariance[is_good])
+    return FitFailure(
+        f"{exposure.source}: {len(markers.ids)} markers of {board.dictionary} and {n_corners} "
+        f"corners were read, at least {MIN_CORNERS} corners are needed",
+        "check columns, rows and lengths of the board, and show more of it",
+    )
 
 
 def _steps(
@@ -66,17 +205,60 @@ def _steps(
     return along_x, along_y
 
 
-def _failure(exposure: Exposure, target: Charuco, n_markers: int, n_corners: int) -> FitFailure:
-    if n_markers == 0:
-        return FitFailure(
-            f"{exposure.source}: no marker of {target.dictionary} in view",
-            "check the dictionary's name, and that the print is neither mirrored nor blurred",
-        )
-    return FitFailure(
-        f"{exposure.source}: {n_markers} markers of {target.dictionary} and {n_corners} corners "
-        f"were read, at least {MIN_CORNERS} corners are needed",
-        "check columns, rows and lengths of the board, and show more of it",
+def _layouts(target: Charuco) -> tuple[Charuco, ...]:
+    """The board in the new and in the old layout; once where these are the same."""
+    if not target.has_two_layouts:
+        return (target,)
+    return replace(target, layout="new"), replace(target, layout="old")
+
+
+def _fitting(markers: Markers, boards: Iterable[Charuco]) -> list[Charuco]:
+    """Those of the boards that the markers fit best, and no better than any other of them."""
+    fits = [_fit(markers, board) for board in boards]
+    best = max(fit.n_agreeing for fit in fits)
+    return [fit.board for fit in fits if fit.is_fitting and best - fit.n_agreeing < DECISIVE]
+
+
+def _fit(markers: Markers, board: Charuco) -> _Fit:
+    """Where each marker says that its nearest neighbours lie, and whether they do.
+
+    Affine, of one marker alone: that holds under any lens and for boards that are bent.
+    """
+    squares = board.marker_squares
+    is_known = markers.ids < len(squares)
+    place = squares[markers.ids[is_known]]
+    corners = markers.corners_px[is_known]
+    right = 0.5 * (corners[:, 1] - corners[:, 0] + corners[:, 2] - corners[:, 3])
+    down = 0.5 * (corners[:, 3] - corners[:, 0] + corners[:, 2] - corners[:, 1])
+    per_square = np.stack([right, down], axis=-1) * (board.square_mm / board.marker_mm)
+    is_seen = np.abs(np.linalg.det(per_square)) > 1.0
+    place, centre, per_square = place[is_seen], corners[is_seen].mean(axis=1), per_square[is_seen]
+    apart = place[None, :, :] - place[:, None, :]
+    is_neighbour: BoolArray = np.abs(apart).sum(axis=-1) == 2
+    first, second = np.nonzero(is_neighbour)
+    away = centre[second] - centre[first]
+    squares_away = np.linalg.solve(per_square[first], away[:, :, None])[:, :, 0]
+    off = np.hypot(*(squares_away - apart[first, second]).T)
+    return _Fit(board, int((off < _NEAR).sum()), len(first))
+
+
+def _misfit(
+    exposure: Exposure, target: Charuco, markers: Markers, fitting: list[Charuco]
+) -> FitFailure:
+    """The markers contradict the board; say which they fit."""
+    swapped = replace(target, columns=target.rows, rows=target.columns, layout="either")
+    others = fitting or _fitting(markers, _layouts(swapped))
+    reason = (
+        f"{exposure.source}: {len(markers.ids)} markers of {target.dictionary} were read, which do "
+        f"not lie as on a board of {target.columns} x {target.rows} squares"
     )
+    if fitting:
+        reason += f" in OpenCV's {target.layout} layout"
+    if not others:
+        return FitFailure(reason, "check columns, rows and lengths of the board")
+    right = others[0] if len(others) == 1 else swapped
+    text = format_target(right)
+    return FitFailure(f"{reason}, but as on {text}", f"write {text}")
 
 
 SMALLEST_IMAGE_PX = 32
@@ -107,6 +289,14 @@ def detect_target(exposure: Exposure, target: Target) -> TargetView | FitFailure
     if isinstance(target, Chessboard):
         return detect_chessboard(exposure, target)
     return detect_charuco(exposure, target)
+
+
+def settle_target(exposures: Iterable[Exposure], target: Target) -> Target:
+    """The target with what its name leaves open, told by the first exposures that show it.
+
+    That is the layout of a ChArUco board; the target as it is where none of the exposures tells.
+    """
+    return settle_layout(exposures, target) if isinstance(target, Charuco) else target
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -81,6 +81,11 @@ class Chessboard:
         return (1, 2, 3) if self.columns == self.rows and self.columns % 2 == 0 else (2,)
 
 
+CharucoLayout = Literal["either", "new", "old"]
+"""On which squares of a ChArUco board its markers lie: in the new layout (OpenCV since 4.6) the
+first square of the board is dark, in the old one that of the last row. Either: the image tells."""
+
+
 @dataclass(frozen=True, slots=True)
 class Charuco:
     """ChArUco board, counted in squares; its points are the inner corners."""
@@ -90,7 +95,21 @@ class Charuco:
     square_mm: float
     marker_mm: float
     dictionary: str
+    layout: CharucoLayout = "either"
     symmetric_turns: ClassVar[tuple[int, ...]] = ()
+
+    @property
+    def has_two_layouts(self) -> bool:
+        """Whether old and new layout differ."""
+        return self.rows % 2 == 0
+
+    @property
+    def marker_squares(self) -> IntArray:
+        """(M, 2) column and row of the square of each marker; of the new layout if it is open."""
+        j, i = np.mgrid[: self.rows, : self.columns]
+        is_old = self.has_two_layouts and self.layout == "old"
+        row, column = np.nonzero((i + j) % 2 == (0 if is_old else 1))
+        return np.stack([column, row], axis=-1)
 
     @property
     def points_board_mm(self) -> FloatArray:
@@ -129,8 +148,9 @@ def parse_target(text: str) -> Target:
     text
         ``circle-grid:COLSxROWS:PITCH_MM``, ``asymmetric-circle-grid:COLSxROWS:PITCH_MM``,
         ``chessboard:COLSxROWS:SQUARE_MM`` (inner corners) or
-        ``charuco:COLSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY`` (squares). A length is in mm unless it
-        bears a unit: ``13``, ``13mm``, ``1.3cm``, ``0.013m``.
+        ``charuco:COLSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY`` (squares), which ``:old`` or ``:new``
+        may follow. A length is in mm unless it bears a unit: ``13``, ``13mm``, ``1.3cm``,
+        ``0.013m``.
 
     Raises
     ------
@@ -145,7 +165,8 @@ def parse_target(text: str) -> Target:
             remedy=f"write for example {EXAMPLES['chessboard']}",
         )
     n_fields = 4 if kind == "charuco" else 2
-    if len(fields) != n_fields:
+    has_layout = kind == "charuco" and len(fields) == n_fields + 1
+    if len(fields) != n_fields and not has_layout:
         raise _wrong(text, kind, f"needs {n_fields} fields after '{kind}', has {len(fields)}")
     columns, rows = _counts(text, kind, fields[0])
     if kind == "chessboard":
@@ -167,8 +188,9 @@ def format_target(target: Target) -> str:
     """The specification that `parse_target` reads as this target."""
     counts = f"{target.columns}x{target.rows}"
     if isinstance(target, Charuco):
-        name = target.dictionary
-        return f"charuco:{counts}:{target.square_mm:.12g}:{target.marker_mm:.12g}:{name}"
+        text = f"charuco:{counts}:{target.square_mm:.12g}:{target.marker_mm:.12g}"
+        layout = "" if target.layout == "either" else f":{target.layout}"
+        return f"{text}:{target.dictionary}{layout}"
     if isinstance(target, CircleGrid):
         kind = "asymmetric-circle-grid" if target.is_asymmetric else "circle-grid"
         return f"{kind}:{counts}:{target.pitch_mm:.12g}"
@@ -183,7 +205,9 @@ def describe_target(target: Target) -> str:
         return f"{target.columns} x {target.rows} circles, first to last centre {size}"
     less = 1 if isinstance(target, Charuco) else 0
     counts = f"{target.columns - less} x {target.rows - less}"
-    return f"{counts} inner corners, first to last {size}"
+    is_old = isinstance(target, Charuco) and target.layout == "old"
+    layout = ", old layout (OpenCV before 4.6)" if is_old else ""
+    return f"{counts} inner corners, first to last {size}{layout}"
 
 
 def _charuco(text: str, columns: int, rows: int, fields: list[str]) -> Charuco:
@@ -201,7 +225,18 @@ def _charuco(text: str, columns: int, rows: int, fields: list[str]) -> Charuco:
     n_known = len(cv2.aruco.getPredefinedDictionary(code).bytesList)
     if n_markers > n_known:
         raise _wrong(text, kind, f"the board needs {n_markers} markers, {name} has {n_known}")
-    return Charuco(columns, rows, square_mm, marker_mm, name)
+    return Charuco(columns, rows, square_mm, marker_mm, name, _layout(text, fields[4:]))
+
+
+def _layout(text: str, fields: list[str]) -> CharucoLayout:
+    match [field.lower() for field in fields]:
+        case []:
+            return "either"
+        case ["old"]:
+            return "old"
+        case ["new"]:
+            return "new"
+    raise _wrong(text, "charuco", f"'{fields[0]}' is no layout: old or new, or leave it out")
 
 
 def _counts(text: str, kind: str, field: str) -> tuple[int, int]:

@@ -41,7 +41,7 @@ from armscan.calibration.hand_eye.estimate import (
     Problem,
     estimate,
     estimate_robustly,
-    held_covariance,
+    joint_covariance,
 )
 from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
@@ -235,10 +235,10 @@ class Stated:
 
     @staticmethod
     def of_solution(found: HandEyeSolution) -> Stated:
-        stated = held_covariance(found, found)
+        stated = joint_covariance(found)
         pose = found.state.tool_from_sensor
         arm = noise_model.arm_noise(found.components, found.noise.sigmas)
-        covariance = stated.matrix[:6, :6]
+        covariance = stated.unknowns[:6, :6]
         return Stated(pose, covariance, stated.region_factor, found.is_settled, arm)
 
     def outcome(self, drawn: Drawn, bound: FloatArray | None, truth: Pose[Tool, Sensor]) -> Outcome:

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.estimate import Problem, estimate, held_covariance
+from armscan.calibration.hand_eye.estimate import Problem, estimate, joint_covariance
 from armscan.calibration.hand_eye.noise import estimate_noise
 from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
@@ -94,8 +94,8 @@ def calibrated(
     found = estimate(problem, problem.start(TOOL_FROM_SENSOR))
     if found is None:
         return None
-    stated = held_covariance(found, found)
-    return found.state.tool_from_sensor, stated.matrix[:6, :6], stated.region_factor
+    stated = joint_covariance(found)
+    return found.state.tool_from_sensor, stated.unknowns[:6, :6], stated.region_factor
 
 
 def plain_study(rig: PlateRig, runs: int, seed: int) -> tuple[FloatArray, int]:

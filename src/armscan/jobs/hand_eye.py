@@ -296,10 +296,7 @@ def calibrate_hand_eye(
     job.progress(ProgressEvent("solve", n_steps, n_steps))
     fit = replace(fit, warnings=(*inputs.warnings, *fit.warnings))
     provenance = job.provenance(inputs.files, used, parents=parents, warnings=fit.warnings)
-    sensor = inputs.sensor
-    if sensor is not None:
-        sensor = fit.sensor_after(sensor, provenance)
-    scanner = ScannerCalibration(sensor, fit.calibration, provenance)
+    scanner = fit.scanner(inputs.sensor, provenance)
     stripes = tuple(stripe.beside(fit.sensor_step) for stripe in inputs.stripes)
     page = hand_eye_page(
         fit,

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
@@ -122,7 +122,7 @@ WINDOW_REMEDY = (
 )
 
 
-def check_sizes(exposures: Sequence[Exposure], camera: CameraModel) -> None:
+def check_sizes(exposures: Iterable[Exposure], camera: CameraModel) -> None:
     """Raise `InputError` if an exposure is not of the camera's sensor.
 
     A window may be anywhere on the sensor; an image without window must have its full size.

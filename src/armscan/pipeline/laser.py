@@ -120,9 +120,8 @@ def calibrate_sheets_from_pairs(
     options = options or LaserOptions()
     cameras = HeadCameras.of(camera)
     for pair in pairs:
-        images = [image for image in pair if image is not None]
-        check_sizes(images, cameras.model(pair[0].camera))
-    target = settle_target((image for pair in pairs for image in pair if image is not None), target)
+        check_sizes(filter(None, pair), cameras.model(pair[0].camera))
+    target = settle_target((image for pair in pairs for image in filter(None, pair)), target)
     places: dict[str, BoardPlacement] = {}
     answers: list[TargetView | FitFailure] = []
     n_places = len({placement_of(pair) for pair in pairs})

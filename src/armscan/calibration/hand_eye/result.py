@@ -35,6 +35,7 @@ from armscan.models.calibration import (
     HandEyeCalibration,
     HandEyeDiagnostics,
     Provenance,
+    ScannerCalibration,
     SensorCalibration,
 )
 
@@ -149,6 +150,13 @@ class HandEyeFit(ArrayRecord):
         if self.sensor_step is None or self.sensor_covariance is None:
             return sensor
         return sensor.updated(self.sensor_step, self.sensor_covariance, provenance)
+
+    def scanner(
+        self, sensor: SensorCalibration | None, provenance: Provenance
+    ) -> ScannerCalibration:
+        """Hand-eye and sensor, of ``sensor`` as it was given; None where points were delivered."""
+        moved = None if sensor is None else self.sensor_after(sensor, provenance)
+        return ScannerCalibration(moved, self.calibration, provenance)
 
     @property
     def beside_given_sensor(self) -> HandEyeCalibration:

@@ -121,7 +121,6 @@ def calibrate_sheets_from_pairs(
     cameras = HeadCameras.of(camera)
     for pair in pairs:
         check_sizes(filter(None, pair), cameras.model(pair[0].camera))
-    target = settle_target((image for pair in pairs for image in filter(None, pair)), target)
     places: dict[str, BoardPlacement] = {}
     answers: list[TargetView | FitFailure] = []
     n_places = len({placement_of(pair) for pair in pairs})
@@ -369,6 +368,7 @@ def find_placements(
 
     The images without laser are tried first.
     """
+    target = settle_target((image for pair in pairs for image in filter(None, pair)), target)
     groups: dict[str, dict[int, list[Exposure]]] = {}
     for name, tried in (
         *((placement_of(pair), pair[1]) for pair in pairs if pair[1] is not None),

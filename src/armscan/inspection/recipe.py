@@ -161,7 +161,7 @@ class PartQuantity:
         Of the feature or face.
     kind
         ``feature``: its diameter or half angle, a form error, relation or step; ``mean``, ``spot``:
-        of a face, its mean deviation and that of the spot that deviates most.
+        of a face, its mean deviation and that of the spot that decides.
     unit
         mm or degrees.
     value, u_value

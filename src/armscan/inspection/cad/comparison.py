@@ -152,8 +152,8 @@ class FaceComparison:
         U (k = 2) of the mean, of the points' errors or of how far exposures disagree, the larger;
         NaN where not known, and of a face without points.
     spot_mm, u_spot_mm, spot_place_mm
-        Median deviation of the spot that deviates most, its U, and (3,) where in Cad it is; NaN
-        where no spot has enough points.
+        Median deviation of the spot that decides, of those the one that deviates most, its U, and
+        (3,) where in Cad it is; NaN where no spot has enough points.
     tolerance_mm
         Of the face; NaN for none.
     decision
@@ -569,18 +569,30 @@ def _decisions(d: FloatArray, limit: FloatArray, u: FloatArray) -> IntArray:
     return np.where(np.isfinite(limit), decided, -1).astype(np.int64)
 
 
+def _deciding(spots: _Spots, local: IntArray) -> int:
+    """Row of the spot that decides a face, -1 without spots; ``local`` are the spots' decisions.
+
+    Of the spots of the worst decision it is the one that deviates most. A spot that fails, but was
+    shown by no two exposures, comes after those that were.
+    """
+    if not len(spots):
+        return -1
+    is_excused = spots.is_once & (local == FAIL)
+    return int(np.lexsort((np.abs(spots.deviation_mm), ~is_excused, local))[-1])
+
+
 def _face(
     name: str, limit: float, d: FloatArray, u_mean: float, spots: _Spots, *, is_once: bool
 ) -> FaceComparison:
     statistics = deviation_statistics(d)
-    worst = int(np.argmax(np.abs(spots.deviation_mm))) if len(spots) else -1
+    local = _decisions(spots.deviation_mm, np.full(len(spots), limit), spots.u_mm)
+    shown = _deciding(spots, local)
     decision: Decision | Literal["", "not seen"] = ""
     is_excused = False
-    if worst < 0:
+    if shown < 0:
         decision = "not seen"
     elif math.isfinite(limit):
         whole = DECISIONS.index(OF_VALIDITY[judge(statistics.mean_mm, limit, u_mean)])
-        local = _decisions(spots.deviation_mm, np.full(len(spots), limit), spots.u_mm)
         fails = np.array([whole, *local]) == FAIL
         once = np.array([is_once, *spots.is_once])
         is_excused = bool(fails.any() and once[fails].all())
@@ -590,9 +602,9 @@ def _face(
         name=name,
         statistics=statistics,
         u_mean_mm=u_mean if statistics.n else math.nan,
-        spot_mm=float(spots.deviation_mm[worst]) if worst >= 0 else math.nan,
-        u_spot_mm=float(spots.u_mm[worst]) if worst >= 0 else math.nan,
-        spot_place_mm=spots.place_mm[worst] if worst >= 0 else np.full(3, math.nan),
+        spot_mm=float(spots.deviation_mm[shown]) if shown >= 0 else math.nan,
+        u_spot_mm=float(spots.u_mm[shown]) if shown >= 0 else math.nan,
+        spot_place_mm=spots.place_mm[shown] if shown >= 0 else np.full(3, math.nan),
         tolerance_mm=limit,
         decision=decision,
         is_seen_once=is_excused,

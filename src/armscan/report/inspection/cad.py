@@ -341,8 +341,8 @@ def cad_page(
     limit = colour_limit_mm(found)
     definitions = tuple((label, meaning) for label, meaning in DEFINITIONS.values())
     spot = (
-        ("spot", f"median deviation of the spot that deviates most, of all spots {_width(found)} "
-         "wide with ten points or more"),
+        ("spot", "median deviation of the spot that decides, of those of the worst decision the "
+         f"one that deviates most; of all spots {_width(found)} wide with ten points or more"),
         ("U", "expanded uncertainty, k = 2: of the points, what exposures have in common, and the "
          "alignment; of a face's mean how far exposures disagree, where that is more"),
     )  # fmt: skip

@@ -239,7 +239,7 @@ def _chart_sections(
         charts = tuple(trend_chart(rows, name, ("feature",)) for name in limited)
         found.append(Section("Trend of features", (Text(COLOURS_TEXT), Gallery(charts, 420))))
     words = COLOURS_TEXT + (
-        "Of a face the mean is filled and the spot that deviates most hollow; faces that come "
+        "Of a face the mean is filled and the spot that decides hollow; faces that come "
         "nearest to their limits stand first."
     )
     for title, names, is_folded in (

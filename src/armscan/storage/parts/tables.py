@@ -111,7 +111,7 @@ def _listed(names: tuple[str, ...], most: int = 12) -> str:
 
 
 def face_table_bytes(found: CadComparison) -> bytes:
-    """CSV of the faces: statistics, spot that deviates most, tolerance and decision."""
+    """CSV of the faces: statistics, spot that decides, tolerance and decision."""
     columns: dict[str, tuple[str, ...]] = {
         "face": tuple(one.name for one in found.faces),
         "n": tuple(str(one.statistics.n) for one in found.faces),

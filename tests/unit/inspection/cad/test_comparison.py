@@ -99,6 +99,24 @@ def test_a_dent_of_a_spot_fails_a_face_whose_mean_passes() -> None:
     assert top.decision == "fail"
 
 
+def test_the_spot_shown_is_the_one_that_decides() -> None:
+    """A deep spot that is well known passes, a shallow one that scatters is undecided."""
+    points = top_points(20_000)
+    deep, rough = (
+        np.abs(points[:, :2] - place).max(axis=1) < 2.5 for place in ([15.0, 20.0], [45.0, 20.0])
+    )
+    points[deep, 2] -= 0.12
+    points[rough, 2] -= 0.09 + np.random.default_rng(4).normal(0.0, 0.25, int(rough.sum()))
+    found = compared(points, sigma=0.005, tolerance_mm=0.15)
+    top = next(one for one in found.faces if one.statistics.n)
+    assert top.decision == "undecided"
+    assert np.abs(top.spot_place_mm[:2] - [45.0, 20.0]).max() < 3.5
+    assert abs(abs(top.spot_mm) - 0.15) < top.u_spot_mm
+    loose = compared(points, sigma=0.005)
+    whole = next(one for one in loose.faces if one.statistics.n)
+    assert abs(whole.spot_mm) >= abs(top.spot_mm)
+
+
 def test_a_stray_point_makes_no_dent() -> None:
     points = top_points(20_000)
     points[7, 2] += 1.5

@@ -193,12 +193,13 @@ def measure_markers(
     page = marker_page(
         exposures, detections, matches, warnings, provenance, is_simulated=is_simulated
     )
+    table = markers_csv(matches.markers, is_simulated=is_simulated)
     return Summary(
         title="Markers measured" + (" in simulated images." if is_simulated else "."),
         quantities=marker_quantities(matches, detections),
         tables=(_counts(detections), status_table(matches)),
         warnings=warnings,
-        written=job.write({places[0]: markers_csv(matches.markers), places[1]: page}),
+        written=job.write({places[0]: table, places[1]: page}),
         next_step="`armscan register -h` joins scans that share markers",
         extra={
             "kind": "markers",

@@ -154,7 +154,11 @@ def register(
         joined = _join_place(lists[0], moved, clouds, options)
     report, carried = joined.report, joined.carried
     inputs = [*(item.path for item in joined.lists), *(item.path for item in carried)]
-    is_simulated = are_simulated(inputs) or any(item.cloud.is_simulated for item in carried)
+    marks = (
+        *(item.is_simulated for item in joined.lists),
+        *(item.cloud.is_simulated for item in carried),
+    )
+    is_simulated = any(marks) or are_simulated(inputs)
     forced = [reason for item in carried for reason in item.cloud.forced]
     provenance = job.provenance(inputs, (options,), warnings=report.warnings, forced=forced)
     document = Registration(
@@ -172,7 +176,7 @@ def register(
     )
     contents = {
         DOCUMENT: registration_document(document),
-        MARKERS: markers_csv(joined.markers),
+        MARKERS: markers_csv(joined.markers, is_simulated=is_simulated),
         **{item.name: ply_bytes(item.cloud) for item in carried},
         PAGE: render_page(registration_page(report, provenance, is_simulated=is_simulated)),
     }

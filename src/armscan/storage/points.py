@@ -431,6 +431,8 @@ ASSUMED_SIGMA_MM = 0.02
 """Standard deviation an axis of a marker about which a list says nothing: a probed point, or a
 ring's centre measured by two cameras."""
 FRAME = "frame ="
+SIMULATED = "simulated"
+"""Comment of a list that was measured on rendered images."""
 _UPPER = np.triu_indices(3)
 
 
@@ -448,32 +450,36 @@ class MarkerList:
         True if the list numbers its markers itself.
     is_sigma_assumed
         True if the list holds no covariance.
+    is_simulated
+        True if the list says that it was measured on rendered images.
     """
 
     markers: MarkerSet
     path: Path
     has_ids: bool
     is_sigma_assumed: bool
+    is_simulated: bool = False
 
 
-def markers_csv(markers: MarkerSet) -> bytes:
+def markers_csv(markers: MarkerSet, *, is_simulated: bool = False) -> bytes:
     """Text of a table of markers; `read_marker_list` reads it back as the same numbers.
 
     Columns ``id,x_mm,y_mm,z_mm`` and the six different elements of the covariance; a comment
-    ``# frame = Sensor`` names the coordinate frame.
+    ``# frame = Sensor`` names the coordinate frame, and ``# simulated`` marks rendered images.
     """
     upper = markers.covariance_mm2[:, _UPPER[0], _UPPER[1]]
     columns = {"id": tuple(str(number) for number in markers.ids)}
     columns |= number_columns(COORDINATES, markers.points_mm)
     columns |= number_columns(COVARIANCES, upper)
-    return csv_bytes(columns, (f"{FRAME} {markers.frame}",))
+    marks = (SIMULATED,) if is_simulated else ()
+    return csv_bytes(columns, (f"{FRAME} {markers.frame}", *marks))
 
 
 def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_MM) -> MarkerList:
     """Read a table ``x_mm,y_mm,z_mm`` with, if you like, ``id`` and the six covariances.
 
-    A comment ``# frame = Base`` names the frame. Tables of probed points are such lists; points
-    are taken as they stand, centres of a tip included.
+    A comment ``# frame = Base`` names the frame, ``# simulated`` marks rendered images. Tables of
+    probed points are such lists; points are taken as they stand, centres of a tip included.
 
     Parameters
     ----------
@@ -511,7 +517,8 @@ def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_
             frame=(*frames, frame)[0],
             source=path_text(path),
         )
-    return MarkerList(markers, path, "id" in table, not has_covariance)
+    is_simulated = SIMULATED in (text.strip() for text in table.comments)
+    return MarkerList(markers, path, "id" in table, not has_covariance, is_simulated)
 
 
 def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> FloatArray:

@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError, InputError
+from armscan.jobs.job import Job
+from armscan.jobs.register import register
 from armscan.records.points import MarkerSet
+from armscan.storage.documents import read_registration
 from armscan.storage.points import markers_csv, read_marker_list
+from rigs.marker_scenes import walk
 
 
 def some_markers(n: int = 4) -> MarkerSet:
@@ -58,3 +62,19 @@ def test_other_tables_are_refused(tmp_path: Path, old: str, new: str, message: s
 def test_a_covariance_must_be_one() -> None:
     with pytest.raises(InputError, match="not positive definite"):
         MarkerSet(ids=np.arange(1), points_mm=np.zeros((1, 3)), covariance_mm2=-np.eye(3)[None])
+
+
+@pytest.mark.parametrize("is_simulated", [False, True])
+def test_views_of_rendered_images_join_to_a_marked_registration(
+    tmp_path: Path, is_simulated: bool
+) -> None:
+    """One view that is marked is enough."""
+    paths = [tmp_path / f"view{k}.csv" for k in range(3)]
+    for k, view in enumerate(walk(np.random.default_rng(1), 3).views):
+        paths[k].write_bytes(markers_csv(view, is_simulated=is_simulated and k == 1))
+    folder = tmp_path / "joined"
+    found = register(Job(output=folder), paths)
+    assert found.data["simulated"] is is_simulated
+    assert read_registration(folder / "registration.json").simulated is is_simulated
+    assert ("simulated" in (folder / "registration.html").read_text("utf-8")) is is_simulated
+    assert read_marker_list(folder / "markers.csv", frame="").is_simulated is is_simulated

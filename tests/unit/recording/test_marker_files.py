@@ -42,6 +42,21 @@ def test_a_full_list_comes_back_as_the_same_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.markers.covariance_mm2, markers.covariance_mm2)
 
 
+@pytest.mark.parametrize("is_simulated", [False, True])
+def test_a_list_says_whether_its_images_were_rendered(tmp_path: Path, is_simulated: bool) -> None:
+    markers = MarkerSet(
+        ids=np.arange(3),
+        points_mm=np.eye(3) * 50.0,
+        covariance_mm2=np.tile(1e-4 * np.eye(3), (3, 1, 1)),
+        frame="Sensor",
+    )
+    path = tmp_path / "markers.csv"
+    path.write_bytes(markers_csv(markers, is_simulated=is_simulated))
+    found = read_marker_list(path, frame="Base")
+    assert found.is_simulated is is_simulated
+    assert found.markers.frame == "Sensor"
+
+
 def test_three_columns_are_enough(tmp_path: Path) -> None:
     found = read_marker_list(written(tmp_path, f"{HEAD}\n{ROWS}"), frame="Base", sigma_mm=0.05)
     assert found.markers.ids.tolist() == [1, 2, 3]

@@ -15,6 +15,7 @@ import pytest
 from armscan.errors import ArmscanError, FileFormatError, OutputError
 from armscan.jobs.live.recordings import recover_recording
 from armscan.records.recording import CameraSetup, PixelColour, Session
+from armscan.report.quantity import summary_json
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings import write_mcap
 from armscan.storage.recordings.mcap_folder import read_summary
@@ -146,6 +147,25 @@ def test_recovery_goes_on_after_a_damaged_chunk(
     for k in (0, 1, 2, *range(6, 12)):
         pixels = cv2.imread(str(saved / row(k).source), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(pixels, image(k))
+
+
+@pytest.mark.parametrize(("is_gap", "shown"), [(False, "not known"), (True, "at least 3")])
+def test_without_the_end_lost_exposures_are_counted_as_far_as_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_gap: bool, shown: str
+) -> None:
+    """Three of twelve are behind the cut, and nothing says so; a gap before it tells of others."""
+    path = tmp_path / "scan.mcap"
+    spans = recorded(path, monkeypatch)
+    data = bytearray(path.read_bytes()[: spans[3][0]])
+    if is_gap:
+        data[spans[1][0] + 30] ^= 0xFF
+    path.write_bytes(data)
+    summary = recover_recording(path, tmp_path / "saved")
+    told = next(one for one in summary.quantities if one.key == "lost_exposures")
+    assert told.text == shown
+    assert json.loads(summary_json(summary))["lost_exposures"] is None
+    assert summary.data["least_lost_exposures"] == 3 * is_gap
+    assert ("lost: at least 3 exposures" in summary.warnings) is is_gap
 
 
 def test_what_is_left_without_its_beginning_has_its_session(

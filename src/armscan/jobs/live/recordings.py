@@ -5,6 +5,7 @@ are in a folder.
 
 from __future__ import annotations
 
+import math
 from hashlib import sha256
 from pathlib import Path
 
@@ -173,6 +174,16 @@ def _refuse_points(output: Path, source: Path) -> None:
         )
 
 
+def _lost_exposures(found: ReadBack) -> Quantity:
+    """How many exposures are lost; without the file's summary only the least number is known."""
+    key, label = "lost_exposures", "lost exposures"
+    if found.is_loss_counted:
+        return Quantity(key, label, found.n_lost)
+    shown = f"at least {found.n_lost:,}" if found.n_lost else "not known"
+    meaning = "the end of the file, which has their count, is gone"
+    return Quantity(key, label, math.nan, meaning=meaning, shown=shown)
+
+
 def _summary(title: str, found: ReadBack, output: Path) -> Summary:
     is_file = output.suffix.lower() == SUFFIX
     return Summary(
@@ -182,7 +193,8 @@ def _summary(title: str, found: ReadBack, output: Path) -> Summary:
             Quantity("arm_samples", "arm samples", found.n_samples),
             Quantity("events", "events", found.n_events),
             Quantity("set_aside", "set aside", found.n_aside),
-            Quantity("lost_exposures", "lost exposures", found.n_lost),
+            _lost_exposures(found),
+            Quantity("least_lost_exposures", "", found.n_lost),
             Quantity("seconds", "duration", found.seconds, unit="s"),
         ),
         warnings=(*(f"lost: {text}" for text in found.lost), *found.aside, *found.warnings),

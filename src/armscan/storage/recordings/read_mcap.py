@@ -92,7 +92,9 @@ class ReadBack:
         Exposures and samples that a table cannot hold: repeated or backward times or ids, names
         outside of the recording.
     n_lost
-        Exposures that were recorded and are not whole.
+        Exposures that were recorded and are not whole; the least number without the file's summary.
+    is_loss_counted
+        True if the file's summary says how many exposures were recorded, so that ``n_lost`` is all.
     seconds
         From the first exposure to the last.
     aside
@@ -108,6 +110,7 @@ class ReadBack:
     n_events: int = 0
     n_aside: int = 0
     n_lost: int = 0
+    is_loss_counted: bool = True
     seconds: float = 0.0
     aside: tuple[str, ...] = ()
     lost: tuple[str, ...] = ()
@@ -161,8 +164,11 @@ class _Folder:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
 
-    def finish(self, n_stated: int) -> ReadBack:
-        """Write the tables, and say what became of it; ``n_stated`` exposures were recorded."""
+    def finish(self, n_stated: int | None) -> ReadBack:
+        """Write the tables, and say what became of it.
+
+        ``n_stated`` exposures were recorded; None if the file does not say so any more.
+        """
         tables = self.tables
         for name, content in tables.contents().items():
             self._write(name, content)
@@ -173,7 +179,8 @@ class _Folder:
             n_events=len(tables.events),
             n_aside=tables.aside.total() + tables.n_samples_aside,
             aside=tables.notes,
-            n_lost=self.n_lost(n_stated),
+            n_lost=self.n_lost(n_stated or 0),
+            is_loss_counted=n_stated is not None,
             seconds=1e-9 * (max(times) - min(times)) if times else 0.0,
             lost=self._lost(n_stated),
         )
@@ -184,19 +191,18 @@ class _Folder:
         return found
 
     def n_lost(self, n_stated: int) -> int:
-        """Exposures that were recorded and did not come whole."""
+        """Exposures that were recorded, as far as is known, and did not come whole."""
         n_whole = self.n_seen["whole"]
         return max(self.n_said[EXPOSURE_TOPIC], n_stated) - n_whole
 
-    def _lost(self, n_stated: int) -> tuple[str, ...]:
+    def _lost(self, n_stated: int | None) -> tuple[str, ...]:
         said = []
-        n = max(self.n_said[EXPOSURE_TOPIC], n_stated)
-        if self.n_lost(n_stated):
-            said.append(f"{self.n_lost(n_stated)} of {n} exposures")
+        if n_lost := self.n_lost(n_stated or 0):
+            known = f"{n_lost} of {n_stated} exposures"
+            said.append(f"at least {n_lost} exposures" if n_stated is None else known)
         for topic, what in ((ARM_TOPIC, "packets of the arm's samples"), (EVENT_TOPIC, "events")):
             if self.n_seen[topic] < self.n_said[topic]:
-                n_gone = self.n_said[topic] - self.n_seen[topic]
-                said.append(f"{n_gone} of {self.n_said[topic]} {what}")
+                said.append(f"at least {self.n_said[topic] - self.n_seen[topic]} {what}")
         for one in self.damages[:LISTED]:
             said.append(f"{one.n_bytes} bytes from byte {one.place} on ({one.reason})")
         if len(self.damages) > LISTED:
@@ -234,7 +240,6 @@ def extract_recording(path: Path, folder: Path, *, is_recovering: bool = False) 
         grown = _Folder(partial)
         for piece in pieces_of(file, path.stat().st_size):
             _take(grown, piece)
-        n_stated = 0 if stated is None else stated.n_exposures
         if not is_recovering:
             _refuse_lost(grown, stated, where)
         if not grown.tables.exposures:
@@ -242,7 +247,7 @@ def extract_recording(path: Path, folder: Path, *, is_recovering: bool = False) 
             fact = "every exposure in it was taken back or set aside" if is_whole else (
                 "no exposure in the file is whole")  # fmt: skip
             raise FileFormatError(fact, where=where, remedy="record again, or look for a copy")
-        return grown.finish(n_stated)
+        return grown.finish(None if stated is None else stated.n_exposures)
 
 
 def _stated(path: Path, *, is_recovering: bool) -> FileSummary | None:

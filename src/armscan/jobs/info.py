@@ -7,6 +7,7 @@ import importlib
 import os
 import pkgutil
 import platform
+import shlex
 import tempfile
 import time
 from collections import Counter
@@ -72,7 +73,7 @@ def describe_registration(path: Path) -> dict[str, Any]:
         "not_joined": [one.name for one in document.not_joined],
         "simulated": document.simulated,
         "created_utc": document.provenance.created_utc,
-        "command": " ".join(document.provenance.command),
+        "command": shlex.join(document.provenance.command),
     }
 
 

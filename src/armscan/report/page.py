@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -157,7 +158,7 @@ def _origin_section(provenance: Provenance) -> Section:
         (
             fact("Document", provenance.document_id),
             fact("Written", f"{provenance.created_utc} by armscan {provenance.armscan_version}"),
-            fact("Command", " ".join(provenance.command)),
+            fact("Command", shlex.join(provenance.command)),
             fact("Rests on", ", ".join(provenance.parent_ids) or "no other document"),
         )
     )

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError, InputError
+from armscan.jobs.info import describe_registration
 from armscan.jobs.job import Job
 from armscan.jobs.register import register
 from armscan.records.points import MarkerSet
@@ -73,8 +75,11 @@ def test_views_of_rendered_images_join_to_a_marked_registration(
     for k, view in enumerate(walk(np.random.default_rng(1), 3).views):
         paths[k].write_bytes(markers_csv(view, is_simulated=is_simulated and k == 1))
     folder = tmp_path / "joined"
-    found = register(Job(output=folder), paths)
+    command = ("armscan", "register", *map(str, paths), "-o", "joined views")
+    found = register(Job(output=folder, command=command), paths)
     assert found.data["simulated"] is is_simulated
     assert read_registration(folder / "registration.json").simulated is is_simulated
+    described = describe_registration(folder / "registration.json")
+    assert tuple(shlex.split(described["command"])) == command
     assert ("simulated" in (folder / "registration.html").read_text("utf-8")) is is_simulated
     assert read_marker_list(folder / "markers.csv", frame="").is_simulated is is_simulated

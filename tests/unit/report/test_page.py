@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import re
+import shlex
 
 import cv2
 import numpy as np
@@ -20,8 +21,19 @@ from armscan.report.drawing import (
     scene_markup,
     uniform_dots,
 )
-from armscan.report.page import Facts, Gallery, Legend, Page, Picture, Section, Text, render_page
+from armscan.report.page import (
+    Facts,
+    Gallery,
+    Legend,
+    Page,
+    Picture,
+    Section,
+    Text,
+    page_of,
+    render_page,
+)
 from armscan.report.quantity import Table, fact
+from armscan.storage.documents import new_provenance
 
 HOSTILE = '<script>alert("1")</script>&'
 
@@ -58,6 +70,15 @@ def test_print_parts_no_heading_and_its_first_words_from_what_follows() -> None:
     text = render_page(page()).decode()
     rule = next(line for line in text.splitlines() if "break-after: avoid" in line)
     assert {"h2", "h2 + p"} <= {one.strip() for one in rule.partition("{")[0].split(",")}
+
+
+def test_the_command_is_shown_as_a_shell_takes_it() -> None:
+    command = ("armscan", "inspect", "cad", "my cloud.ply", "--title-block", "operator=A. Ray")
+    origin = page_of(new_provenance((), command=command), "Part", "", ()).sections[-1]
+    block = next(block for block in origin.blocks if isinstance(block, Facts))
+    shown = next(item.text for item in block.quantities if item.label == "Command")
+    assert "'operator=A. Ray'" in shown
+    assert tuple(shlex.split(shown)) == command
 
 
 def test_simulated_data_are_called_so() -> None:

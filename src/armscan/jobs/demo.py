@@ -430,7 +430,7 @@ def _written(run: _Run, demo: HeadDemo, warnings: tuple[str, ...]) -> Summary:
     request, folder, seconds = run.request, run.folder, run.seconds
     name = request.head
     head = {**head_data(demo), "seconds": seconds}
-    marked = tuple(sentence(f"hand-eye: {text}") for text in warnings)
+    marked = tuple(sentence(f"Hand-eye: {text}") for text in warnings)
     commands = _commands(run, demo)
     photographs = {}
     for place in sorted(run.place("").iterdir()):

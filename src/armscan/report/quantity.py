@@ -227,12 +227,12 @@ def significant(value: float, unit: str = "", digits: int = 3) -> str:
 def sentence(text: str) -> str:
     """Text with a capital at its start and a full stop, or its question mark, at its end.
 
-    A first word with a dot, digit or the like inside is a name, of a file or a coefficient, and
-    stays as it is.
+    A first word with a dot, digit or the like inside, or a colon behind it, is a name, of a file, a
+    part or a coefficient, and stays as it is.
     """
     if not text:
         return ""
-    first = text.split(maxsplit=1)[0].rstrip(".,:;").replace("-", "").replace("'", "")
+    first = text.split(maxsplit=1)[0].rstrip(".,;").replace("-", "").replace("'", "")
     start = text[:1].upper() if first.isalpha() else text[:1]
     return f"{start}{text[1:].rstrip('.')}{'' if text.endswith('?') else '.'}"
 

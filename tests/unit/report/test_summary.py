@@ -66,6 +66,7 @@ def test_sentences() -> None:
 def test_names_at_the_start_of_a_sentence_stay_as_they_are() -> None:
     assert sentence("left03copy.png repeats left03.png") == "left03copy.png repeats left03.png."
     assert sentence("left.png: residuals are large") == "left.png: residuals are large."
+    assert sentence("part-s: 3 points are beside it") == "part-s: 3 points are beside it."
     assert sentence("k1k2 without hold-out") == "k1k2 without hold-out."
 
 

@@ -40,9 +40,14 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """Say what files and folders are, and what is in them."""
+    from armscan.errors import FileFormatError
     from armscan.jobs.info import describe_files
 
-    show(describe_files(files), as_json=as_json)
+    summary = describe_files(files)
+    show(summary, as_json=as_json)
+    if n_failed := summary.data["n_failed"]:
+        what = f"{n_failed} of {len(summary.data['items'])} items cannot be read"
+        raise FileFormatError(what, remedy="see what is said of each, or leave them out")
 
 
 def convert(
@@ -131,7 +136,7 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Check what is installed: packages, compiler, drivers."""
-    from armscan.jobs.info import examine_installation
+    from armscan.jobs.installation import examine_installation
 
     if bundle is not None:
         from armscan.jobs.live.bundle import pack_bundle

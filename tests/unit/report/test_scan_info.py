@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from armscan.cli.run import main
 from armscan.errors import FileFormatError
 from armscan.jobs.info import describe_files
 from armscan.models.arm import thesis_arm
@@ -122,3 +123,25 @@ def test_other_tables_are_refused(tmp_path: Path) -> None:
     path.write_text("name,age\nx,3\n")
     with pytest.raises(FileFormatError, match="no column is called x_mm"):
         describe_files([str(path)])
+
+
+def test_one_file_that_cannot_be_read_hides_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd, good = tmp_path / "a.xyzzy", tmp_path / "points.csv"
+    odd.write_bytes(b"what is this")
+    good.write_text("x_mm,y_mm,z_mm\n1,2,3\n100,2,3\n1,90,3\n")
+    missing = tmp_path / "no.csv"
+    names = [str(odd), str(missing), str(good)]
+    summary = describe_files(names)
+    unknown, absent, known = summary.data["items"]
+    assert unknown["failed"].startswith("armscan does not know this kind of file")
+    assert "there is no such file" in absent["failed"]
+    assert (known["points"], "failed" in known) == (3, False)
+    assert summary.data["n_failed"] == 2
+    assert main(["info", *names]) == 2
+    told = capsys.readouterr()
+    assert "3 probed points" in told.out and "does not know this kind of file" in told.out
+    assert told.err.startswith("error: 2 of 3 items cannot be read")
+    with pytest.raises(FileFormatError, match="does not know"):
+        describe_files(names[:1])

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from armscan.errors import ArmscanError, OptionError
-from armscan.jobs.info import examine_installation
+from armscan.jobs.installation import examine_installation
 from armscan.report.quantity import Quantity, Summary, Table
 from armscan.storage.documents import content_hash
 from armscan.storage.files import check_outputs, holds_files, is_folder, read_bytes, write_files

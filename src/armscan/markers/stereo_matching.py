@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
@@ -30,6 +31,7 @@ class RingStatus(Enum):
 
     MATCHED = "matched"
     NO_PARTNER = "no ring on its epipolar line"
+    WRONG_SIZE = "the rings on its epipolar line are not of the diameter given"
     AMBIGUOUS = "several rings may be its partner"
     UNSUPPORTED = "its partner does not fit the surface that its neighbours show"
     OUT_OF_ORDER = "another pair on its epipolar line lies the other way round"
@@ -113,6 +115,10 @@ def match_rings(
     crossed = _out_of_order(pairs.select(matched), left, views)
     kept = matched[~crossed]
     statuses = _statuses(len(left), pairs, np.asarray(rank >= 2), matched, crossed)
+    if options.diameter_mm is not None and RingStatus.NO_PARTNER in statuses:
+        of_any_size = replace(options, diameter_mm=None)
+        others = find_candidates(left, right, views, calibration_covariance, of_any_size)
+        statuses = _with_wrong_sizes(statuses, others)
     return _matches(left, pairs.select(kept), statuses, len(pairs), n_planes)
 
 
@@ -153,6 +159,17 @@ def _statuses(
     for row, is_crossed in zip(pairs.left[matched], crossed, strict=True):
         statuses[row] = RingStatus.OUT_OF_ORDER if is_crossed else RingStatus.MATCHED
     return tuple(statuses)
+
+
+def _with_wrong_sizes(
+    statuses: tuple[RingStatus, ...], of_any_size: CandidatePairs
+) -> tuple[RingStatus, ...]:
+    """The statuses, where rings without a partner have one among pairs of any size."""
+    have = set(of_any_size.left.tolist())
+    return tuple(
+        RingStatus.WRONG_SIZE if status is RingStatus.NO_PARTNER and k in have else status
+        for k, status in enumerate(statuses)
+    )
 
 
 def _out_of_order(pairs: CandidatePairs, left: RingImages, views: TwoViews) -> BoolArray:

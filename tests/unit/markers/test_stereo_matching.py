@@ -142,6 +142,16 @@ def test_known_size_and_depth_leave_fewer_candidates() -> None:
     assert len(other.left) == 0
 
 
+def test_rings_of_another_size_than_given_are_told_from_rings_without_partner() -> None:
+    scene = random_scene(3, missing=0.0)
+    plain = matched(scene)
+    sized = matched(scene, RingMatchOptions(diameter_mm=2.2 * RADIUS_MM))
+    assert len(sized.left) == 0
+    for before, now in zip(plain.statuses, sized.statuses, strict=True):
+        is_alone = before is RingStatus.NO_PARTNER
+        assert now is (RingStatus.NO_PARTNER if is_alone else RingStatus.WRONG_SIZE)
+
+
 def test_three_rings_are_matched_only_if_their_size_is_known() -> None:
     """A pair is checked against three others: with two there is only its size."""
     scene = random_scene(3, missing=0.0)

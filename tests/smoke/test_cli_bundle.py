@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from armscan.cli import main
-from armscan.jobs.live import bundle
-from armscan.jobs.live.bundle import without_secrets
+from armscan.jobs.live import doctor as bundle
+from armscan.jobs.live.doctor import without_secrets
 from armscan.storage.documents import read_camera_calibration
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import record_folder

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from armscan.cli.run import VARIABLE, give_kernels_a_folder
-from armscan.jobs.installation import kernel_modules
+from armscan.jobs.live.doctor import kernel_modules
 from armscan.kernels import arrays
 from armscan.kernels.arrays import load_kernels
 

@@ -136,11 +136,9 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Check what is installed: packages, compiler, drivers."""
-    from armscan.jobs.installation import examine_installation
+    from armscan.jobs.live.doctor import examine_installation, pack_bundle
 
     if bundle is not None:
-        from armscan.jobs.live.bundle import pack_bundle
-
         show(pack_bundle(bundle, having or (), is_overwriting=force), as_json=as_json)
         return
     refuse_vain({"--with": having}, "there is no bundle", "give --bundle, or leave out")

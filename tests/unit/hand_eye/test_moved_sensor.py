@@ -113,6 +113,7 @@ def test_points_of_other_postures_are_right_with_a_poor_camera() -> None:
         claims.append(float(normalised.mean()) / 3.0)
         cameras.append(_camera_claims(moved))
         assert np.trace(moved.camera.covariance) < 0.9 * np.trace(sensor.camera.covariance)
+        np.testing.assert_array_equal(moved.covariance, moved.covariance.T)
     assert np.sqrt(np.mean(squares)) < 1.3 * 0.0071
     assert np.mean(squares) < 0.7 * np.mean(given)
     assert 0.6 < np.mean(claims) < 1.5, "20 draws have 1.14"
@@ -158,6 +159,22 @@ def test_a_sheet_that_no_stripe_shows_follows_the_camera() -> None:
     np.testing.assert_allclose(
         moved.sheets[1].sheet.origin_mm, moved.sheets[0].sheet.origin_mm, atol=1e-9
     )
+
+
+def test_what_the_sensor_was_calibrated_with_as_exact_stays() -> None:
+    """A camera whose distortion was held: those parameters do not move, nor gain a variance."""
+    head = CalibratedHead(1.0, 5)
+    sensor = head.sensor()
+    held = np.array([4, 5, 6, 7, 8])
+    covariance = sensor.covariance.copy()
+    covariance[held], covariance[:, held] = 0.0, 0.0
+    stripes, plate = head.stripes(sensor)
+    fit = calibrate_on_plate(stripes, plate, sensor_covariance=covariance)
+    assert isinstance(fit, HandEyeFit)
+    assert fit.sensor_step is not None and fit.sensor_covariance is not None
+    assert not fit.sensor_step[held].any()
+    assert not fit.sensor_covariance[held].any()
+    assert np.diag(fit.sensor_covariance).min() >= 0.0
 
 
 def test_without_its_covariance_the_sensor_stays() -> None:

@@ -442,13 +442,14 @@ def joint_covariance(solution: HandEyeSolution) -> JointCovariance:
     )
     after, between = whole.matrix[n:, n:], whole.matrix[hand_eye, n:]
     by_units = np.linalg.solve(after, between.T).T
-    learnt = root @ (np.eye(len(units)) - after) @ root.T
+    given = whole.matrix[hand_eye, hand_eye] - by_units @ between.T
+    moved = before + root @ (after - np.eye(len(units))) @ root.T
     return JointCovariance(
         unknowns=whole.matrix[:n, :n],
         region_factor=whole.region_factor,
-        given_sensor=whole.matrix[hand_eye, hand_eye] - by_units @ between.T,
+        given_sensor=0.5 * (given + given.T),
         dhand_eye_dsensor=by_units @ units,
-        sensor=before - learnt,
+        sensor=0.5 * (moved + moved.T),
     )
 
 

@@ -543,7 +543,8 @@ class CondensedObservations(ArrayRecord):
         covariance, by_sensor = self.sensor_covariance, self.dpoint_dsensor
         if covariance is None or by_sensor is None:
             return np.zeros((0, 0)), np.zeros((0, 0))
-        moving = np.flatnonzero(by_sensor.any(axis=(0, 1)))
+        is_open = np.diag(covariance) > 0.0
+        moving = np.flatnonzero(by_sensor.any(axis=(0, 1)) & is_open)
         root = square_root(covariance[np.ix_(moving, moving)], "the sensor's covariance")
         sizes = np.linalg.norm(root, axis=1)[:, None]
         sizes[sizes == 0.0] = 1.0

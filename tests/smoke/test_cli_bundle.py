@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from armscan.cli import main
-from armscan.jobs.live import doctor as bundle
+from armscan.jobs.live import doctor
 from armscan.jobs.live.doctor import without_secrets
 from armscan.storage.documents import read_camera_calibration
 from armscan.storage.recording import read_recording

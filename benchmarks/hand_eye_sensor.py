@@ -85,7 +85,7 @@ def main() -> None:
             if not isinstance(fit, HandEyeFit):
                 print(f"run {run}: {fit.reason}")
                 continue
-            moved = fit.sensor_after(sensor, PROVENANCE)
+            moved = fit.sensor_after(sensor)
             rows["given"].append(figures(head, sensor, fit.beside_given_sensor))
             rows["moved"].append(figures(head, moved, fit.calibration))
         print(f"camera x {factor:g}: {len(rows['moved'])} of {arguments.runs} runs")

@@ -48,8 +48,8 @@ def test_a_bundle_says_what_is_inside_and_keeps_secrets(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.setenv("SOME_TOKEN", "hunter2hunter2")
-    monkeypatch.setattr(bundle, "CUT_EXPOSURES", 1)
-    monkeypatch.setattr(bundle, "_user", lambda: "annika")
+    monkeypatch.setattr(doctor, "CUT_EXPOSURES", 1)
+    monkeypatch.setattr(doctor, "_user", lambda: "annika")
     scan, log, place = lab_folder(tmp_path / "scan"), tmp_path / "run.log", tmp_path / "q.zip"
     log.write_text(f"annika began in {tmp_path}/scan\ntoken=abc\n")
     words = ["doctor", "--bundle", str(place)]
@@ -99,7 +99,7 @@ def test_a_recording_that_cannot_be_read_goes_in_as_it_is(
         assert archive.read("killed.mcap") == broken.read_bytes()
         listed = archive.read("README.txt").decode()
     assert said["warnings"] == [] and "it cannot be read (the recording is unfinished" in listed
-    monkeypatch.setattr(bundle, "MOST_BYTES", 1000)
+    monkeypatch.setattr(doctor, "MOST_BYTES", 1000)
     assert main(words) == 0
     with zipfile.ZipFile(place) as archive:
         assert archive.read("killed.mcap") == broken.read_bytes()[:1000]

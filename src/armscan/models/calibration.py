@@ -374,12 +374,10 @@ class SensorCalibration(ArrayRecord):
         start = self.sheet_parameter_slice(len(self.sheets)).start
         return slice(start, len(self.parameter_names))
 
-    def updated(
-        self, step: FloatArray, covariance: FloatArray, provenance: Provenance
-    ) -> SensorCalibration:
+    def updated(self, step: FloatArray, covariance: FloatArray) -> SensorCalibration:
         """The sensor with its parameters moved by a step (P,), known to another covariance (P, P).
 
-        ``provenance`` is that of what moved it.
+        The provenance stays that of the calibration which gave it.
         """
         n, of_second = len(CAMERA_PARAMETER_NAMES), self.second_parameter_slice
         sheets = tuple(
@@ -399,7 +397,6 @@ class SensorCalibration(ArrayRecord):
             sheets=sheets,
             second=second,
             covariance=covariance,
-            provenance=provenance,
         )
 
 

@@ -15,7 +15,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import HandEyeCalibration, SensorCalibration
 from rigs.calibrated_head import CalibratedHead
 from rigs.plate_rig import PLATE_NORMAL, RigNoise
-from rigs.sheet_rig import PROVENANCE, thesis_rig
+from rigs.sheet_rig import thesis_rig
 from rigs.sphere_rig import DIAMETER_MM, SphereRig, turned_poses
 
 NOISE = RigNoise()
@@ -104,7 +104,7 @@ def test_points_of_other_postures_are_right_with_a_poor_camera() -> None:
         stripes, plate = head.stripes(sensor)
         fit = calibrate_on_plate(stripes, plate, sensor_covariance=sensor.covariance)
         assert isinstance(fit, HandEyeFit)
-        moved = fit.sensor_after(sensor, PROVENANCE)
+        moved = fit.sensor_after(sensor)
         error, covariance = head.scan(moved, fit.calibration)
         squares.append(float(((error @ PLATE_NORMAL) ** 2).mean()))
         error_given, _ = head.scan(sensor, fit.beside_given_sensor)
@@ -154,7 +154,7 @@ def test_a_sheet_that_no_stripe_shows_follows_the_camera() -> None:
     fit = calibrate_on_plate(wide, plate, sensor_covariance=sensor.covariance)
     assert isinstance(fit, HandEyeFit) and fit.sensor_step is not None
     np.testing.assert_allclose(fit.sensor_step[n:], fit.sensor_step[9:17], rtol=1e-6, atol=1e-12)
-    moved = fit.sensor_after(sensor, PROVENANCE)
+    moved = fit.sensor_after(sensor)
     assert np.linalg.eigvalsh(moved.covariance / np.trace(moved.covariance)).min() > -1e-12
     np.testing.assert_allclose(
         moved.sheets[1].sheet.origin_mm, moved.sheets[0].sheet.origin_mm, atol=1e-9
@@ -183,5 +183,5 @@ def test_without_its_covariance_the_sensor_stays() -> None:
     stripes, plate = head.stripes(sensor)
     fit = calibrate_on_plate(stripes, plate)
     assert isinstance(fit, HandEyeFit)
-    assert fit.sensor_after(sensor, PROVENANCE) is sensor
+    assert fit.sensor_after(sensor) is sensor
     assert fit.beside_given_sensor is fit.calibration

@@ -145,17 +145,17 @@ class HandEyeFit(ArrayRecord):
     sensor_step: FloatArray | None = floats("P", default=None)
     sensor_covariance: FloatArray | None = floats("P", "P", default=None)
 
-    def sensor_after(self, sensor: SensorCalibration, provenance: Provenance) -> SensorCalibration:
+    def sensor_after(self, sensor: SensorCalibration) -> SensorCalibration:
         """The sensor to which the hand-eye belongs."""
         if self.sensor_step is None or self.sensor_covariance is None:
             return sensor
-        return sensor.updated(self.sensor_step, self.sensor_covariance, provenance)
+        return sensor.updated(self.sensor_step, self.sensor_covariance)
 
     def scanner(
         self, sensor: SensorCalibration | None, provenance: Provenance
     ) -> ScannerCalibration:
         """Hand-eye and sensor, of ``sensor`` as it was given; None where points were delivered."""
-        moved = None if sensor is None else self.sensor_after(sensor, provenance)
+        moved = None if sensor is None else self.sensor_after(sensor)
         return ScannerCalibration(moved, self.calibration, provenance)
 
     @property

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from armscan.calibration.hand_eye.estimate import Problem, estimate
+from armscan.calibration.hand_eye.estimate import Problem, estimate, joint_covariance
 from armscan.calibration.hand_eye.observations import (
     CondensedObservations,
     HandEyeOptions,
@@ -142,11 +142,8 @@ def _runs(options: HandEyeOptions, n_runs: int) -> tuple[FloatArray, FloatArray]
         problem = Problem(nodes, PlateSurface(plate), options)
         fit = estimate(problem, problem.start(TOOL_FROM_SENSOR))
         assert fit is not None
-        by_sensor = fit.placed.by_sensor
-        assert by_sensor is not None
         error = hand_eye_difference(fit.state.tool_from_sensor, TOOL_FROM_SENSOR)
-        coupling = fit.linear.gain @ by_sensor
-        total = fit.covariance + coupling @ rig.sensor_covariance @ coupling.T
+        total = joint_covariance(fit).unknowns[:6, :6]
         sigmas.append([fit.arm_mm, fit.sigma_of("sheet shape")])
         squares.append(float(error @ np.linalg.solve(total, error)))
     return np.array(sigmas), np.array(squares)

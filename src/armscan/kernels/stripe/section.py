@@ -45,7 +45,8 @@ SIDE_FROM, SIDE_TO = 3.4, 4.2
 """Sigmas between which pixels beside the line tell the noise of the background."""
 CORE_SIGMAS = 1.3
 """Profiles that are clipped farther out say nothing of the section: their flanks alone are left."""
-FIT_PARAMETERS = 3.0
+LEAST_SHARE = 0.2
+"""Of the noise's variance in a residual: of less, the fit's own faults are what is seen."""
 LEAST_DETERMINANT = 1e-12
 MAD_TO_SIGMA = 1.4826022185056018
 LEAST_GROUND = 1e-6
@@ -75,7 +76,7 @@ def leave_pixel(pixels: Floats, pixel: int, lanes: Floats, left: FloatsOut) -> N
         shape += lanes[FOURTH * LANES + k] * (uu * (uu - 6.0) + 3.0)
         m = exponential(-0.5 * min(uu, FARTHEST_SQUARE)) * lanes[AT_AMPLITUDE * LANES + k]
         m *= pixels[REFLECTANCE * LANES + k] * max(shape, 0.0)
-        left[k] = m if is_seen & (pixels[COUNTS * LANES + k] >= 0.0) else NOT_SEEN
+        left[k] = m if is_seen & (pixels[COUNTS * LANES + k] > 0.0) else NOT_SEEN
         left[LANES + k] = m + pixels[GROUND_LEVEL * LANES + k]
         left[2 * LANES + k] = pixels[LEVEL * LANES + k] - m
 
@@ -217,18 +218,15 @@ def leave_fitted(sums: Floats, said: FloatsOut) -> None:
     are not determined.
     """
     said[:] = 0.0
-    a, b, c, d, e, f = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
-    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * c00 + b * c01 + c * c02
-    if not determinant > LEAST_DETERMINANT * a * d * f:
+    inverse = np.zeros(6)
+    if not invert(sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], inverse):
         return
-    c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
     for term in range(3):
         at = 21 if term == 2 else 6 + 3 * term
         x, y, z = sums[at], sums[at + 1], sums[at + 2]
-        t0 = (c00 * x + c01 * y + c02 * z) / determinant
-        t1 = (c01 * x + c11 * y + c12 * z) / determinant
-        t2 = (c02 * x + c12 * y + c22 * z) / determinant
+        t0 = inverse[0] * x + inverse[1] * y + inverse[2] * z
+        t1 = inverse[1] * x + inverse[3] * y + inverse[4] * z
+        t2 = inverse[2] * x + inverse[4] * y + inverse[5] * z
         taken = t0 * sums[15] + t1 * sums[16] + t2 * sums[17]
         own = t0 * x + t1 * y + t2 * z
         if term == 0:
@@ -242,22 +240,62 @@ def leave_fitted(sums: Floats, said: FloatsOut) -> None:
 
 
 @compiled(error_model="numpy")
-def keep_left(left: Floats, size: int, lanes: Floats, k: int, pixels: TableOut, count: int) -> int:
-    """Append what the fit leaves of one lane's ``size`` pixels to ``pixels``; the new count."""
+def invert(a: float, b: float, c: float, d: float, e: float, f: float, inverse: FloatsOut) -> bool:
+    """Inverse of the symmetric matrix ``((a, b, c), (b, d, e), (c, e, f))``, in the same order.
+
+    Returns False, and leaves ``inverse`` (6,), where there is none.
+    """
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * c00 + b * c01 + c * c02
+    if not determinant > LEAST_DETERMINANT * a * d * f:
+        return False
+    inverse[0], inverse[1], inverse[2] = c00, c01, c02
+    inverse[3], inverse[4], inverse[5] = a * f - c * c, b * c - a * e, a * d - b * b
+    inverse /= determinant
+    return True
+
+
+@compiled(error_model="numpy")
+def keep_left(
+    left: Floats, size: int, lanes: Floats, k: int, noise: Floats, pixels: TableOut, count: int
+) -> int:
+    """Append what the fit leaves of one lane's ``size`` pixels to ``pixels``; the new count.
+
+    A fit follows each pixel by its leverage: of the noise's variance ``1 - leverage`` is left in
+    the residual, which is widened by that. Of the peak of a line that is half a pixel wide
+    nothing is left: such pixels do not tell the noise.
+    """
     centre, step = lanes[AT_CENTRE * LANES + k], lanes[STEP * LANES + k]
-    n = 0
+    inverse, sums = np.zeros(6), np.zeros(5)
     for at in range(size):
-        is_line = abs((at - centre) * step) < REACH_SIGMAS
-        n += 1 if is_line and left[3 * at * LANES + k] != NOT_SEEN else 0
-    freedom = math.sqrt(n / max(n - FIT_PARAMETERS, 1.0))
-    for at in range(size):
-        own = left[3 * at * LANES + k]
-        if own == NOT_SEEN:
+        m, u = left[3 * at * LANES + k], (at - centre) * step
+        if m == NOT_SEEN or not abs(u) < REACH_SIGMAS:
             continue
-        is_line = abs((at - centre) * step) < REACH_SIGMAS
-        pixels[0, count] = own
+        light = max(left[(3 * at + 1) * LANES + k], 0.0)
+        w = m * m / (noise[0] * m * m + noise[1] * light + noise[2])
+        power = w
+        for order in range(5):
+            sums[order] += power
+            power *= u
+    is_fitted = invert(sums[0], sums[1], sums[2], sums[2], sums[3], sums[4], inverse)
+    for at in range(size):
+        m, u = left[3 * at * LANES + k], (at - centre) * step
+        if m == NOT_SEEN:
+            continue
+        share = 1.0
+        if abs(u) < REACH_SIGMAS:
+            if not is_fitted:
+                continue
+            light = max(left[(3 * at + 1) * LANES + k], 0.0)
+            w = m * m / (noise[0] * m * m + noise[1] * light + noise[2])
+            taken = inverse[0] + 2.0 * u * inverse[1] + u * u * (2.0 * inverse[2] + inverse[3])
+            taken += u * u * u * (2.0 * inverse[4] + u * inverse[5])
+            share = 1.0 - w * taken
+            if share < LEAST_SHARE:
+                continue
+        pixels[0, count] = m
         pixels[1, count] = left[(3 * at + 1) * LANES + k]
-        pixels[2, count] = left[(3 * at + 2) * LANES + k] * (freedom if is_line else 1.0)
+        pixels[2, count] = left[(3 * at + 2) * LANES + k] / math.sqrt(share)
         count += 1
     return count
 
@@ -333,7 +371,7 @@ def weigh_section(
                     sums[m] = lanes[(SUMS + m) * LANES + k]
                 leave_fitted(sums, said[block + k])
             if pixels.shape[1] > 0:
-                count = keep_left(left, size, lanes, k, pixels, count)
+                count = keep_left(left, size, lanes, k, noise, pixels, count)
     return count
 
 

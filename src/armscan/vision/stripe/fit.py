@@ -51,9 +51,16 @@ from armscan.vision.stripe.ridge import (
 
 START_CONTRAST2 = 0.03
 START_PER_GAIN = 0.1
-BIN_EDGES = np.array([0.0, 0.01, 0.03, 0.07, 0.13, 0.22, 0.33, 0.46, 0.6, 0.75, 0.9, 1.2])
+BIN_EDGES = np.array(
+    [0.0, 0.01, 0.03, 0.07, 0.13, 0.22, 0.33, 0.46, 0.6, 0.75, 0.9, 1.2, 1.7, 2.5, 4.0, 8.0]
+)
 LEAST_PER_BIN = 30
 LEAST_VARIANCE = 0.02
+VARIANCE_SAMPLING = 3.0
+"""Relative variance of a bin's clipped mean square, times its count."""
+VARIANCE_MISFIT = 0.2
+"""What three terms leave of the noise's rise with the level, of a bin's variance."""
+VARIANCE_ROUNDS = 3
 
 
 def start_noise(background_noise: float) -> FloatArray:
@@ -67,7 +74,9 @@ def estimate_noise(
     """Fit ``v = C^2 m^2 + (m + background) / gain + read^2`` to squared residuals.
 
     The residuals are binned by the line's own grey level ``m``; each bin gives a robust variance,
-    and non-negative least squares gives the three terms.
+    and non-negative least squares gives the three terms. A bin of which the fit says too much by
+    some factor counts as one of which it says too little by it, and thousands of faint pixels no
+    more than a hundred bright ones: of lines unlike each other in one image, each has its say.
 
     ``pixels``: (3, >= n) of `kernels.stripe.section.weigh_section`, ``n_pixels`` of which count.
     ``peak``: amplitude of the bright ones. ``fallback``: (3,) what to return if there are too few
@@ -80,10 +89,13 @@ def estimate_noise(
         return fallback
     variance = np.maximum(spread, LEAST_VARIANCE)
     rows = np.stack([square, light, np.ones_like(count)], axis=1)
-    weight = np.sqrt(count) / variance
-    terms, _ = nnls(rows * weight[:, None], variance * weight)
-    terms[2] = max(terms[2], LEAST_VARIANCE)
-    return np.asarray(terms)
+    certain = 1.0 / np.sqrt(VARIANCE_SAMPLING / count + VARIANCE_MISFIT**2)
+    terms = fallback
+    for _ in range(VARIANCE_ROUNDS):
+        weight = certain / np.sqrt((rows @ terms) * variance)
+        terms = np.asarray(nnls(rows * weight[:, None], variance * weight)[0])
+        terms[2] = max(terms[2], LEAST_VARIANCE)
+    return terms
 
 
 MOST_SECTION = np.array([0.12, 0.03])
@@ -263,7 +275,7 @@ def fit_ridge(
         at = pick[good]
         fitted = _Sample.of(plane, table[at], sides[at], sample[good])
         peak = _nearly_largest(fitted.fits[:, AMPLITUDE])
-        noise = estimate_noise(*fitted.left(section), peak, noise)
+        noise = estimate_noise(*fitted.left(noise, section), peak, noise)
         said = fitted.said(noise, section)
         is_usable = (reach[at] >= REACH_SIGMAS) & (said[:, HAS_CORE] > 0.0)
         axis = table[at, 5].astype(np.int64)
@@ -327,10 +339,10 @@ class _Sample:
         reach = math.ceil(_nearly_largest(fits[:, SIGMA]) * SIDE_SPAN / 2.0)
         return cls(plane, points, sides, fits, reach)
 
-    def left(self, section: FloatArray) -> tuple[FloatArray, int]:
+    def left(self, noise: FloatArray, section: FloatArray) -> tuple[FloatArray, int]:
         """(3, >= n) pixels of `weigh_section`, and n."""
         pixels = np.zeros((3, len(self.fits) * (2 * self.reach + 1)))
-        n = self._weigh(np.zeros(3), section, np.zeros((0, SECTION_COLUMNS)), pixels)
+        n = self._weigh(noise, section, np.zeros((0, SECTION_COLUMNS)), pixels)
         return pixels, n
 
     def said(self, noise: FloatArray, section: FloatArray) -> FloatArray:

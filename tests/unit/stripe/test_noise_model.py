@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The noise model of a line's pixels, from residuals as fits leave them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import armscan.vision.stripe.fit
+from armscan.geometry.arrays import FloatArray
+from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.stripe.fit import estimate_noise, start_noise
+from rigs.stripe_image import StripeNoise, StripeScene
+from rigs.stripe_scenes import line
+
+PEAK = 75.0
+CONTRAST2, PER_GAIN, READ2 = 0.01, 0.2, 4.0
+
+
+def bright_pixels(rng: np.random.Generator) -> FloatArray:
+    """Levels, light and residuals across a line of speckle, shot noise and read noise."""
+    u = np.tile(np.linspace(-4.0, 4.0, 17), 150)
+    level = PEAK * np.exp(-0.5 * u * u)
+    sigma = np.sqrt(CONTRAST2 * level**2 + PER_GAIN * level + READ2)
+    return np.stack([level, level, rng.normal(0.0, sigma)])
+
+
+def variance_at_peak(pixels: FloatArray) -> float:
+    terms = start_noise(1.0)
+    for _ in range(2):
+        terms = estimate_noise(pixels, pixels.shape[1], PEAK, terms)
+    return float(terms @ [PEAK**2, PEAK, 1.0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_faint_lines_of_little_noise_leave_bright_ones_theirs(seed: int) -> None:
+    # Print edges that photographs shifted by part of a pixel leave are many and faint, and of
+    # another noise than the laser's speckle.
+    rng = np.random.default_rng(seed)
+    bright = bright_pixels(rng)
+    level = rng.uniform(0.13, 0.22, 2000) * PEAK
+    faint = np.stack([level, level, rng.normal(0.0, 0.3, 2000)])
+    truth = CONTRAST2 * PEAK**2 + PER_GAIN * PEAK + READ2
+    assert variance_at_peak(bright) == pytest.approx(truth, rel=0.3)
+    assert variance_at_peak(np.hstack([bright, faint])) == pytest.approx(truth, rel=0.3)
+
+
+@pytest.mark.parametrize("sigma_px", [0.6, 1.0, 2.5])
+def test_the_noise_of_a_line_is_told_whatever_its_width(
+    sigma_px: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Of five pixels across a narrow line a fit of three parameters follows most.
+    found = []
+
+    def note(*given: Any) -> FloatArray:
+        found.append(estimate_noise(*given))
+        return found[-1]
+
+    monkeypatch.setattr(armscan.vision.stripe.fit, "estimate_noise", note)
+    noise = StripeNoise(speckle=0.1)
+    for seed in range(6):
+        scene = StripeScene((line(8.0, sigma_px=sigma_px, peak=150.0),), 480, 300, noise=noise)
+        profile = extract_stripes(scene.expose(seed))
+        assert profile.is_accepted.mean() > 0.95
+        level = np.array([0.3, 1.0]) * 150.0
+        terms = np.stack([level**2, level, np.ones(2)])
+        found[-1] = found[-1] @ terms / (np.array([0.1**2, 0.1, 1.0 + 1.0 / 12.0]) @ terms)
+    ratio = np.array([one for one in found if one.shape == (2,)])
+    assert np.median(ratio, axis=0) == pytest.approx([1.0, 1.0], abs=0.15)

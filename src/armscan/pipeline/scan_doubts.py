@@ -51,7 +51,10 @@ EXPLAINS = 0.4
 KEEPS = 0.5
 """And if passes overlap at least this much as they did."""
 CLAIMED_SIGMAS = 5.0
-"""Where no passes overlap as read, a reading must agree within so many times what is claimed."""
+"""Where no passes overlap as read, a reading must agree within so many times what is claimed,"""
+SOUND_RATIO, SOUND_OVERLAP = 0.5, 0.5
+"""or as passes of a sound scan do, and over so large a part of the points: on a curved part what
+quadrics leave between stripes is far more than is claimed."""
 LAGS_MS = (1.0, 3.0, 8.0, 20.0, 50.0, 100.0)
 SEARCHED_POINTS = 2500
 """Points with which other readings are tried; the scan as read is compared with all of them."""
@@ -233,7 +236,7 @@ def _cause(scan: _Scan, full: PassAgreement | None) -> tuple[str, str]:
     found = pass_agreement(scan.stripes)
     for words, remedy, stripes in _readings(scan):
         other = pass_agreement(stripes)
-        if other is not None and _explains(other, found) and other.distance_mm < 0.9 * best:
+        if other is not None and _explains(other, found, scan) and other.distance_mm < 0.9 * best:
             best, cause = other.distance_mm, (words, remedy)
             if best < SUSPECT_SIGMAS * other.claimed_mm:
                 break
@@ -247,7 +250,7 @@ def _knocked(scan: _Scan, found: PassAgreement | None) -> tuple[str, str]:
     """Whether a head that sits elsewhere on the arm explains the disagreement."""
     moved = _other_hand_eye(scan.stripes)
     other = None if moved is None else pass_agreement(moved[0])
-    if moved is None or other is None or not _explains(other, found):
+    if moved is None or other is None or not _explains(other, found, scan):
         return "", ""
     return (
         f"a head that sits {moved[1]:.2g} mm and {moved[2]:.2g} deg elsewhere on the arm would "
@@ -256,11 +259,13 @@ def _knocked(scan: _Scan, found: PassAgreement | None) -> tuple[str, str]:
     )
 
 
-def _explains(other: PassAgreement, found: PassAgreement | None) -> bool:
+def _explains(other: PassAgreement, found: PassAgreement | None, scan: _Scan) -> bool:
     if other.ratio > WARNED_RATIO:
         return False
     if found is None:
-        return len(other.pairs) > 1 and other.distance_mm < CLAIMED_SIGMAS * other.claimed_mm
+        is_sound = other.ratio < SOUND_RATIO and other.n_points > SOUND_OVERLAP * len(scan.sheet)
+        is_certain = other.distance_mm < CLAIMED_SIGMAS * other.claimed_mm
+        return len(other.pairs) > 1 and (is_sound or is_certain)
     return (
         other.distance_mm < EXPLAINS * found.distance_mm and other.n_points > KEEPS * found.n_points
     )
@@ -363,6 +368,15 @@ def _other_poses(
             f"positions of the arm in {unit} would explain it",
             "give the translations of the poses in mm",
             scan.at(rotations, factor * translations),
+        )
+    for first, second in ((0, 1), (1, 2), (0, 2)):
+        order = [0, 1, 2]
+        order[first], order[second] = second, first
+        yield (
+            f"positions of the arm with {'xyz'[first]} and {'xyz'[second]} exchanged would "
+            "explain it",
+            "name the columns x_mm,y_mm,z_mm in the order in which the numbers stand",
+            scan.at(rotations, translations[:, order]),
         )
     for axis, name in enumerate("xyz"):
         mirror = np.eye(3)

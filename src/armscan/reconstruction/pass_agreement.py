@@ -273,7 +273,8 @@ def pass_distances(stripes: Stripes) -> PassDistances | None:
             about = surface.distances(rows, number)
             own_normal[about.row] = about.normal
     alike = np.abs(np.einsum("ni,ni->n", found.normal, own_normal[found.row]))
-    return found.of_rows(~(alike < SAME_FACE))
+    is_one_face = ~(alike < SAME_FACE)
+    return found.of_rows(is_one_face) if is_one_face.any() else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -97,6 +97,9 @@ def _other_angles(rotations: FloatArray, places: FloatArray) -> tuple[FloatArray
         (_other_angles, "angles"),
         (lambda r, t: (r, t / 25.4), "inches"),
         (lambda r, t: (r, t / 10.0), "centimetres"),
+        (lambda r, t: (r, t[:, [1, 0, 2]]), "x and y exchanged"),
+        (lambda r, t: (r, t[:, [0, 2, 1]]), "y and z exchanged"),
+        (lambda r, t: (r, t[:, [2, 1, 0]]), "x and z exchanged"),
     ],
 )
 def test_poses_taken_for_something_else(scan: BallScan, wrong: Misread, words: str) -> None:

@@ -149,7 +149,9 @@ def test_a_shift_along_a_surface_shows_by_its_slope() -> None:
 
 @pytest.mark.parametrize("turn_rad", [0.0, 0.7])
 def test_passes_that_saw_the_faces_beside_an_edge_are_not_compared(turn_rad: float) -> None:
-    assert pass_agreement(faces_of_a_block(turn_rad)) is None
+    stripes = faces_of_a_block(turn_rad)
+    assert pass_agreement(stripes) is None
+    assert pass_distances(stripes) is None
 
 
 def test_what_does_not_overlap_is_not_compared() -> None:

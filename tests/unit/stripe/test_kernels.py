@@ -354,28 +354,6 @@ def test_section_is_what_the_fit_leaves() -> None:
     assert np.std(pixels[2, :count]) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * count))
 
 
-@pytest.mark.parametrize("line_sigma", [0.8, 2.5])
-def test_residuals_are_widened_by_what_the_fit_took_of_each_pixel(line_sigma: float) -> None:
-    """Against the hat matrix of weighted least squares in NumPy."""
-    rng, noise = np.random.default_rng(3), np.array([0.01, 0.1, 1.0])
-    u = (np.arange(41) - 20.3) / line_sigma
-    light = 100.0 * np.exp(-0.5 * u * u)
-    image = (5.0 + light + rng.normal(0.0, 2.0, 41)).astype(np.float32)[None, :]
-    points = np.array([[20.0, 0.0, 1.0, 0.0, 0.0, 1.0]])
-    fits = np.array([[20.3, 100.0, line_sigma, 0.1, 0.0, 1.0, 0.0, 0.0]])
-    none, pixels = np.zeros((1, 1), np.uint8), np.zeros((3, 31))
-    given = (image, none, EVEN, points, np.full((1, 2), 5.0), fits, noise, np.zeros(4))
-    n = weigh_section(*given, 15, np.zeros((0, 8)), pixels)
-    near = np.abs(u) < 2.7
-    weight = 1.0 / np.sqrt(noise[0] * light**2 + noise[1] * (light + 5.0) + noise[2])[near]
-    slopes = (light * np.stack([np.ones(41), u, u * u]))[:, near].T * weight[:, None]
-    left = 1.0 - np.diag(slopes @ np.linalg.pinv(slopes))
-    expected = ((image[0] - 5.0 - light)[near] / np.sqrt(np.maximum(left, 1e-9)))[left > 0.2]
-    assert (left < 0.2).any() == (line_sigma < 1.0)
-    is_line = pixels[0, :n] > 100.0 * np.exp(-0.5 * 2.7**2)
-    assert pixels[2, :n][is_line] == pytest.approx(expected, rel=1e-4)
-
-
 def test_a_narrow_section_is_told_however_far_is_looked() -> None:
     """Wide lines of an image decide how far is looked; the bell of a narrow one is 0 there."""
     image = np.full((3, 401), 5.0, np.float32)

@@ -37,6 +37,7 @@ from armscan.vision.stripe.image import (
     colour_plane,
     has_laser_colour,
     is_on_known_ground,
+    laid_under,
     lit_plane,
     mono_plane,
     relative_reflectance,
@@ -97,6 +98,7 @@ def extract_stripes(
     options = options or StripeOptions()
     if background is not None:
         check_background(exposure, background)
+        background = laid_under(background, exposure)
     full_scale = exposure.full_scale / NORMAL_SCALE
     threshold = None if options.threshold is None else options.threshold / full_scale
     if exposure.colour == "mono" and background is None:

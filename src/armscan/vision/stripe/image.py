@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
@@ -107,6 +108,125 @@ def check_background(exposure: Exposure, background: Exposure) -> None:
             where=background.source,
             remedy="take both with the same camera settings",
         )
+
+
+SHIFT_STEPS, SHIFT_SETTLED_PX = 8, 0.002
+LEAST_SHIFT_PX, MOST_SHIFT_PX = 0.02, 2.0
+"""Less leaves no edge that is seen; to more the blurred edges do not lead."""
+CERTAIN_SHIFT, EXPLAINED = 6.0, 0.9
+"""Sigmas to which a shift must be known, and what it may leave of the scatter at edges: colours
+that a webcam makes up follow the light, and move nothing."""
+LANCZOS_PX = 4
+MOVE_REACH_PX = LANCZOS_PX + math.ceil(MOST_SHIFT_PX)
+EDGE_BLUR_PX = 1.0
+EDGE_SAMPLE, EDGE_SHARE, MOST_EDGES = 200_000, 0.2, 20_000
+"""Pixels that are looked at, and the part and count of them, the steepest, that are compared."""
+LEAST_EDGES = 200
+LEAST_GAIN = 0.2
+"""A view whose edges show by less in the other one is not the same view."""
+
+
+def laid_under(background: Exposure, exposure: Exposure) -> Exposure:
+    """The view without laser, moved to where the view with it was taken; itself if nothing moved.
+
+    Between two photographs of a scene that stands still, a tripod or a board on its stand often
+    moves by a tenth to a quarter of a pixel: print edges then stay in the difference as lines.
+    """
+    shift = shift_between(_grey(exposure), _grey(background))
+    if shift is None:
+        return background
+    image = np.rint(_moved(background.image, shift))
+    image = np.clip(image, 0.0, background.full_scale).astype(background.image.dtype)
+    return replace(background, image=np.ascontiguousarray(image))
+
+
+def shift_between(lit: FloatImage, dark: FloatImage) -> FloatArray | None:
+    """(2,) px by which what the dark view (H, W) shows lies farther right and down in the lit one.
+
+    It leaves least at the edges of the dark view (Lucas and Kanade 1981), by a trimmed fit that
+    allows another brightness, so that the laser's own pixels do not count. None if that is hardly
+    anything, or not certain.
+    """
+    lit, dark = (
+        np.asarray(cv2.GaussianBlur(image, (0, 0), EDGE_BLUR_PX), np.float32)
+        for image in (lit, dark)
+    )
+    v, u = _steepest(np.hypot(cv2.Scharr(dark, -1, 1, 0), cv2.Scharr(dark, -1, 0, 1)))
+    if not len(u):
+        return None
+    level, shift, unmoved = lit[v, u].astype(np.float64), np.zeros(2), np.inf
+    for k in range(SHIFT_STEPS):
+        there = _moved(dark, shift)
+        across = 0.5 * (there[v, u + 1] - there[v, u - 1])
+        down = 0.5 * (there[v + 1, u] - there[v - 1, u])
+        design = np.stack([there[v, u], np.ones(len(u)), across, down], axis=1, dtype=np.float64)
+        if k == 0:
+            unmoved = _trimmed_fit(design[:, :2], level).scatter
+        fit = _trimmed_fit(design, level)
+        if not fit.terms[0] > LEAST_GAIN:
+            return None
+        step = -fit.terms[2:] / fit.terms[0]
+        shift = shift + step
+        if not np.abs(shift).max() < MOST_SHIFT_PX:
+            return None
+        if np.abs(step).max() < SHIFT_SETTLED_PX:
+            break
+    sigma_px = float(fit.sigmas[2:].max() / fit.terms[0])
+    is_told = np.linalg.norm(shift) > max(LEAST_SHIFT_PX, CERTAIN_SHIFT * sigma_px)
+    return shift if is_told and fit.scatter < EXPLAINED * unmoved else None
+
+
+def _moved(image: ImageArray | FloatImage, shift: FloatArray) -> FloatImage:
+    """An image (H, W) or (H, W, 3), float32, moved by (2,) px right and down.
+
+    By Lanczos' kernel: with OpenCV's cubic one a shift of 0.25 px is found as 0.21 px.
+    """
+    at = np.arange(-MOVE_REACH_PX, MOVE_REACH_PX + 1.0)
+    kernels = np.sinc(at + shift[:, None]) * np.sinc((at + shift[:, None]) / LANCZOS_PX)
+    kernels[np.abs(at + shift[:, None]) >= LANCZOS_PX] = 0.0
+    across, down = kernels / kernels.sum(axis=1, keepdims=True)
+    levels = np.asarray(image, np.float32)
+    moved = cv2.sepFilter2D(levels, cv2.CV_32F, across, down, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(moved, np.float32)
+
+
+def _steepest(slope: FloatImage) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the steepest of a sample of pixels, none of them at the border."""
+    step, border = max(1, math.isqrt(slope.size // EDGE_SAMPLE)), MOVE_REACH_PX + 1
+    sample = slope[border:-border:step, border:-border:step]
+    count = min(int(EDGE_SHARE * sample.size), MOST_EDGES)
+    if count < LEAST_EDGES:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    chosen = np.argpartition(sample, -count, axis=None)[-count:]
+    v, u = np.divmod(np.sort(chosen), sample.shape[1])
+    return np.asarray(border + step * v), np.asarray(border + step * u)
+
+
+class _TrimmedFit(NamedTuple):
+    """Terms (K,) of linear least squares, their standard deviations, and what values scatter by."""
+
+    terms: FloatArray
+    sigmas: FloatArray
+    scatter: float
+
+
+def _trimmed_fit(design: FloatArray, values: FloatArray) -> _TrimmedFit:
+    """Linear least squares without outliers."""
+    use = np.ones(len(values), dtype=np.bool_)
+    for _ in range(ROUNDS):
+        normal = design[use].T @ design[use]
+        terms = np.linalg.lstsq(normal, design[use].T @ values[use], rcond=None)[0]
+        rest = values - design @ terms
+        scatter = max(robust_sigma(rest[use]), 1e-6)
+        sigmas = scatter * np.sqrt(np.maximum(np.diag(np.linalg.pinv(normal)), 0.0))
+        use = np.abs(rest) <= TRIM_SIGMAS * scatter
+    return _TrimmedFit(np.asarray(terms), np.asarray(sigmas), robust_sigma(rest))
+
+
+def _grey(exposure: Exposure) -> FloatImage:
+    """(H, W) float32 mean of the channels, as the image has them."""
+    image = exposure.image
+    return np.asarray(image if image.ndim == 2 else image.mean(axis=2), dtype=np.float32)
 
 
 def subtract(lit: FloatImage, dark: FloatImage, full_scale: float) -> FloatImage:

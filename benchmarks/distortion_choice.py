@@ -7,7 +7,8 @@ seeds from 1000).
 Each draw has its own lens (field of view 8 to 70 degrees, the size of each term at the image's
 corner drawn over the one before), image, noise and views; the board covers most of the image or
 only its middle. ``alike`` adds a smooth error field of its own to every view, as large as the
-noise: residuals of one view then are correlated.
+noise: residuals of one view then are correlated. ``--bow 0.005`` bows the board along x and y by up
+to that part of its length, as home-made boards are.
 
 Columns: *right* the chosen model frees what the lens has and no more; *less*, *more* it leaves out
 a coefficient that the lens has, frees one that it has not. *inside* the truth of fx, fy, cx, cy
@@ -73,12 +74,13 @@ def draw_camera(model: str, rng: np.random.Generator) -> CameraModel:
     )
 
 
-def draw(model: str, covers: str, *, alike: bool, seed: int) -> Draw:
+def draw(model: str, covers: str, *, alike: bool, bow: float, seed: int) -> Draw:
     rng = np.random.default_rng([seed, MODELS.index(model)])
     camera = draw_camera(model, rng)
     while len(camera.folded_border()):
         camera = draw_camera(model, rng)
     board = Chessboard(11, 8, 10.0)
+    bow_mm = 100.0 * bow * np.random.default_rng([seed, 100]).uniform(-1.0, 1.0, 2)
     share, reach = (0.55, 0.28) if covers == "all" else (0.3, 0.03)
     distance = 100.0 * camera.fx_px / (share * camera.width_px)
     noise = 10.0 ** rng.uniform(-2.0, -0.7)
@@ -90,6 +92,7 @@ def draw(model: str, covers: str, *, alike: bool, seed: int) -> Draw:
         distance_mm=distance,
         max_tilt_deg=40.0,
         reach=reach,
+        bow_mm=(float(bow_mm[0]), float(bow_mm[1])),
     )
     views = make_views(scene, seed)[0]
     if alike:
@@ -132,13 +135,13 @@ def chi2_of(fit: CameraFit, truth: CameraModel) -> float:
     return normalised_error(truth.parameters[:4], fit.camera.parameters[:4], fit.covariance[:4, :4])
 
 
-def row(model: str, covers: str, *, alike: bool, seeds: range) -> str:
+def row(model: str, covers: str, *, alike: bool, bow: float, seeds: range) -> str:
     limit = stats.chi2.ppf(0.95, 4)
     counts = {"right": 0, "less": 0, "more": 0}
     auto, free, width, off = [], [], [], []
     refused = 0
     for seed in seeds:
-        drawn = draw(model, covers, alike=alike, seed=seed)
+        drawn = draw(model, covers, alike=alike, bow=bow, seed=seed)
         fit = calibrate_camera(drawn.views)
         full = calibrate_camera(drawn.views, CameraOptions(distortion="k1k2p1p2k3", n_folds=0))
         if not isinstance(fit, CameraFit) or not isinstance(full, CameraFit):
@@ -168,6 +171,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--alike", choices=["no", "yes"])
+    parser.add_argument("--bow", type=float, default=0.0)
     given = parser.parse_args()
     seeds = range(given.first, given.first + given.draws)
     cv2.setNumThreads(1)
@@ -181,7 +185,7 @@ def main() -> None:
     for model, covers, alike in ROWS:
         if given.alike and alike != (given.alike == "yes"):
             continue
-        print(row(model, covers, alike=alike, seeds=seeds), flush=True)
+        print(row(model, covers, alike=alike, bow=given.bow, seeds=seeds), flush=True)
 
 
 if __name__ == "__main__":

@@ -94,6 +94,19 @@ def test_bow_of_the_board_is_found_and_judged() -> None:
     assert abs(fit.camera.fx_px - CAMERA.fx_px) < 4.0 * fit.sigma[0]
 
 
+def test_a_bow_hides_no_coefficient_of_the_lens() -> None:
+    """Models are chosen anew with the bow free: it passes for p1 and p2, and for their absence."""
+    distortion = np.array([-0.12, 0.1, 1.2e-3, 1e-3, 0.0])
+    camera, errors = replace(CAMERA, distortion=distortion), []
+    for seed, bow_mm in enumerate([(0.15, -0.1), (0.5, 0.4), (1.5, -1.0)]):
+        scene = Scene(camera=camera, noise_px=0.1, bow_mm=bow_mm)
+        fit = solved(make_views(scene, seed)[0])
+        assert {"p1", "p2"} <= set(fit.free_parameters)
+        truth, found = camera.parameters[:4], fit.camera.parameters[:4]
+        errors.append(normalised_error(truth, found, fit.covariance[:4, :4]))
+    assert np.mean(errors) < 4.0 + 4.0 * np.sqrt(8.0 / len(errors))
+
+
 def test_bowed_boards_do_not_spoil_the_camera_unasked() -> None:
     """Bows from none to plain ones: what is stated holds for all of them alike."""
     errors, found = [], 0

@@ -5,8 +5,9 @@ evidence for what comes out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -51,6 +52,7 @@ from armscan.calibration.cameras.robust import (
     excess_variance_px2,
     residuals_px,
     solve_robustly,
+    with_board_warp,
     with_excess,
     with_significant_bow,
 )
@@ -454,8 +456,13 @@ def _solve_model(
     observations = gather(used)
     sources = tuple(view.source for view in used)
 
+    @cache
     def solve(model: DistortionModel) -> Solution | FitFailure:
         return _solve(used, observations, prepared, model, options)
+
+    def bowed(model: DistortionModel) -> Solution | FitFailure:
+        flat = solve(model)
+        return flat if isinstance(flat, FitFailure) else with_board_warp(flat, options.max_steps)
 
     def validate(solution: Solution, reference: Solution) -> CrossValidation | None:
         on_points = replace(solution, weights=reference.weights)
@@ -465,8 +472,21 @@ def _solve_model(
         camera = solution.state.camera(observations.width_px, observations.height_px)
         return len(camera.folded_border()) > 0
 
+    def choose(
+        solving: Callable[[DistortionModel], Solution | FitFailure],
+    ) -> ChosenModel | FitFailure:
+        return choose_model(solving, validate, folds, chance_of_coefficients)
+
     if options.distortion == "auto" and options.n_folds:
-        return choose_model(solve, validate, folds, chance_of_coefficients)
+        chosen = choose(solve)
+        if isinstance(chosen, FitFailure) or not _is_bowed(chosen.solution, options):
+            return chosen
+        # what a bow does to the residuals hides coefficients, and passes for others
+        again = choose(bowed)
+        flat = again if isinstance(again, FitFailure) else solve(again.model)
+        if isinstance(again, FitFailure) or isinstance(flat, FitFailure):
+            return chosen
+        return replace(again, solution=flat) if _is_bowed(flat, options) else chosen
     model: DistortionModel = options.distortion
     reason = f"{model} was asked for"
     if model == "auto":
@@ -475,6 +495,11 @@ def _solve_model(
     if isinstance(solution, FitFailure):
         return solution
     return ChosenModel(model, solution, validate(solution, solution), reason)
+
+
+def _is_bowed(solution: Solution, options: CameraOptions) -> bool:
+    bow = with_significant_bow(solution, options.max_steps, is_wanted=options.solve_warp)
+    return not isinstance(bow, FitFailure) and bow[1] is not None
 
 
 def _solve(

@@ -7,7 +7,7 @@ Hand-eye first; then, from a plate and a stand-off that moves, the time between 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from armscan.jobs.job import Job, solved
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.hand_eye import (
     ObservedStripes,
+    measured_beside,
     observe_plate,
     observe_stripes,
     posed_stripes_from_profiles,
@@ -221,6 +222,10 @@ class HandEyeInputs:
 def _check_solved_along(artefact: Artefact, options: HandEyeOptions) -> None:
     if artefact.sphere_diameter_mm is not None and options.solve_plate:
         raise OptionError("a sphere has no plate to solve", remedy="leave --solve-plate out")
+    if artefact.sphere_diameter_mm is not None and artefact.side is not None:
+        raise OptionError("a sphere has no side that was touched", remedy="leave --side out")
+    if artefact.sphere_diameter_mm is not None and options.plate_flatness_mm is not None:
+        raise OptionError("a sphere has no flatness", remedy="leave --plate-flatness-mm out")
     if artefact.sphere_diameter_mm is None and options.solve_diameter:
         raise OptionError("a plate has no diameter to solve", remedy="leave --solve-diameter out")
 
@@ -271,7 +276,7 @@ def calibrate_hand_eye(
 
     n_steps = len(inputs.groups) + 1
     job.progress(ProgressEvent("solve", 0, n_steps))
-    fit = solve(inputs.stripes)
+    fit, stripes = _solved_where_it_moves(solve, inputs)
     if isinstance(fit, FitFailure):
         provenance = job.provenance(inputs.files, used, parents=parents, warnings=inputs.warnings)
         page = refused_page(
@@ -297,7 +302,7 @@ def calibrate_hand_eye(
     fit = replace(fit, warnings=(*inputs.warnings, *fit.warnings))
     provenance = job.provenance(inputs.files, used, parents=parents, warnings=fit.warnings)
     scanner = fit.scanner(inputs.sensor, provenance)
-    stripes = tuple(stripe.beside(fit.sensor_step) for stripe in inputs.stripes)
+    stripes = tuple(stripe.beside(fit.sensor_step) for stripe in stripes)
     page = hand_eye_page(
         fit,
         scanner,
@@ -324,6 +329,36 @@ def calibrate_hand_eye(
         extra = {**summary.extra, "thesis": data}
         summary = replace(summary, tables=(*summary.tables, table), extra=extra)
     return replace(summary, forced=provenance.forced)
+
+
+SENSOR_ROUNDS, STRAIGHT = 4, 0.03
+"""Solutions at most, and what the sensor's step may leave unlinear, over a point's own noise."""
+
+
+def _solved_where_it_moves(
+    solve: Callable[[Sequence[PosedStripe]], HandEyeFit | FitFailure], inputs: HandEyeInputs
+) -> tuple[HandEyeFit | FitFailure, tuple[PosedStripe, ...]]:
+    """The solution, and the stripes with which it was found, linearised by the sensor it stores.
+
+    The first round takes the derivatives at the sensor as it was given; a lens that is weakly known
+    moves so far that they do not hold at the image's border. Of two cameras they are kept.
+    """
+    stripes, sensor = inputs.stripes, inputs.sensor
+    fit = solve(stripes)
+    for _ in range(SENSOR_ROUNDS - 1):
+        if isinstance(fit, FitFailure) or sensor is None or sensor.second is not None:
+            break
+        if fit.sensor_step is None:
+            break
+        moved = fit.sensor_after(sensor)
+        found, bend = measured_beside(stripes, inputs.images, moved, fit.sensor_step)
+        if bend < STRAIGHT:
+            break
+        again = solve(found)
+        if isinstance(again, FitFailure):
+            break
+        fit, stripes = again, found
+    return fit, stripes
 
 
 def calibrate_latency(

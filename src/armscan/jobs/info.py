@@ -141,7 +141,7 @@ def describe_scanner(path: Path) -> dict[str, Any]:
     sensor = calibration.sensor
     second = None if sensor is None else sensor.second
     sheets = "no images" if sensor is None else f"{len(sensor.sheets)} light sheets"
-    sigma = np.sqrt(np.diag(hand_eye.covariance))
+    sigma = np.sqrt(np.diag(calibration.covariance)[-len(HAND_EYE_PARAMETER_NAMES) :])
     pose = hand_eye.tool_from_sensor
     values = [*pose.rotation_vector_rad, *pose.translation_mm]
     names = [name.replace("rotation_", "rotation_vector_") for name in HAND_EYE_PARAMETER_NAMES]

@@ -15,7 +15,7 @@ from armscan.calibration.hand_eye.observations import (
 from armscan.calibration.latency import PlateLooks, plate_looks
 from armscan.devices.sources import ScanSource
 from armscan.errors import EstimationError
-from armscan.geometry.arrays import IntArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
@@ -30,9 +30,9 @@ from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.scan import check_poses
 from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.reconstruction.place import delivered_points
-from armscan.reconstruction.points import MeasuredProfile
+from armscan.reconstruction.points import MeasuredProfile, points_again
 from armscan.reconstruction.sync import exposure_poses
-from armscan.reconstruction.triangulate import sensor_columns
+from armscan.reconstruction.triangulate import StripePoints, sensor_columns
 from armscan.records.exposure import Exposure
 from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
@@ -264,10 +264,6 @@ def posed_stripe(
         As the arm reported it.
     """
     points = measured.points
-    by_all = np.zeros((len(points), 3, len(sensor.parameter_names)))
-    for k in range(len(sensor.sheets)):
-        rows = np.flatnonzero(points.sheet == k)
-        by_all[np.ix_(rows, np.arange(3), sensor_columns(sensor, k))] = points.by_sensor[rows]
     return PosedStripe(
         source=measured.labelled.profile.source,
         posture=posture,
@@ -275,8 +271,65 @@ def posed_stripe(
         points_mm=points.points_mm,
         noise_mm=points.noise_mm,
         sheet=points.sheet,
-        dpoint_dsensor=by_all,
+        dpoint_dsensor=_by_all(points, sensor),
     )
+
+
+def _by_all(points: StripePoints, sensor: SensorCalibration) -> FloatArray:
+    """(N, 3, P) derivative of points by all the sensor's parameters."""
+    by_all = np.zeros((len(points), 3, len(sensor.parameter_names)))
+    for k in range(len(sensor.sheets)):
+        rows = np.flatnonzero(points.sheet == k)
+        by_all[np.ix_(rows, np.arange(3), sensor_columns(sensor, k))] = points.by_sensor[rows]
+    return by_all
+
+
+def measured_beside(
+    stripes: Sequence[PosedStripe],
+    images: Sequence[LabelledProfile],
+    moved: SensorCalibration,
+    sensor_step: FloatArray,
+) -> tuple[tuple[PosedStripe, ...], float]:
+    """The stripes with derivatives by the sensor that are taken where a solution has moved it.
+
+    A step that is large, of a weakly known lens, is not linear at the image's border. The points
+    given back are those that lie, by their derivatives, where the moved sensor sees them once the
+    step is added (`PosedStripe.beside`).
+
+    Parameters
+    ----------
+    stripes, images
+        What was measured, in equal order; of a sensor of one camera.
+    moved
+        The sensor after the step.
+    sensor_step
+        (P,) from the sensor with which the stripes were measured.
+
+    Returns
+    -------
+    stripes, bend
+        Root mean square over the points of how far they move beside where the derivatives at the
+        sensor before put them, over their noise.
+    """
+    found: list[PosedStripe] = []
+    squares = [np.zeros(0)]
+    for stripe, image in zip(stripes, images, strict=True):
+        points = points_again(image, moved)
+        if len(points) != len(stripe.points_mm):
+            found.append(stripe)  # some meet the moved sheet no more
+            continue
+        by_all = _by_all(points, moved)
+        linear = stripe.beside(sensor_step).points_mm
+        noise = np.sqrt((points.noise_mm**2).sum(axis=(1, 2)))
+        squares.append(
+            ((points.points_mm - linear) ** 2).sum(axis=1) / np.maximum(noise, 1e-9) ** 2
+        )
+        place = points.points_mm - by_all @ sensor_step
+        found.append(
+            replace(stripe, points_mm=place, noise_mm=points.noise_mm, dpoint_dsensor=by_all)
+        )
+    every = np.concatenate(squares)
+    return tuple(found), float(np.sqrt(every.mean())) if len(every) else 0.0
 
 
 def _spread(rows: IntArray, most: int) -> IntArray:

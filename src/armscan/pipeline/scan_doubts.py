@@ -369,14 +369,12 @@ def _other_poses(
             "give the translations of the poses in mm",
             scan.at(rotations, factor * translations),
         )
-    for first, second in ((0, 1), (1, 2), (0, 2)):
-        order = [0, 1, 2]
-        order[first], order[second] = second, first
+    for order in ("yxz", "xzy", "zyx", "yzx", "zxy"):
         yield (
-            f"positions of the arm with {'xyz'[first]} and {'xyz'[second]} exchanged would "
+            f"positions of the arm whose numbers stand in the order {', '.join(order)} would "
             "explain it",
             "name the columns x_mm,y_mm,z_mm in the order in which the numbers stand",
-            scan.at(rotations, translations[:, order]),
+            scan.at(rotations, translations[:, [order.index(axis) for axis in "xyz"]]),
         )
     for axis, name in enumerate("xyz"):
         mirror = np.eye(3)

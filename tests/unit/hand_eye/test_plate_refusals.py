@@ -232,10 +232,15 @@ def test_a_plate_that_moved_after_probing_is_refused_with_its_distance(by_mm: fl
     assert ("below" in fit.reason) == (by_mm > 0.0)
 
 
-def test_a_moved_plate_that_is_solved_along_is_held_by_the_stated_covariance() -> None:
+@pytest.mark.parametrize("by_mm", [0.5, 5.0])
+def test_a_moved_plate_that_is_solved_along_is_held_by_the_stated_covariance(by_mm: float) -> None:
+    """The plane that is given is a start only, and what is shown is the one that was found."""
     stripes, plate = _scan()
-    fit = calibrate_on_plate(stripes, _raised(plate, 0.5), HandEyeOptions(solve_plate=True))
+    fit = calibrate_on_plate(stripes, _raised(plate, by_mm), HandEyeOptions(solve_plate=True))
     assert isinstance(fit, HandEyeFit)
+    given = np.array(plate.plane.coefficients)
+    shown = dict(fit.reference)["plate"].replace("- ", "-").replace("+ ", "+").split()
+    assert [float(shown[k]) for k in (0, 2, 4, 6)] == pytest.approx(given, abs=0.2)
     error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
     assert error @ np.linalg.solve(fit.calibration.covariance, error) < CHI2_999
 

@@ -20,7 +20,13 @@ from armscan.models.calibration import (
     SensorCalibration,
 )
 from armscan.models.light_sheet import LightSheet
-from armscan.pipeline.hand_eye import ObservedStripes, _left_out, observe_stripes
+from armscan.pipeline.hand_eye import (
+    ObservedStripes,
+    _left_out,
+    measured_beside,
+    observe_stripes,
+)
+from armscan.reconstruction.points import points_again
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from rigs.plain_scanner import plain_camera, stored_sheet
@@ -172,6 +178,31 @@ def test_images_and_poses_give_the_hand_eye() -> None:
     assert coupling is not None and coupling.shape == (6, 17)
     assert len(run.seen.images) == len(run.seen.stripes) == 16
     assert run.seen.warnings == ()
+
+
+def test_stripes_are_linearised_where_the_sensor_is_moved_to() -> None:
+    """There they lie on the moved sensor's points; what is left beside the first is a square."""
+    sensor = _sensor()
+    seen = observe_stripes(DrawnScan(), sensor)
+    step = np.zeros(17)
+    step[[0, 1, 4, 5]], step[9:12] = [4.0, 3.0, 0.02, -0.1], [0.1, -0.05, 1e-3]
+    bends = []
+    for share in (0.5, 1.0):
+        moved = sensor.updated(share * step, sensor.covariance)
+        found, bend = measured_beside(seen.stripes, seen.images, moved, share * step)
+        bends.append(bend)
+        for stripe, image in zip(found, seen.images, strict=True):
+            expected = points_again(image, moved).points_mm
+            assert stripe.beside(share * step).points_mm == pytest.approx(expected, abs=1e-9)
+            nearby = 1e-4 * step
+            other = points_again(image, sensor.updated(share * step + nearby, sensor.covariance))
+            beside = stripe.beside(share * step + nearby).points_mm
+            assert beside == pytest.approx(other.points_mm, abs=1e-6)
+    assert bends[1] > 0.5
+    assert bends[1] / bends[0] == pytest.approx(4.0, rel=0.1)
+    still, none = measured_beside(seen.stripes, seen.images, sensor, np.zeros(17))
+    assert none < 1e-6
+    assert len(still) == len(seen.stripes)
 
 
 def test_without_views_exposures_at_one_place_are_one_posture() -> None:

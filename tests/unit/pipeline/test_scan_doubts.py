@@ -97,9 +97,11 @@ def _other_angles(rotations: FloatArray, places: FloatArray) -> tuple[FloatArray
         (_other_angles, "angles"),
         (lambda r, t: (r, t / 25.4), "inches"),
         (lambda r, t: (r, t / 10.0), "centimetres"),
-        (lambda r, t: (r, t[:, [1, 0, 2]]), "x and y exchanged"),
-        (lambda r, t: (r, t[:, [0, 2, 1]]), "y and z exchanged"),
-        (lambda r, t: (r, t[:, [2, 1, 0]]), "x and z exchanged"),
+        (lambda r, t: (r, t[:, [1, 0, 2]]), "order y, x, z"),
+        (lambda r, t: (r, t[:, [0, 2, 1]]), "order x, z, y"),
+        (lambda r, t: (r, t[:, [2, 1, 0]]), "order z, y, x"),
+        (lambda r, t: (r, t[:, [1, 2, 0]]), "order y, z, x"),
+        (lambda r, t: (r, t[:, [2, 0, 1]]), "order z, x, y"),
     ],
 )
 def test_poses_taken_for_something_else(scan: BallScan, wrong: Misread, words: str) -> None:

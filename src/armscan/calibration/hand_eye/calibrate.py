@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.calibration.hand_eye.alternatives import find_mirror
+from armscan.calibration.hand_eye.alternatives import find_free_plane, find_mirror
 from armscan.calibration.hand_eye.checks import (
     LIKELIER,
     MOST_OPEN_MM,
@@ -170,9 +170,13 @@ def _refuse_start(
 ) -> FitFailure | None:
     state = problem.start(start.tool_from_sensor)
     refusal = refuse_underdetermined(conditioning_at(problem, state), cause, VARY_POSTURES)
-    if refusal is None and not start.typical_mm <= problem.far_mm(problem.place(state)):
-        return explain_misfit(problem, plate, start)
-    return refusal
+    limit_mm = problem.far_mm(problem.place(state))
+    if refusal is not None or start.typical_mm <= limit_mm:
+        return refusal
+    free = find_free_plane(problem, plate) if problem.options.solve_plate else None
+    if free is not None and free[2] <= limit_mm:
+        return None  # the plane that was given is a start only
+    return explain_misfit(problem, plate, start)
 
 
 def _fit_on_plate(

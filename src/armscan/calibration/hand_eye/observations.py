@@ -110,9 +110,10 @@ class HandEyeOptions:
     def __post_init__(self) -> None:
         scatters = ("arm_position_mm", "exposure_position_mm", "plate_flatness_mm")
         for name in (*scatters, "sheet_shape_mm", "stripe_noise_factor"):
-            self._check(name, 0.0, math.inf, "give 0 or more, or leave it out to have it estimated")
+            remedy = "give 0 or more, below 1000, or leave it out to have it estimated"
+            self._check(name, 0.0, 1000.0, remedy)
         for name in ("arm_rotation_rad", "exposure_rotation_rad"):
-            self._check(name, 0.0, 0.1, "0 or more, below 0.1 rad: give rad, not degrees")
+            self._check(name, 0.0, 0.1, "give 0 or more, below 0.1 rad (5.7 degrees)")
         self._check("flatness_length_mm", 1.0, 1000.0, "give 1 to 1000 mm")
         self._check("per_stripe", 4, 100, "give 4 to 100")
         self._check("posture_sigmas", 1.5, math.inf, "give at least 1.5")

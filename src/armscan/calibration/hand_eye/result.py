@@ -285,12 +285,13 @@ def posture_results(
 def plate_facts(checked: CheckedFit, plate: PlateSurface) -> tuple[tuple[str, str], ...]:
     """What the plate was, and what was taken for scatter, as (label, value)."""
     reference, fit = plate.reference, checked.fit
-    a, b, c, d = plate.plane.coefficients
+    is_solved = fit.problem.options.solve_plate
+    a, b, c, d = (plane_after(fit) or plate.plane if is_solved else plate.plane).coefficients
     facts = [("plate", f"{a:.6f} x {_signed(b)} y {_signed(c)} z {_signed(d, 4)} = 0 in Base (mm)")]
     if reference.n_points:
         rms = "" if reference.rms_mm is None else f", {reference.rms_mm:.4f} mm rms from it"
         facts.append(("probed", f"{reference.n_points} points{rms}"))
-    if fit.problem.options.solve_plate:
+    if is_solved:
         facts.append(("plane", "solved along, without regard to the probing"))
     elif reference.covariance is None and reference.n_points:
         facts.append(("plane", "taken as exact: the probed plate's uncertainty is not known"))
@@ -316,7 +317,7 @@ def _sensor_in_words(fit: HandEyeSolution) -> str:
     """By how much the stripes move the sensor's points; empty where it was taken as exact."""
     observations, step = fit.problem.observations, fit.state.sensor
     by_sensor, covariance = observations.dpoint_dsensor, observations.sensor_covariance
-    if step is None or by_sensor is None or covariance is None:
+    if step is None or by_sensor is None or covariance is None or not covariance.any():
         return ""
     moved_mm = float(np.sqrt(((by_sensor @ step) ** 2).sum(axis=1).mean()))
     stated = np.einsum("nip,pq,niq->n", by_sensor, covariance, by_sensor, optimize=True)

@@ -131,6 +131,7 @@ def laid_under(background: Exposure, exposure: Exposure) -> Exposure:
 
     Between two photographs of a scene that stands still, a tripod or a board on its stand often
     moves by a tenth to a quarter of a pixel: print edges then stay in the difference as lines.
+    The steepest edges of the view decide: what moves by itself before steeper ones is not seen.
     """
     shift = shift_between(_grey(exposure), _grey(background))
     if shift is None:
@@ -151,12 +152,13 @@ def shift_between(lit: FloatImage, dark: FloatImage) -> FloatArray | None:
         np.asarray(cv2.GaussianBlur(image, (0, 0), EDGE_BLUR_PX), np.float32)
         for image in (lit, dark)
     )
-    v, u = _steepest(np.hypot(cv2.Scharr(dark, -1, 1, 0), cv2.Scharr(dark, -1, 0, 1)))
+    every = max(1, math.isqrt(dark.size // EDGE_SAMPLE))
+    v, u = _steepest(np.hypot(cv2.Scharr(dark, -1, 1, 0), cv2.Scharr(dark, -1, 0, 1)), every)
     if not len(u):
         return None
     level, shift, unmoved = lit[v, u].astype(np.float64), np.zeros(2), np.inf
     for k in range(SHIFT_STEPS):
-        there = _moved(dark, shift)
+        there = dark if k == 0 else _moved(dark, shift)
         across = 0.5 * (there[v, u + 1] - there[v, u - 1])
         down = 0.5 * (there[v + 1, u] - there[v - 1, u])
         design = np.stack([there[v, u], np.ones(len(u)), across, down], axis=1, dtype=np.float64)
@@ -167,13 +169,16 @@ def shift_between(lit: FloatImage, dark: FloatImage) -> FloatArray | None:
             return None
         step = -fit.terms[2:] / fit.terms[0]
         shift = shift + step
-        if not np.abs(shift).max() < MOST_SHIFT_PX:
+        if not np.abs(shift).max() < MOST_SHIFT_PX or np.abs(shift).max() < 0.5 * LEAST_SHIFT_PX:
             return None
         if np.abs(step).max() < SHIFT_SETTLED_PX:
             break
-    sigma_px = float(fit.sigmas[2:].max() / fit.terms[0])
-    is_told = np.linalg.norm(shift) > max(LEAST_SHIFT_PX, CERTAIN_SHIFT * sigma_px)
-    return shift if is_told and fit.scatter < EXPLAINED * unmoved else None
+    # pixels that are nearer to each other than the blur is wide share their noise
+    shared = max(1.0, 2.0 * math.sqrt(math.pi) * EDGE_BLUR_PX / every)
+    sigma_px = shared * fit.sigmas[2:] / fit.terms[0]
+    shift = np.where(np.abs(shift) > CERTAIN_SHIFT * sigma_px, shift, 0.0)
+    is_told = np.linalg.norm(shift) > LEAST_SHIFT_PX and fit.scatter < EXPLAINED * unmoved
+    return shift if is_told else None
 
 
 def _moved(image: ImageArray | FloatImage, shift: FloatArray) -> FloatImage:
@@ -190,16 +195,16 @@ def _moved(image: ImageArray | FloatImage, shift: FloatArray) -> FloatImage:
     return np.asarray(moved, np.float32)
 
 
-def _steepest(slope: FloatImage) -> tuple[IntArray, IntArray]:
-    """Rows and columns of the steepest of a sample of pixels, none of them at the border."""
-    step, border = max(1, math.isqrt(slope.size // EDGE_SAMPLE)), MOVE_REACH_PX + 1
-    sample = slope[border:-border:step, border:-border:step]
+def _steepest(slope: FloatImage, every: int) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the steepest of ``every`` so many pixels, none of them at the border."""
+    border = MOVE_REACH_PX + 1
+    sample = slope[border:-border:every, border:-border:every]
     count = min(int(EDGE_SHARE * sample.size), MOST_EDGES)
     if count < LEAST_EDGES:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     chosen = np.argpartition(sample, -count, axis=None)[-count:]
     v, u = np.divmod(np.sort(chosen), sample.shape[1])
-    return np.asarray(border + step * v), np.asarray(border + step * u)
+    return np.asarray(border + every * v), np.asarray(border + every * u)
 
 
 class _TrimmedFit(NamedTuple):

@@ -357,14 +357,18 @@ def _strange(
             f"given for the {word} one: left and right are swapped",
             "swap the lists of images, or the two calibrations",
         )
-    with_given, with_other = (_rms_px(views, given[k].camera) for k in (side, 1 - side))
-    if with_given < STRANGE_RATIO * own.rms_px:
+    # Of its own camera, too, with flat boards: its fit holds the bow of a bent one.
+    with_own, with_given, with_other = (
+        rms_of_poses_px(views, camera)
+        for camera in (own.camera, given[side].camera, given[1 - side].camera)
+    )
+    if with_given < STRANGE_RATIO * with_own:
         return None
     reason = (
         f"the {word} images do not fit the calibration given for the {word} camera: rms "
-        f"{with_given:.2f} px, and {own.rms_px:.2f} px with a camera of their own"
+        f"{with_given:.2f} px, and {with_own:.2f} px with a camera of their own"
     )
-    if with_other < STRANGE_RATIO * own.rms_px:
+    if with_other < STRANGE_RATIO * with_own:
         return FitFailure(
             f"{reason}; they fit that of the {other} camera ({with_other:.2f} px)",
             "swap the lists of images, or the two calibrations",
@@ -385,8 +389,11 @@ def _level(own: CameraFit, given: CameraCalibration) -> float:
     return float(white @ (apart / sigma)) / len(free)
 
 
-def _rms_px(views: Sequence[TargetView], camera: CameraModel) -> float:
-    """Of the poses alone; infinite if the camera cannot have taken the images."""
+def rms_of_poses_px(views: Sequence[TargetView], camera: CameraModel) -> float:
+    """Residuals of views in px if nothing but their poses is solved; flat targets.
+
+    Infinite if the camera cannot have taken the images.
+    """
     residuals = []
     for view in views:
         if (view.width_px, view.height_px) != (camera.width_px, camera.height_px):

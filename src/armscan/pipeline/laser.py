@@ -11,6 +11,9 @@ from typing import cast, get_args
 
 import numpy as np
 
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.pairs import STRANGE_RATIO, rms_of_poses_px
+from armscan.calibration.cameras.result import CameraOptions
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.board_points import (
     HeadCameras,
@@ -73,6 +76,10 @@ LEAST_SHARE = {3: 0.1, 8: 0.5}
 LEAST_SCATTER_PX = 0.1
 """Scatter below this does not make a channel better: boards and lens are not known better."""
 CHANNELS: tuple[LaserColour, ...] = get_args(LaserColour)[1:]
+OWN_CAMERA = CameraOptions(distortion="k1k2p1p2", n_folds=0)
+FEWEST_OF_OWN_CAMERA = 5
+"""Boards from which on a camera is solved from them, to be set beside the given one: of fewer, it
+takes up how they are bent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,11 +215,40 @@ def _fit_sheets(
             f"{skipped[0].reason}",
             "check the target's description and that the board is lit in one image of each pair",
         )
+    about_camera = about_cameras(boards, HeadCameras.of(camera))
     fit = calibrate_sheets(boards, camera, options)
     if isinstance(fit, FitFailure):
         lost = "; ".join(f"{image.source}: {image.reason}" for image in skipped)
-        return FitFailure(f"{fit.reason} (not used: {lost})", fit.remedy) if lost else fit
-    return replace(fit, skipped=(*skipped, *fit.skipped))
+        reason = f"{fit.reason} (not used: {lost})" if lost else fit.reason
+        return FitFailure("; ".join((reason, *about_camera)), fit.remedy)
+    warnings = (*about_camera, *fit.warnings)
+    return replace(fit, skipped=(*skipped, *fit.skipped), warnings=warnings)
+
+
+def about_cameras(boards: Sequence[BoardStripes], cameras: HeadCameras) -> tuple[str, ...]:
+    """Names cameras that fit the boards far worse than one that is solved from them.
+
+    The poses take up most of a wrong focal length and the boards' bow some of a wrong distortion,
+    so that the stripes alone tell little of either.
+    """
+    said = []
+    for number in sorted({board.camera for board in boards}):
+        of_place = {board.place: board.view for board in boards if board.camera == number}
+        views = [replace(view, source=place) for place, view in of_place.items()]
+        own = calibrate_camera(views, OWN_CAMERA) if len(views) >= FEWEST_OF_OWN_CAMERA else None
+        if own is None or isinstance(own, FitFailure):
+            continue
+        given_px, own_px = (
+            rms_of_poses_px(views, model) for model in (cameras.model(number), own.camera)
+        )
+        if given_px >= STRANGE_RATIO * own_px:
+            word = "camera" if cameras.second is None else ("left camera", "right camera")[number]
+            said.append(
+                f"the boards fit the given {word} to {given_px:.2f} px (rms) only, and one solved "
+                f"from them to {own_px:.2f} px: it is not that of these photographs, or its focus "
+                "or zoom was moved since; calibrate it anew, as it is"
+            )
+    return tuple(said)
 
 
 def calibrate_sheets_again(

@@ -183,11 +183,13 @@ def unit_of(name: str) -> str:
 
 def hold_out_quantity(held_out: Any, what: str) -> Quantity:
     """The residual of a hold-out (``rms_px``, ``rms_in_sample_px``, ``n_folds``), or none."""
+    label = f"On {what} it has not seen"
     if held_out is None:
-        return Quantity("hold_out_rms_px", "", None)
+        few = f"too few {what} to hold some of them back"
+        return Quantity("hold_out_rms_px", label, None, shown="not known", meaning=few)
     return Quantity(
         "hold_out_rms_px",
-        f"On {what} it has not seen",
+        label,
         held_out.rms_px,
         shown=f"{significant(held_out.rms_px)} px rms",
         meaning=f"{held_out.n_folds}-fold hold-out; "

@@ -21,7 +21,7 @@ from armscan.models.calibration import FTest
 from armscan.pipeline.cameras import camera_calibration
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, StripeFlag
-from armscan.report.camera import camera_page
+from armscan.report.camera import camera_page, camera_quantities
 from armscan.report.charts import ARROW_SHARE, magnification
 from armscan.report.page import render_page
 from armscan.report.photographs import FLAG_COLOURS
@@ -73,6 +73,18 @@ def test_camera_page_shows_numbers_views_and_reasons() -> None:
     assert "Bow along x" in text
     assert page.count(b"<svg") == 3
     assert f"{fit.n_views} of {len(sources) + 1} images used" in text
+
+
+def test_camera_page_says_that_there_was_no_hold_out() -> None:
+    """Of three photographs two are left, and two solve no camera."""
+    views, _ = make_views(Scene(n_views=3), seed=3)
+    fit = calibrate_camera(views)
+    assert isinstance(fit, CameraFit)
+    assert fit.cross_validation is None
+    text = text_of(render_page(camera_page(fit, (), {}, PROVENANCE)))
+    assert "On images it has not seen not known" in text
+    (told,) = (item for item in camera_quantities(fit, 3) if item.key == "hold_out_rms_px")
+    assert told.value is None
 
 
 def test_residual_arrows_are_enlarged_by_a_round_number() -> None:

@@ -97,7 +97,7 @@ def test_a_recording_with_a_sensor_only_stays_in_the_sensor(
         ({"--plane": "0,0,0,1"}, "normal A,B,C is zero"),
         ({"--plane": "1,2"}, "4 are needed"),
         ({"--profiles": "p*.csv"}, "do not mix"),
-        ({"--arm-rotation-deg": "20"}, "give rad"),
+        ({"--arm-rotation-deg": "20"}, "below 0.1 rad (5.7 degrees)"),
         ({"--euler": "zyx"}, "no rotation convention"),
         ({"--plane": None, "--plate": "absent.csv"}, "no such file"),
         ({"--sensor": "absent.json"}, "no such file"),

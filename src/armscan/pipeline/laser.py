@@ -5,7 +5,7 @@ the stripes, extraction, and the fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast, get_args
 
@@ -48,7 +48,7 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.observations import Observations
-from armscan.vision.stripe.image import SIGMA_RANGE_PX, StripeOptions
+from armscan.vision.stripe.image import SIGMA_RANGE_PX, StripeOptions, shift_of
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import numberings, renumbered, settle_target
 from armscan.vision.targets.repeated_print import does_repeat, predict_print
@@ -216,13 +216,41 @@ def _fit_sheets(
             "check the target's description and that the board is lit in one image of each pair",
         )
     about_camera = about_cameras(boards, HeadCameras.of(camera))
+    about_views = about_moved_views(
+        (pair, item.view)
+        for pair, item in zip(pairs, found, strict=True)
+        if isinstance(item, BoardStripes)
+    )
     fit = calibrate_sheets(boards, camera, options)
     if isinstance(fit, FitFailure):
         lost = "; ".join(f"{image.source}: {image.reason}" for image in skipped)
         reason = f"{fit.reason} (not used: {lost})" if lost else fit.reason
         return FitFailure("; ".join((reason, *about_camera)), fit.remedy)
-    warnings = (*about_camera, *fit.warnings)
+    warnings = (*about_camera, *about_views, *fit.warnings)
     return replace(fit, skipped=(*skipped, *fit.skipped), warnings=warnings)
+
+
+SAID_SHIFT_PX = 0.3
+"""Less is made good, and moves a board by less than its own points tell."""
+
+
+def about_moved_views(shown: Iterable[tuple[ExposurePair, TargetView]]) -> tuple[str, ...]:
+    """Says of views without laser that they lie beside those with it (`laid_under`)."""
+    found: list[tuple[float, str]] = []
+    for (exposure, background), view in shown:
+        if background is None:
+            continue
+        shift = shift_of(around_board(view, background), around_board(view, exposure))
+        found.append((0.0 if shift is None else float(np.linalg.norm(shift)), exposure.source))
+    largest_px, where = max(found, default=(0.0, ""))
+    if largest_px < SAID_SHIFT_PX:
+        return ()
+    n_moved = sum(1 for px, _ in found if px >= SAID_SHIFT_PX)
+    return (
+        f"{n_moved} of {len(found)} views without laser were taken {SAID_SHIFT_PX:g} to "
+        f"{largest_px:.1f} px beside those with it (most in {where}); they were moved under them: "
+        "fasten camera and board, and switch the laser without touching either",
+    )
 
 
 def about_cameras(boards: Sequence[BoardStripes], cameras: HeadCameras) -> tuple[str, ...]:

@@ -7,9 +7,11 @@ import pytest
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from armscan.geometry.arrays import FloatArray
+from armscan.pipeline.laser import about_moved_views
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import laid_under, shift_between
+from armscan.vision.targets.target import TargetView
 
 FINE = 5
 HEIGHT, WIDTH = 240, 320
@@ -103,3 +105,22 @@ def test_colours_are_moved_together() -> None:
     moved = laid_under(in_colour[1], in_colour[0]).image
     assert moved.shape == (HEIGHT, WIDTH, 3)
     assert (moved == laid_under(dark, lit).image[:, :, None]).all()
+
+
+def test_a_person_is_told_of_views_that_were_moved() -> None:
+    corners = np.array([[20.0, 20.0], [300.0, 20.0], [300.0, 220.0], [20.0, 220.0]])
+    board = np.column_stack([corners, np.zeros(4)])
+    view = TargetView(
+        source="board",
+        width_px=WIDTH,
+        height_px=HEIGHT,
+        point_index=np.arange(4),
+        points_px=corners,
+        covariance_px2=np.tile(0.01 * np.eye(2), (4, 1, 1)),
+        points_board_mm=board,
+    )
+    moved, still = pair((0.4, 0.2), seed=6), pair((0.0, 0.0), seed=7)
+    (said,) = about_moved_views([(moved, view), (still, view), ((still[0], None), view)])
+    assert "1 of 2 views" in said
+    assert "0.4 px beside" in said
+    assert about_moved_views([(still, view)]) == ()

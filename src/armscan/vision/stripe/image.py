@@ -133,12 +133,17 @@ def laid_under(background: Exposure, exposure: Exposure) -> Exposure:
     moves by a tenth to a quarter of a pixel: print edges then stay in the difference as lines.
     The steepest edges of the view decide: what moves by itself before steeper ones is not seen.
     """
-    shift = shift_between(_grey(exposure), _grey(background))
+    shift = shift_of(background, exposure)
     if shift is None:
         return background
     image = np.rint(_moved(background.image, shift))
     image = np.clip(image, 0.0, background.full_scale).astype(background.image.dtype)
     return replace(background, image=np.ascontiguousarray(image))
+
+
+def shift_of(background: Exposure, exposure: Exposure) -> FloatArray | None:
+    """(2,) px by which `laid_under` moves the view without laser right and down; None for none."""
+    return shift_between(_grey(exposure), _grey(background))
 
 
 def shift_between(lit: FloatImage, dark: FloatImage) -> FloatArray | None:

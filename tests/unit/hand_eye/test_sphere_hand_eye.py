@@ -368,7 +368,7 @@ def test_bad_input() -> None:
         calibrate_on_sphere(twice, DIAMETER_MM)
     with pytest.raises(OptionError, match="diameter in mm"):
         calibrate_on_sphere(stripes, 0.05)
-    with pytest.raises(OptionError, match="below 0.1 rad"):
+    with pytest.raises(OptionError, match=r"below 0\.1 rad"):
         HandEyeOptions(arm_rotation_rad=1.0)
     with pytest.raises(OptionError, match="per_stripe is 2"):
         HandEyeOptions(per_stripe=2)

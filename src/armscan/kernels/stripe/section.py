@@ -324,8 +324,8 @@ def weigh_section(
     (N, 8) output: normal matrix of the two terms as 00 01 11, their right-hand side, 1 where no
     pixel beyond the core is clipped, and both for what the reflectance is too large by; (0, 8) if
     not asked for. ``pixels``: (3, >= N (2 reach + 1)) output: the line's own grey level, the same
-    with the background, and the residual, widened by the freedom that the fit took, of every pixel
-    of the lines and of those beside them; (3, 0) if not asked for.
+    with the background, and the residual, widened by what the fit took of it under ``noise``, of
+    pixels of the lines and of those beside them; (3, 0) if not asked for.
 
     Returns count of pixels.
     """

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from armscan.calibration.sheets import fan
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.fan import FanAssignment, number_fan
 from armscan.calibration.sheets.labels import assign_sheets, board_numbers
@@ -125,6 +127,28 @@ def test_parallel_boards_are_refused_with_the_reason() -> None:
     assert isinstance(names, FitFailure)
     assert "too parallel" in names.reason
     assert "tilts" in names.remedy
+
+
+def test_stripes_of_no_fan_are_given_up_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stripes thrown about by centimetres, as if beside their boards: few fits, then a reason."""
+    images, _ = images_of(fan_rig(0, 8, 15), 0)
+    rng, fits = np.random.default_rng(0), 0
+    stripes = [
+        [replace(s, ends_mm=s.ends_mm + rng.normal(0.0, 20.0, (2, 3))) for s in image.stripes * 5]
+        for image in images
+    ]
+    fit_fan = fan._fit_fan
+
+    def counted(*args: Any) -> Any:
+        nonlocal fits
+        fits += 1
+        return fit_fan(*args)
+
+    monkeypatch.setattr(fan, "_fit_fan", counted)
+    names = number_fan(stripes, board_numbers(images))
+    assert isinstance(names, FitFailure)
+    assert "hardly any of the" in names.reason
+    assert fits < sum(map(len, stripes)) * fan.MAX_STARTS
 
 
 def test_boards_that_share_no_line_are_placed_by_the_fan_or_refused() -> None:

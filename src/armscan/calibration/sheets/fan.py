@@ -55,6 +55,8 @@ LARGEST_MEAN_CHI2 = 9.0
 """Mean misfit of a stripe's end, in variances, above which the stripes are no fan."""
 LEAST_NUMBERED = 0.5
 """Part of the stripes that must find a sheet."""
+HOPELESS_NUMBERED = 0.25
+"""A start of which fewer are left on sheets is given up: each further stray costs a fit."""
 UNEVEN_SHARE = 0.3
 """Distances of neighbouring sheets that differ from whole spacings by more do not tell how many
 sheets are missing between them."""
@@ -114,7 +116,10 @@ def number_fan(
         if fan is not None:
             found.setdefault(tuple(fan.slot.tolist()), fan)
     if not found:
-        return FitFailure("the stripes do not fall into sheets of one fan", REMEDY)
+        return FitFailure(
+            f"hardly any of the {len(lines)} stripes fall into sheets of one fan",
+            f"check the boards' poses, and that all stripes come from one source; {REMEDY}",
+        )
     certain = _certain(lines, sorted(found.values(), key=lambda fan: fan.cost))
     return certain if isinstance(certain, FitFailure) else certain.assigned(boards, n_sheets)
 
@@ -249,7 +254,7 @@ def _polished(lines: _Lines, axis: FloatArray) -> _Fan | None:
     """Number the stripes by their heights, fit the fan, and number again until it stays."""
     slot = _slots_by_height(lines, _heights(lines, axis))
     for _ in range(POLISH_ROUNDS):
-        if not (slot >= 0).any():
+        if not _is_hopeful(slot):
             return None
         fan = _fit_fan(lines, slot, axis)
         again = _slots_by_height(lines, _heights(lines, fan.axis))
@@ -257,19 +262,23 @@ def _polished(lines: _Lines, axis: FloatArray) -> _Fan | None:
         if np.array_equal(again, slot):
             break
         slot, axis = again, fan.axis
-    return _fit_fan(lines, slot, axis) if (slot >= 0).any() else None
+    return _fit_fan(lines, slot, axis) if _is_hopeful(slot) else None
 
 
 def _without_strays(lines: _Lines, slot: IntArray, axis: FloatArray) -> IntArray:
-    """Take the worst stripe off its sheet while one misses it by too much."""
+    """Take the worst stripe off its sheet while one misses it by too much, and there is hope."""
     slot = slot.copy()
-    while (slot >= 0).any():
+    while _is_hopeful(slot):
         fan = _fit_fan(lines, slot, axis)
         worst = int(np.argmax(fan.chi2))
         if fan.chi2[worst] <= STRAY_CHI2:
             break
         slot[worst] = -1
     return slot
+
+
+def _is_hopeful(slot: IntArray) -> bool:
+    return float((slot >= 0).mean()) >= HOPELESS_NUMBERED
 
 
 def _slots_by_height(lines: _Lines, height_mm: FloatArray) -> IntArray:

@@ -10,9 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from armscan.cli.run import main
-from armscan.geometry.poses import Pose
+from armscan.devices.sources import ScanSource
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.models.arm import forward, thesis_arm
+from armscan.storage.arm import arm_model_toml
 from armscan.storage.documents import scanner_document
 from armscan.storage.recording import write_recording
 from rigs import scan_fake
@@ -61,3 +66,44 @@ def test_a_recording_without_the_ball_gets_one_sentence(
     scan, scanner = folder / "plate", folder / "good.json"
     assert "no ball of 34.96 mm" in fails("verify", scan, "--scanner", scanner, "--ball", 34.96)
     assert "give --scanner" in fails("verify", scan, "--ball", 34.96)
+
+
+ARM = thesis_arm((100.0, 200.0, 200.0, 50.0), (20.0, 30.0, 20.0))
+
+
+def in_joints(scan: scan_fake.FakeScan) -> ScanSource:
+    """The same scan by an arm that stands beside the plate and stores its joints' angles."""
+    track, rng = scan.arm, np.random.default_rng(0)
+    assert track is not None
+    joints = np.zeros((len(track), 7))
+    for k in range(len(track)):
+        start = joints[k - 1]
+        found = least_squares(apart, start, args=(track.pose(k),), xtol=1e-14)
+        while np.abs(found.fun).max() > 1e-6:
+            start = rng.uniform(-2.0, 2.0, 7)
+            found = least_squares(apart, start, args=(track.pose(k),), xtol=1e-14)
+        joints[k] = found.x
+    session = replace(scan.session, pose_form="joints")
+    return scan_fake.as_source(
+        replace(scan, arm=replace(track, joints_rad=joints), session=session)
+    )
+
+
+def apart(joints: FloatArray, pose: Pose[Base, Tool]) -> FloatArray:
+    """How far the arm is from a pose, mm, turns by a lever of 300 mm."""
+    rotations, places = forward(ARM, joints[None])
+    turned = 300.0 * (rotations[0] - pose.rotation).ravel()
+    return np.concatenate([places[0] - pose.translation_mm, turned])
+
+
+def test_joint_angles_go_through_the_arm_that_is_given(
+    folder: Path, tmp_path: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    arm, source = tmp_path / "arm.toml", in_joints(scan_fake.fake_scan(12, 2.0))
+    write_recording(tmp_path / "plate", source)
+    arm.write_bytes(arm_model_toml(ARM))
+    words = ["verify", tmp_path / "plate", "--plate", folder / "plate.csv"]
+    words += ["--scanner", folder / "good.json"]
+    assert "joint angles need the arm's geometry" in fails(*words)
+    assert main([*map(str, words), "--arm", str(arm), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["verdict"] == "still valid"

@@ -10,6 +10,7 @@ import typer
 
 from armscan.cli.delivery import OF_INSPECTIONS, Work, job_command
 from armscan.cli.options import (
+    ArmFile,
     DefaultOf,
     FeatureOption,
     PageOption,
@@ -173,6 +174,7 @@ def verify(
         ),
     ] = None,
     side: SideOption = None,
+    arm: ArmFile = None,
     region: RegionOption = "",
     feature_mm: FeatureOption = None,
 ) -> Work:
@@ -187,5 +189,5 @@ def verify(
     inspection = given(InspectionOptions, feature_mm=feature_mm)
     standard = Standard(ball, plate, None if side is None else side.value)
     return lambda job: verify_scanner(
-        job, scan, scanner, standard, region=box, options=options, inspection=inspection
+        job, scan, scanner, standard, arm=arm, region=box, options=options, inspection=inspection
     )

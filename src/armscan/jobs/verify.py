@@ -44,6 +44,7 @@ from armscan.report.quantity import (
     significant,
     values,
 )
+from armscan.storage.arm import read_arm_model
 from armscan.storage.clouds import read_cloud
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.files import holds_files
@@ -101,6 +102,7 @@ def verify(
     scanner: Path | None,
     standard: Standard,
     *,
+    arm: Path | None = None,
     region: Sequence[float] = (),
     options: VerifyOptions | None = None,
     inspection: InspectionOptions | None = None,
@@ -117,6 +119,8 @@ def verify(
         ``scanner.json``; may be None for a cloud only.
     standard
         What was scanned.
+    arm
+        ``arm.toml`` for a recording of joint angles; None to look for it in the recording.
     region
         ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm; empty for all.
     options, inspection
@@ -132,10 +136,14 @@ def verify(
     box = region_of(region)
     if holds_files(scan) and scanner is None:
         raise OptionError("a recording needs the scanner's calibration", remedy="give --scanner")
+    if arm is not None and not holds_files(scan):
+        raise OptionError(
+            "the cloud is in Base already", where="--arm", remedy="give it with a recording"
+        )
     job.places(".html")
     table = scan / EXPOSURES_FILE if holds_files(scan) else scan
-    inputs = [path for path in (table, scanner, standard.plate) if path is not None]
-    measured, is_simulated = _measured(scan, scanner, job.progress)
+    inputs = [path for path in (table, scanner, standard.plate, arm) if path is not None]
+    measured, is_simulated = _measured(scan, scanner, arm, job.progress)
     is_simulated = is_simulated or are_simulated(inputs)
     result = _verified(measured, standard, box, options, inspection)
     report = _report(scan.name, result, measured)
@@ -173,7 +181,9 @@ def verify(
     )
 
 
-def _measured(scan: Path, scanner: Path | None, progress: Progress) -> tuple[Measured, bool]:
+def _measured(
+    scan: Path, scanner: Path | None, arm: Path | None, progress: Progress
+) -> tuple[Measured, bool]:
     """The points, and whether they are of rendered images."""
     if not holds_files(scan) or scanner is None:
         cloud = read_cloud(scan)
@@ -184,8 +194,11 @@ def _measured(scan: Path, scanner: Path | None, progress: Progress) -> tuple[Mea
                 remedy="give a recording with the arm's poses, or a cloud made from one",
             )
         return Measured(cloud), cloud.is_simulated
-    source, calibration = read_recording(scan), read_scanner_calibration(scanner)
+    source = read_recording(scan, None if arm is None else read_arm_model(arm))
+    calibration = read_scanner_calibration(scanner)
     found = measure_scan(source, calibration, ScanOptions(has_normals=False), progress=progress)
+    warnings = (*source.warnings, *source.session.assumed, *found.warnings)
+    found = replace(found, warnings=warnings)
     return Measured(found.cloud, found, calibration), source.is_simulated
 
 

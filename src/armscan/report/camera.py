@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 
-from armscan.calibration.cameras.result import CameraFit, ViewFit
+from armscan.calibration.cameras.result import BoardWarp, CameraFit, ViewFit
 from armscan.models.calibration import Provenance
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.records.exposure import Exposure
@@ -96,6 +96,22 @@ def camera_quantities(fit: CameraFit, n_images: int) -> tuple[Quantity, ...]:
         Quantity("covered_fraction", "", fit.coverage.fraction),
         hold_out_quantity(held_out, "images"),
         *parameter_quantities(fit),
+        *_bow_quantity(fit.warp),
+    )
+
+
+def _bow_quantity(warp: BoardWarp | None) -> tuple[Quantity, ...]:
+    if warp is None or not warp.is_significant:
+        return ()
+    x, y = (f"{value:+.3f}" for value in warp.bow_mm)
+    return (
+        Quantity(
+            "board.bow_mm",
+            "Bow of the board",
+            warp.bow_mm.tolist(),
+            meaning="solved along",
+            shown=f"{x}, {y} mm along x, along y",
+        ),
     )
 
 
@@ -391,7 +407,7 @@ def _residual_histogram(fit: CameraFit) -> Picture:
     )
 
 
-def _warp_section(warp: Any) -> Section:
+def _warp_section(warp: BoardWarp) -> Section:
     verdict = (
         "The board is bowed: the data ask for it."
         if warp.is_significant

@@ -15,6 +15,7 @@ from armscan.calibration.cameras.robust import excess_variance_px2
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.estimate import Estimate
 from armscan.models.camera import PARAMETER_NAMES
+from armscan.report.camera import camera_quantities
 from armscan.vision.targets.target import TargetView
 from rigs.camera_scene import CAMERA, Scene, make_views, normalised_error
 from rigs.plain_scanner import plain_camera
@@ -92,6 +93,19 @@ def test_bow_of_the_board_is_found_and_judged() -> None:
     assert abs(np.mean(errors) - 2.0) < 3.0 * np.sqrt(4.0 / 20.0)
     assert any("bowed" in warning and "is solved along" in warning for warning in fit.warnings)
     assert abs(fit.camera.fx_px - CAMERA.fx_px) < 4.0 * fit.sigma[0]
+
+
+@pytest.mark.parametrize(("share", "is_warned_of"), [(5e-4, False), (2e-3, True)])
+def test_a_small_bow_is_solved_without_a_warning(share: float, is_warned_of: bool) -> None:
+    """A board off the shelf is no fault; a card that bends by 1/500 of its length is one."""
+    side_mm = float(np.ptp(make_views(Scene(), 0)[0][0].points_board_mm, axis=0).max())
+    scene = Scene(n_views=12, noise_px=0.03, bow_mm=(share * side_mm, 0.0))
+    fit = solved(make_views(scene, 1)[0], ALL_FIVE)
+    assert fit.warp is not None and fit.warp.is_significant
+    assert fit.warp.bow_mm[0] == pytest.approx(scene.bow_mm[0], abs=5.0 * fit.warp.sigma_mm[0])
+    assert any("board is bowed" in warning for warning in fit.warnings) == is_warned_of
+    told = [quantity.text for quantity in camera_quantities(fit, 12)]
+    assert any(f"{fit.warp.bow_mm[0]:+.3f}" in shown for shown in told)
 
 
 def test_a_bow_hides_no_coefficient_of_the_lens() -> None:

@@ -414,6 +414,9 @@ SQUARE_SIGMAS = 5.0
 """Pixels are square to a part in a thousand in nearly all cameras."""
 ALIKE = 4.0
 """Residuals of one view are alike enough to be told if variances are widened by this."""
+MUCH_BOWED = 1e-3
+"""Of the print's longer side. Most boards bow by more than noise hides, and that is solved; sheets
+of card, by this much and more, have other bends of a tenth of it or so."""
 UNSEEN_WORSE = 1.3
 UNSEEN_BETTER = 0.9
 """Least squares fits the views that it used at least about as well as those that it did not."""
@@ -549,7 +552,12 @@ def _about_residuals(fit: CameraFit) -> list[str]:
 
 
 def _about_warp(fit: CameraFit) -> list[str]:
-    if fit.warp is None or not fit.warp.is_significant:
+    points = np.concatenate([view.view.points_board_mm for view in fit.views])
+    if (
+        fit.warp is None
+        or not fit.warp.is_significant
+        or not is_much_bowed(fit.warp.bow_mm, points)
+    ):
         return []
     bow = ", ".join(f"{value:+.3f}" for value in fit.warp.bow_mm)
     largest = float(abs(fit.warp.bow_mm).sum())
@@ -557,6 +565,12 @@ def _about_warp(fit: CameraFit) -> list[str]:
         f"the board is bowed by {bow} mm (along x, along y): that is solved along; a flatter board "
         f"is better, for bends of other shapes are not: {largest:.2g} mm in height"
     ]
+
+
+def is_much_bowed(bow_mm: FloatArray, points_board_mm: FloatArray) -> bool:
+    """Whether a target with these points (N, 3) bows so much that bends of other shapes matter."""
+    side_mm = float(np.ptp(points_board_mm[:, :2], axis=0).max())
+    return float(np.abs(bow_mm).sum()) > MUCH_BOWED * side_mm
 
 
 LARGEST_FOCAL_SIGMA = 0.02

@@ -25,6 +25,7 @@ from armscan.calibration.cameras.result import (
     CrossValidation,
     about_coverage,
     focal_reasons,
+    is_much_bowed,
     rms_reasons,
 )
 from armscan.geometry.arrays import (
@@ -313,6 +314,10 @@ def _about_board(fit: StereoFit) -> list[str]:
             f"standard deviations were widened by {widening:.1f}; look at the board's flatness"
         )
     if bow is None:
+        return warnings
+    fits = [camera.fit for camera in cameras if camera.fit is not None]
+    points = np.concatenate([view.view.points_board_mm for own in fits for view in own.views])
+    if not is_much_bowed(bow.bow_mm, points):
         return warnings
     along_x, along_y = bow.bow_mm
     return [

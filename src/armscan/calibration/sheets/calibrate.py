@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armscan.calibration.cameras.result import is_much_bowed
 from armscan.calibration.sheets.board_points import (
     N_CAMERA,
     BoardBow,
@@ -156,7 +157,7 @@ def calibrate_sheets(
 
 
 def _about_bow(bow: BoardBow | None) -> tuple[str, ...]:
-    if bow is None or not bow.bow_mm.any():
+    if bow is None or not is_much_bowed(bow.bow_mm, np.stack([bow.low_mm, bow.high_mm])):
         return ()
     along = ", ".join(f"{value:+.3f}" for value in bow.bow_mm)
     return (f"the board is bowed by {along} mm (along x, along y); stripes were placed so",)

@@ -14,6 +14,7 @@ Beside it stand other methods: eq. 2.44, total least squares and cross ratios on
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -42,6 +43,7 @@ from armscan.calibration.sheets.stripes_on_board import BoardImage
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Line, fit_line, fit_plane
+from armscan.models.calibration import FTest
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.vision.targets.target import TargetView
@@ -220,6 +222,9 @@ class _Claim:
 
 FEWEST_BOARDS = 4
 """For an outlier among them: with fewer, two are left of which each explains the other."""
+CLEAR_CHI2 = 36.0
+"""By how much more chi-square, six sigma, an outlier leaves than any other board: of any misfit
+that is spread over the boards, as of a bow, leaving out one or the other takes the significance."""
 
 
 def find_outlier_view(
@@ -237,27 +242,28 @@ def find_outlier_view(
     whole = solve_sheets(alone, [sheet], errors, [False], sigma_factor=noise.sigma_factor)
     if isinstance(whole, FitFailure):
         return None
-    p_values = [_probability_without(int(board), alone, whole, noise) for board in boards]
-    best = int(np.argmax(p_values))
-    if p_values[best] < LACK_OF_FIT_P:
+    tests = {board: _test_without(int(board), alone, whole, noise) for board in boards}
+    misfit = {board: test.f_ratio * test.degrees_of_freedom for board, test in tests.items()}
+    best, second = sorted(misfit, key=lambda board: misfit[board])[:2]
+    if tests[best].p_value < LACK_OF_FIT_P or misfit[second] - misfit[best] < CLEAR_CHI2:
         return None
-    return int(alone.image[alone.board == boards[best]][0])
+    return int(alone.image[alone.board == best][0])
 
 
-def _probability_without(
+def _test_without(
     board: int, observations: SheetObservations, whole: SheetSolution, noise: StripeNoise
-) -> float:
+) -> FTest:
     """Of the lack of fit of all other boards, by one step from the plane of all."""
     normal = whole.system.solve(whole.weight, 0, without_board=board)
     if normal is None:
-        return 0.0
+        return FTest(f_ratio=math.inf, degrees_of_freedom=1, p_value=0.0)
     rest = observations.board != board
     remaining = (whole.system.residual_px + whole.system.times(normal.step))[rest]
     common = normal.step[normal.n_sheet :]
     chi2 = float((whole.weight[rest] * remaining**2).sum() + common @ common)
     share = replace(noise, degrees_of_freedom=noise.degrees_of_freedom * float(rest.mean()))
     n_stripes = len(np.unique(observations.stripe[rest]))
-    return lack_of_fit(chi2, n_stripes, whole.n_parameters, share).p_value
+    return lack_of_fit(chi2, n_stripes, whole.n_parameters, share)
 
 
 MIN_COLLINEAR = 3

@@ -27,6 +27,7 @@ from armscan.calibration.sheets.result import (
     BoardStripes,
     LaserFit,
     PlacedBoard,
+    SheetImage,
     SheetOptions,
     SkippedImage,
 )
@@ -226,7 +227,8 @@ def _fit_sheets(
         lost = "; ".join(f"{image.source}: {image.reason}" for image in skipped)
         reason = f"{fit.reason} (not used: {lost})" if lost else fit.reason
         return FitFailure("; ".join((reason, *about_camera)), fit.remedy)
-    warnings = (*about_camera, *about_views, *fit.warnings)
+    about_lines = about_widths(fit.images, len(fit.sheets))
+    warnings = (*about_camera, *about_views, *about_lines, *fit.warnings)
     return replace(fit, skipped=(*skipped, *fit.skipped), warnings=warnings)
 
 
@@ -276,6 +278,31 @@ def about_cameras(boards: Sequence[BoardStripes], cameras: HeadCameras) -> tuple
                 f"from them to {own_px:.2f} px: it is not that of these photographs, or its focus "
                 "or zoom was moved since; calibrate it anew, as it is"
             )
+    return tuple(said)
+
+
+WIDER = 2.0
+FEWEST_WIDTHS = 5
+
+
+def about_widths(images: Sequence[SheetImage], n_sheets: int) -> tuple[str, ...]:
+    """Names images in which a sheet's line is much wider than in all others.
+
+    It is another line, or not as it was. One that lies a little beside the sheet may fit too well
+    to be told by its place.
+    """
+    said = []
+    for sheet in range(n_sheets):
+        shown = [(image, image.profile.width_px[image.sheet == sheet]) for image in images]
+        widths = sorted((float(np.median(w)), image.source) for image, w in shown if len(w))
+        if len(widths) < FEWEST_WIDTHS or widths[-1][0] < WIDER * widths[-2][0]:
+            continue
+        (next_px, _), (widest_px, source) = widths[-2:]
+        said.append(
+            f"{source}: its line is {widest_px:.1f} px wide (sigma), that of no other image more "
+            f"than {next_px:.1f}: the laser may have been moved or focused anew; look at it, or "
+            "leave it out"
+        )
     return tuple(said)
 
 

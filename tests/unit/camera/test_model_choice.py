@@ -17,6 +17,7 @@ from armscan.calibration.cameras.distortion import (
     MODELS,
     ChosenModel,
     choose_model,
+    predicts_better,
 )
 from armscan.calibration.cameras.result import CameraFit, CrossValidation, DistortionModel
 from armscan.calibration.cameras.robust import Solution
@@ -92,6 +93,30 @@ def test_the_smallest_model_beyond_which_the_views_show_nothing(
     assert isinstance(found, ChosenModel)
     assert found.model == model
     assert reason in found.reason
+
+
+@pytest.mark.parametrize(
+    ("larger_px", "is_asked_for"), [(0.19, True), (0.1998, False), (0.21, False)]
+)
+def test_coefficients_are_given_up_with_a_bow_free_only_if_unseen_views_do(
+    larger_px: float, is_asked_for: bool
+) -> None:
+    """A gain of 0.2 per cent is less than what held-out views scatter by."""
+    noise = np.array([0.004, -0.003, 0.002, -0.004, 0.003, -0.002, 0.001, -0.001])
+    held_out = {4: 0.2 + np.zeros(VIEWS), 6: larger_px + noise}
+
+    def solution(n_free: int) -> Solution:
+        return cast(Solution, SimpleNamespace(basis=np.eye(9)[:, :n_free]))
+
+    def validate(each: Solution, _reference: Solution) -> CrossValidation:
+        rms = held_out[each.basis.shape[1]]
+        return CrossValidation(5, float(np.sqrt(np.mean(rms**2))), 0.1, (), tuple(rms))
+
+    smaller = ChosenModel("k1", solution(4), None, "")
+    assert predicts_better(solution(6), smaller, validate) == is_asked_for
+    larger = ChosenModel("k1k2", solution(6), None, "")
+    assert not predicts_better(solution(6), larger, validate)
+    assert not predicts_better(FitFailure("none"), smaller, validate)
 
 
 def test_without_any_solution_the_first_failure_is_told() -> None:

@@ -11,6 +11,7 @@ from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, 
 from armscan.errors import OptionError
 from armscan.geometry.poses import Pose
 from armscan.models.light_sheet import LightSheet
+from armscan.pipeline.laser import about_widths
 from armscan.records.profile import StripeFlag
 from rigs.sheet_rig import (
     THESIS_PLANE,
@@ -177,6 +178,20 @@ def test_one_wrong_board_is_named() -> None:
     assert "laser-3.png" in named[0]
     bowed = fitted(thesis_rig(bow_uu_mm=0.15))
     assert not any("all boards but" in warning for warning in bowed.sheets[0].warnings)
+
+
+@pytest.mark.parametrize(("wider", "named"), [(1.7, False), (2.5, True)])
+def test_an_image_of_a_much_wider_line_is_named(wider: float, named: bool) -> None:
+    """A laser moved for one photograph; lines of all boards differ by less than a half."""
+    fit = fitted(thesis_rig())
+    images = list(fit.images)
+    profile = images[2].profile
+    images[2] = replace(images[2], profile=replace(profile, width_px=wider * profile.width_px))
+    assert about_widths(fit.images, 1) == ()
+    said = about_widths(images, 1)
+    assert len(said) == named
+    assert all(text.startswith(images[2].source) for text in said)
+    assert about_widths(images[:4], 1) == (), "of so few none is the usual one"
 
 
 def test_points_are_rejected_for_the_reason_that_holds() -> None:

@@ -42,6 +42,22 @@ def test_a_thick_saturated_line_sets_the_width_and_is_found() -> None:
         assert np.sqrt((off[on_line] ** 2).mean()) < 0.15
 
 
+def test_few_bright_reflections_do_not_set_the_width_of_a_thick_line() -> None:
+    """They bend more than a line that is white over 20 px, and are a tenth as many candidates."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        y, x = np.mgrid[:700, :600].astype(np.float64)
+        image = 20.0 + 1000.0 * np.exp(-0.5 * ((x - 240.0 - 0.05 * y) / 6.0) ** 2)
+        for x0, y0 in rng.uniform((340.0, 20.0), (580.0, 680.0), (8, 2)):
+            near = np.abs(x - x0 - rng.uniform(-0.5, 0.5) * (y - y0)) < 1.5
+            image += 220.0 * (near & (np.abs(y - y0) < 8.0))
+        image += rng.normal(0.0, 1.0, image.shape)
+        profile = extract_stripes(Exposure(np.clip(image, 0, 255).astype(np.uint8), "reflections"))
+        good = profile.points_px[profile.is_accepted]
+        on_line = np.abs(good[:, 0] - 240.0 - 0.05 * good[:, 1]) < 1.0
+        assert on_line.sum() > 650
+
+
 def test_a_crop_gives_the_same_points_in_full_sensor_pixels() -> None:
     image = StripeScene((line(75.0),), 320, 240).expose(1)
     whole = extract_stripes(image)

@@ -24,6 +24,7 @@ from armscan.calibration.cameras.distortion import (
     coefficients_left_at_zero,
     cross_validate,
     design_effect,
+    predicts_better,
     rms,
 )
 from armscan.calibration.cameras.result import (
@@ -485,6 +486,8 @@ def _solve_model(
         again = choose(bowed)
         flat = again if isinstance(again, FitFailure) else solve(again.model)
         if isinstance(again, FitFailure) or isinstance(flat, FitFailure):
+            return chosen
+        if predicts_better(bowed(chosen.model), again, validate):
             return chosen
         return replace(again, solution=flat) if _is_bowed(flat, options) else chosen
     model: DistortionModel = options.distortion

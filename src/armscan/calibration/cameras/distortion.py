@@ -227,6 +227,23 @@ def _gain_sigmas(smaller: CrossValidation | None, larger: CrossValidation | None
     return float(np.mean(gain)) / max(error, 1e-300)
 
 
+def predicts_better(
+    before: Solution | FitFailure,
+    chosen: ChosenModel,
+    validate: Callable[[Solution, Solution], CrossValidation | None],
+) -> bool:
+    """Whether unseen views ask for the coefficients of ``before`` that a later choice gave up.
+
+    Where the residuals of a view are alike, Wald's test has little power: what showed on flat
+    boards is given up with the bow free only if views that took no part do without it, too.
+    """
+    if isinstance(before, FitFailure) or before.basis.shape[1] <= chosen.solution.basis.shape[1]:
+        return False
+    smaller = validate(chosen.solution, before)
+    gain = _gain_sigmas(smaller, validate(before, before))
+    return gain is not None and gain >= GAIN_SIGMAS
+
+
 def _unfolded(
     chosen: ChosenModel, tested: list[ChosenModel], folds: Callable[[Solution], bool]
 ) -> tuple[ChosenModel, str] | None:

@@ -278,6 +278,8 @@ SAMPLE = 3000
 LOOKED_AT = 8
 NEARLY = 0.8
 """Of the narrow scale's strength: less at the wide one leaves no doubt."""
+SPOTS = 4.0
+"""Times as many strong points at the wide scale: what is strong at the narrow one is no line."""
 MEASURED = 300
 STRONG_SHARE = 0.4
 REACH_PX = 30.0
@@ -315,16 +317,25 @@ def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
     """(N, 6) ridge points of the stronger lines, at the scale that suits them better.
 
     A wide line that saturates is flat where a narrow filter looks, and what little is narrow beside
-    it would be taken for the line.
+    it would be taken for the line: where it bends more (reflections), by how few it is.
     """
     sample = np.ascontiguousarray(runs[:: max(len(runs) // SAMPLE, 1)])
     narrow, wide = SCALES_PX
     points, strength = _at_scale(image, sample, narrow)
+    strong = _strong(points)
     # wide filters take long, and few lines need them: some candidates tell
     few = np.ascontiguousarray(sample[::LOOKED_AT])
-    if _at_scale(image, few, wide)[1] > NEARLY * strength:
-        points_wide, strength_wide = _at_scale(image, sample, wide)
-        points = points_wide if strength_wide > strength else points
+    some, strength_wide = _at_scale(image, few, wide)
+    is_wide = strength_wide > NEARLY * strength
+    if is_wide or LOOKED_AT * len(_strong(some)) > SPOTS * len(strong):
+        points, strength_wide = _at_scale(image, sample, wide)
+        wider = _strong(points)
+        are_spots = len(wider) > SPOTS * len(strong) and strength_wide > STRONG_SHARE * strength
+        strong = wider if strength_wide > strength or are_spots else strong
+    return strong
+
+
+def _strong(points: FloatArray) -> FloatArray:
     return points[points[:, 4] >= STRONG_SHARE * strong_median(points[:, 4])]
 
 

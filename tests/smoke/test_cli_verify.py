@@ -19,7 +19,7 @@ from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.arm import forward, thesis_arm
 from armscan.storage.arm import arm_model_toml
 from armscan.storage.documents import scanner_document
-from armscan.storage.recording import write_recording
+from armscan.storage.recording import read_recording, write_recording
 from rigs import scan_fake
 
 SIGMA = np.array([2e-4, 2e-4, 2e-4, 0.015, 0.015, 0.015])
@@ -58,14 +58,24 @@ def test_a_good_head_passes_and_a_moved_one_does_not(
     assert abs(found["moved"]["checks"][0]["error"]) == pytest.approx(0.3, abs=0.02)
     assert found["good"]["checks"][1]["name"] == "hand-eye correction"
     assert any("uncertainty is not known" in text for text in found["good"]["warnings"])
+    source = read_recording(folder / "plate")
+    of_recording = (*source.warnings, *source.session.assumed)
+    assert of_recording
+    assert any(of_recording[0][1:] in text for text in found["good"]["warnings"])
 
 
 def test_a_recording_without_the_ball_gets_one_sentence(
-    folder: Path, fails: Callable[..., str]
+    folder: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     scan, scanner = folder / "plate", folder / "good.json"
     assert "no ball of 34.96 mm" in fails("verify", scan, "--scanner", scanner, "--ball", 34.96)
     assert "give --scanner" in fails("verify", scan, "--ball", 34.96)
+    cloud = folder / "plate.ply"
+    assert main(["reconstruct", str(scan), "--scanner", str(scanner), "-o", str(cloud)]) == 0
+    capsys.readouterr()
+    words = ("verify", cloud, "--plate", folder / "plate.csv", "--arm", folder / "arm.toml")
+    assert "a cloud in Base takes no arm" in fails(*words)
+    assert "no such file" in fails("verify", folder / "nothing", *words[2:], "--scanner", scanner)
 
 
 ARM = thesis_arm((100.0, 200.0, 200.0, 50.0), (20.0, 30.0, 20.0))
@@ -78,11 +88,9 @@ def in_joints(scan: scan_fake.FakeScan) -> ScanSource:
     joints = np.zeros((len(track), 7))
     for k in range(len(track)):
         start = joints[k - 1]
-        found = least_squares(apart, start, args=(track.pose(k),), xtol=1e-14)
-        while np.abs(found.fun).max() > 1e-6:
-            start = rng.uniform(-2.0, 2.0, 7)
-            found = least_squares(apart, start, args=(track.pose(k),), xtol=1e-14)
-        joints[k] = found.x
+        starts = (start, *rng.uniform(-2.0, 2.0, (20, 7)))
+        found = (least_squares(apart, s, args=(track.pose(k),), xtol=1e-14) for s in starts)
+        joints[k] = next(each.x for each in found if np.abs(each.fun).max() < 1e-6)
     session = replace(scan.session, pose_form="joints")
     return scan_fake.as_source(
         replace(scan, arm=replace(track, joints_rad=joints), session=session)

@@ -29,6 +29,7 @@ from armscan.pipeline.laser import (
     look_at_pairs,
 )
 from armscan.records.exposure import Exposure
+from armscan.report.camera import bow_quantities
 from armscan.report.photographs import TriedImage, refused_page
 from armscan.report.quantity import (
     Quantity,
@@ -362,6 +363,7 @@ def sheets_summary(
         told.append(fact("stripes in", sentence(fit.channel_reason)))
     if fit.print_reason:
         told.append(fact("target's print", sentence(fit.print_reason)))
+    told += bow_quantities(fit.board_bow_mm)
     for sheet in fit.sheets:
         told.append(fact(f"sheet {sheet.name}", ""))
         told += [fact(f"  {q.label}", q.line) for q in for_people(sheet_quantities(sheet))]

@@ -136,10 +136,6 @@ def verify(
     box = region_of(region)
     if holds_files(scan) and scanner is None:
         raise OptionError("a recording needs the scanner's calibration", remedy="give --scanner")
-    if arm is not None and not holds_files(scan):
-        raise OptionError(
-            "the cloud is in Base already", where="--arm", remedy="give it with a recording"
-        )
     job.places(".html")
     table = scan / EXPOSURES_FILE if holds_files(scan) else scan
     inputs = [path for path in (table, scanner, standard.plate, arm) if path is not None]
@@ -193,6 +189,8 @@ def _measured(
                 where=str(scan),
                 remedy="give a recording with the arm's poses, or a cloud made from one",
             )
+        if arm is not None:
+            raise OptionError("a cloud in Base takes no arm", where="--arm", remedy="leave it out")
         return Measured(cloud), cloud.is_simulated
     source = read_recording(scan, None if arm is None else read_arm_model(arm))
     calibration = read_scanner_calibration(scanner)

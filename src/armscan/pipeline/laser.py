@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import cast, get_args
 
 import numpy as np
@@ -27,7 +28,6 @@ from armscan.calibration.sheets.result import (
     BoardStripes,
     LaserFit,
     PlacedBoard,
-    SheetImage,
     SheetOptions,
     SkippedImage,
 )
@@ -227,8 +227,7 @@ def _fit_sheets(
         lost = "; ".join(f"{image.source}: {image.reason}" for image in skipped)
         reason = f"{fit.reason} (not used: {lost})" if lost else fit.reason
         return FitFailure("; ".join((reason, *about_camera)), fit.remedy)
-    about_lines = about_widths(fit.images, len(fit.sheets))
-    warnings = (*about_camera, *about_views, *about_lines, *fit.warnings)
+    warnings = (*about_camera, *about_views, *about_widths(fit), *fit.warnings)
     return replace(fit, skipped=(*skipped, *fit.skipped), warnings=warnings)
 
 
@@ -282,28 +281,32 @@ def about_cameras(boards: Sequence[BoardStripes], cameras: HeadCameras) -> tuple
 
 
 WIDER = 2.0
-FEWEST_WIDTHS = 5
+"""A beam's width changes with the distance; no head's by so much from the next board to one."""
+FEWEST_TO_COMPARE = 5
 
 
-def about_widths(images: Sequence[SheetImage], n_sheets: int) -> tuple[str, ...]:
-    """Names images in which a sheet's line is much wider than in all others.
+def about_widths(fit: LaserFit) -> tuple[str, ...]:
+    """Names images in which a sheet's line is much wider than in all others of the camera.
 
     It is another line, or not as it was. One that lies a little beside the sheet may fit too well
     to be told by its place.
     """
-    said = []
-    for sheet in range(n_sheets):
-        shown = [(image, image.profile.width_px[image.sheet == sheet]) for image in images]
-        widths = sorted((float(np.median(w)), image.source) for image, w in shown if len(w))
-        if len(widths) < FEWEST_WIDTHS or widths[-1][0] < WIDER * widths[-2][0]:
+    said: dict[str, str] = {}
+    for sheet, camera in product(range(len(fit.sheets)), {board.camera for board in fit.boards}):
+        widths = sorted(
+            (float(np.median(image.profile.width_px[shown])), image.source)
+            for image, board in zip(fit.images, fit.boards, strict=True)
+            if board.camera == camera and (shown := image.sheet == sheet).any()
+        )
+        if len(widths) < FEWEST_TO_COMPARE or widths[-1][0] <= WIDER * widths[-2][0]:
             continue
         (next_px, _), (widest_px, source) = widths[-2:]
-        said.append(
+        said[source] = (
             f"{source}: its line is {widest_px:.1f} px wide (sigma), that of no other image more "
             f"than {next_px:.1f}: the laser may have been moved or focused anew; look at it, or "
             "leave it out"
         )
-    return tuple(said)
+    return tuple(said.values())
 
 
 def calibrate_sheets_again(

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 
 from armscan.calibration.cameras.result import BoardWarp, CameraFit, ViewFit
+from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import Provenance
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.records.exposure import Exposure
@@ -96,23 +97,18 @@ def camera_quantities(fit: CameraFit, n_images: int) -> tuple[Quantity, ...]:
         Quantity("covered_fraction", "", fit.coverage.fraction),
         hold_out_quantity(held_out, "images"),
         *parameter_quantities(fit),
-        *_bow_quantity(fit.warp),
+        *(bow_quantities(fit.warp.bow_mm) if fit.warp is not None else ()),
     )
 
 
-def _bow_quantity(warp: BoardWarp | None) -> tuple[Quantity, ...]:
-    if warp is None or not warp.is_significant:
+def bow_quantities(bow_mm: Sequence[float] | FloatArray) -> tuple[Quantity, ...]:
+    """Bow of the board along x and along y; nothing of a flat one."""
+    if not np.any(bow_mm):
         return ()
-    x, y = (f"{value:+.3f}" for value in warp.bow_mm)
-    return (
-        Quantity(
-            "board.bow_mm",
-            "Bow of the board",
-            warp.bow_mm.tolist(),
-            meaning="solved along",
-            shown=f"{x}, {y} mm along x, along y",
-        ),
-    )
+    x, y = (significant(float(each), "mm") for each in bow_mm)
+    shown = f"{x} along x, {y} along y"
+    value, words = [float(each) for each in bow_mm], "solved along"
+    return (Quantity("board.bow_mm", "Bow of the board", value, shown=shown, meaning=words),)
 
 
 def parameter_quantities(fit: CameraFit) -> tuple[Quantity, ...]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from armscan.calibration.cameras.pairs import SIDES
+from armscan.calibration.cameras.pairs import SIDES, common_bow
 from armscan.calibration.cameras.stereo_result import (
     PairFit,
     StereoFit,
@@ -23,6 +23,7 @@ from armscan.records.exposure import Exposure
 from armscan.report.camera import (
     MEANINGS,
     NO_TARGET,
+    bow_quantities,
     hold_out_quantity,
     noise_text,
     rms_texts,
@@ -87,6 +88,7 @@ PAIRS_HELD_OUT = (
 def stereo_quantities(fit: StereoFit) -> tuple[Quantity, ...]:
     """What is told of a stereo calibration."""
     related = f"{len(fit.related)} used of {len(fit.pairs)}"
+    bow = common_bow((fit.left.single, fit.right.single))
     return (
         Quantity("n_pairs", "Pairs", len(fit.related), shown=related),
         Quantity("n_points", "Target points", fit.n_points),
@@ -110,6 +112,7 @@ def stereo_quantities(fit: StereoFit) -> tuple[Quantity, ...]:
         Quantity("epipolar_mean_px", "", fit.epipolar_mean_px),
         hold_out_quantity(fit.hold_out, "pairs"),
         *_relative_quantities(fit),
+        *(() if bow is None else bow_quantities(bow.bow_mm)),
     )
 
 

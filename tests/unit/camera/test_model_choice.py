@@ -105,8 +105,9 @@ def test_coefficients_are_given_up_with_a_bow_free_only_if_unseen_views_do(
     noise = np.array([0.004, -0.003, 0.002, -0.004, 0.003, -0.002, 0.001, -0.001])
     held_out = {4: 0.2 + np.zeros(VIEWS), 6: larger_px + noise}
 
-    def solution(n_free: int) -> Solution:
-        return cast(Solution, SimpleNamespace(basis=np.eye(9)[:, :n_free]))
+    def solution(n_free: int, *, is_converged: bool = True) -> Solution:
+        basis = np.eye(9)[:, :n_free]
+        return cast(Solution, SimpleNamespace(basis=basis, is_converged=is_converged))
 
     def validate(each: Solution, _reference: Solution) -> CrossValidation:
         rms = held_out[each.basis.shape[1]]
@@ -117,6 +118,7 @@ def test_coefficients_are_given_up_with_a_bow_free_only_if_unseen_views_do(
     larger = ChosenModel("k1k2", solution(6), None, "")
     assert not predicts_better(solution(6), larger, validate)
     assert not predicts_better(FitFailure("none"), smaller, validate)
+    assert not predicts_better(solution(6, is_converged=False), smaller, validate)
 
 
 def test_without_any_solution_the_first_failure_is_told() -> None:

@@ -14,7 +14,11 @@ from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.fan import FanAssignment, number_fan
 from armscan.calibration.sheets.labels import assign_sheets, board_numbers
 from armscan.calibration.sheets.result import BoardStripes, SheetOptions
-from armscan.calibration.sheets.stripes_on_board import BoardImage, observe_board_stripes
+from armscan.calibration.sheets.stripes_on_board import (
+    BoardImage,
+    StripeObservation,
+    observe_board_stripes,
+)
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from rigs.fan_rig import MIDDLE_MM, FanRig, fan_rig
@@ -129,6 +133,22 @@ def test_parallel_boards_are_refused_with_the_reason() -> None:
     assert "tilts" in names.remedy
 
 
+def test_a_fan_among_as_many_strays_recovers_from_a_round_that_looks_hopeless() -> None:
+    """Thirty stripes of a fan and 23 strays: a first round that leaves few need not be the last."""
+    images, _ = images_of(fan_rig(0, 8, 7), 0)
+    rng, stripes = np.random.default_rng(1), list[list[StripeObservation]]()
+    for image in images:
+        row = list(image.stripes)
+        for stripe in image.stripes:
+            if rng.random() < 0.7:
+                astray = stripe.ends_mm + rng.normal(0.0, 20.0, (2, 3))
+                row.append(replace(stripe, ends_mm=astray))
+        stripes.append(row)
+    names = number_fan(stripes, board_numbers(images))
+    assert isinstance(names, FanAssignment), names
+    assert sum(k >= 0 for row in names.sheets for k in row) >= 25
+
+
 def test_stripes_of_no_fan_are_given_up_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stripes thrown about by centimetres, as if beside their boards: few fits, then a reason."""
     images, _ = images_of(fan_rig(0, 8, 15), 0)
@@ -147,8 +167,8 @@ def test_stripes_of_no_fan_are_given_up_soon(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(fan, "_fit_fan", counted)
     names = number_fan(stripes, board_numbers(images))
     assert isinstance(names, FitFailure)
-    assert "hardly any of the" in names.reason
-    assert fits < sum(map(len, stripes)) * fan.MAX_STARTS
+    assert "no numbering puts 25% of the 150 stripes" in names.reason
+    assert fits < 1000
 
 
 def test_boards_that_share_no_line_are_placed_by_the_fan_or_refused() -> None:

@@ -461,6 +461,7 @@ def _solve_model(
     def solve(model: DistortionModel) -> Solution | FitFailure:
         return _solve(used, observations, prepared, model, options)
 
+    @cache
     def bowed(model: DistortionModel) -> Solution | FitFailure:
         flat = solve(model)
         return flat if isinstance(flat, FitFailure) else with_board_warp(flat, options.max_steps)

@@ -237,7 +237,9 @@ def predicts_better(
     Where the residuals of a view are alike, Wald's test has little power: what showed on flat
     boards is given up with the bow free only if views that took no part do without it, too.
     """
-    if isinstance(before, FitFailure) or before.basis.shape[1] <= chosen.solution.basis.shape[1]:
+    if isinstance(before, FitFailure) or not before.is_converged:
+        return False
+    if before.basis.shape[1] <= chosen.solution.basis.shape[1]:
         return False
     smaller = validate(chosen.solution, before)
     gain = _gain_sigmas(smaller, validate(before, before))

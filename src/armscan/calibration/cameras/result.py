@@ -415,8 +415,8 @@ SQUARE_SIGMAS = 5.0
 ALIKE = 4.0
 """Residuals of one view are alike enough to be told if variances are widened by this."""
 MUCH_BOWED = 1e-3
-"""Of the print's longer side. Most boards bow by more than noise hides, and that is solved; sheets
-of card, by this much and more, have other bends of a tenth of it or so."""
+"""Of the print's longer side. Nearly all boards bow by more than noise hides, and that is solved;
+what bends by so much is thin, and is likely to have bends of other shapes, which are not."""
 UNSEEN_WORSE = 1.3
 UNSEEN_BETTER = 0.9
 """Least squares fits the views that it used at least about as well as those that it did not."""

@@ -146,8 +146,13 @@ def calibrate_sheets(
         fit = case if isinstance(case, _Refused) else case.solved()
         if isinstance(fit, LaserFit):
             warnings = (*_about_bow(bow), *vote.warnings, *fit.warnings)
-            boards = tuple(boards)
-            return replace(fit, boards=boards, skipped=vote.outlying, warnings=warnings)
+            return replace(
+                fit,
+                boards=tuple(boards),
+                skipped=vote.outlying,
+                warnings=warnings,
+                board_bow_mm=() if bow is None else tuple(bow.bow_mm.tolist()),
+            )
         if isinstance(fit, FitFailure):
             return fit
         if not assignment.is_fan or len(assignment.names) == 1:

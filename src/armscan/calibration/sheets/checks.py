@@ -245,7 +245,8 @@ def find_outlier_view(
     tests = {board: _test_without(int(board), alone, whole, noise) for board in boards}
     misfit = {board: test.f_ratio * test.degrees_of_freedom for board, test in tests.items()}
     best, second = sorted(misfit, key=lambda board: misfit[board])[:2]
-    if tests[best].p_value < LACK_OF_FIT_P or misfit[second] - misfit[best] < CLEAR_CHI2:
+    is_clear = CLEAR_CHI2 <= misfit[second] - misfit[best] < math.inf
+    if tests[best].p_value < LACK_OF_FIT_P or not is_clear:
         return None
     return int(alone.image[alone.board == best][0])
 

@@ -56,7 +56,7 @@ LARGEST_MEAN_CHI2 = 9.0
 LEAST_NUMBERED = 0.5
 """Part of the stripes that must find a sheet."""
 HOPELESS_NUMBERED = 0.25
-"""A start of which fewer are left on sheets is given up: each further stray costs a fit."""
+"""A round that leaves fewer on sheets is the last but one: each further stray costs a fit."""
 UNEVEN_SHARE = 0.3
 """Distances of neighbouring sheets that differ from whole spacings by more do not tell how many
 sheets are missing between them."""
@@ -117,7 +117,8 @@ def number_fan(
             found.setdefault(tuple(fan.slot.tolist()), fan)
     if not found:
         return FitFailure(
-            f"hardly any of the {len(lines)} stripes fall into sheets of one fan",
+            f"no numbering puts {HOPELESS_NUMBERED:.0%} of the {len(lines)} stripes on sheets of "
+            "one fan",
             f"check the boards' poses, and that all stripes come from one source; {REMEDY}",
         )
     certain = _certain(lines, sorted(found.values(), key=lambda fan: fan.cost))
@@ -253,8 +254,10 @@ def _starting_axes(lines: _Lines, axis: FloatArray, covariance: FloatArray) -> I
 def _polished(lines: _Lines, axis: FloatArray) -> _Fan | None:
     """Number the stripes by their heights, fit the fan, and number again until it stays."""
     slot = _slots_by_height(lines, _heights(lines, axis))
+    n_hopeless = 0
     for _ in range(POLISH_ROUNDS):
-        if not _is_hopeful(slot):
+        n_hopeless += not _is_hopeful(slot)
+        if n_hopeless > 1 or not (slot >= 0).any():
             return None
         fan = _fit_fan(lines, slot, axis)
         again = _slots_by_height(lines, _heights(lines, fan.axis))

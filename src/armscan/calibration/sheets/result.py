@@ -384,6 +384,9 @@ class LaserFit(ArrayRecord):
         Why that channel, in words; empty where nothing was to be chosen.
     print_reason
         Why the target's print was subtracted, in words; empty where it was not.
+    board_bow_mm
+        (2,) bow of the board along x and along y that stripes were placed with; zero for a flat
+        one, empty where the board did not move.
     """
 
     sheets: tuple[SheetFit, ...]
@@ -399,6 +402,7 @@ class LaserFit(ArrayRecord):
     laser_colour: LaserColour = "auto"
     channel_reason: str = ""
     print_reason: str = ""
+    board_bow_mm: tuple[float, ...] = ()
 
     @property
     def sheet_names(self) -> tuple[str, ...]:

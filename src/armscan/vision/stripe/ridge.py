@@ -317,7 +317,8 @@ def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
     """(N, 6) ridge points of the stronger lines, at the scale that suits them better.
 
     A wide line that saturates is flat where a narrow filter looks, and what little is narrow beside
-    it would be taken for the line: where it bends more (reflections), by how few it is.
+    it would be taken for the line. Reflections bend more than such a line, but are few: the wide
+    scale has SPOTS times as many strong points then.
     """
     sample = np.ascontiguousarray(runs[:: max(len(runs) // SAMPLE, 1)])
     narrow, wide = SCALES_PX
@@ -326,8 +327,7 @@ def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
     # wide filters take long, and few lines need them: some candidates tell
     few = np.ascontiguousarray(sample[::LOOKED_AT])
     some, strength_wide = _at_scale(image, few, wide)
-    is_wide = strength_wide > NEARLY * strength
-    if is_wide or LOOKED_AT * len(_strong(some)) > SPOTS * len(strong):
+    if strength_wide > NEARLY * strength or LOOKED_AT * len(_strong(some)) > SPOTS * len(strong):
         points, strength_wide = _at_scale(image, sample, wide)
         wider = _strong(points)
         are_spots = len(wider) > SPOTS * len(strong) and strength_wide > STRONG_SHARE * strength

@@ -280,6 +280,8 @@ NEARLY = 0.8
 """Of the narrow scale's strength: less at the wide one leaves no doubt."""
 SPOTS = 4.0
 """Times as many strong points at the wide scale: what is strong at the narrow one is no line."""
+CLIPPED = 250.0
+"""Of 255, `NORMAL_SCALE`: a little less where a view without laser was taken off."""
 MEASURED = 300
 STRONG_SHARE = 0.4
 REACH_PX = 30.0
@@ -331,8 +333,16 @@ def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
         points, strength_wide = _at_scale(image, sample, wide)
         wider = _strong(points)
         are_spots = len(wider) > SPOTS * len(strong) and strength_wide > STRONG_SHARE * strength
+        are_spots = are_spots and _is_clipped(image, wider)
         strong = wider if strength_wide > strength or are_spots else strong
     return strong
+
+
+def _is_clipped(image: FloatImage, points: FloatArray) -> bool:
+    """Whether most of the points (N, 6) lie where the camera is at its white: of print few do."""
+    last = np.array(image.shape[::-1]) - 1
+    column, row = np.rint(points[:, :2]).astype(np.int64).clip(0, last).T
+    return float((image[row, column] >= CLIPPED).mean()) > 0.5
 
 
 def _strong(points: FloatArray) -> FloatArray:

@@ -286,11 +286,7 @@ FEWEST_TO_COMPARE = 5
 
 
 def about_widths(fit: LaserFit) -> tuple[str, ...]:
-    """Names images in which a sheet's line is much wider than in all others of the camera.
-
-    It is another line, or not as it was. One that lies a little beside the sheet may fit too well
-    to be told by its place.
-    """
+    """Names images in which a sheet's line is much wider than in all others of the camera."""
     said: dict[str, str] = {}
     for sheet, camera in product(range(len(fit.sheets)), {board.camera for board in fit.boards}):
         widths = sorted(
@@ -302,9 +298,8 @@ def about_widths(fit: LaserFit) -> tuple[str, ...]:
             continue
         (next_px, _), (widest_px, source) = widths[-2:]
         said[source] = (
-            f"{source}: its line is {widest_px:.1f} px wide (sigma), that of no other image more "
-            f"than {next_px:.1f}: the laser may have been moved or focused anew; look at it, or "
-            "leave it out"
+            f"{source}: its line is {widest_px:.1f} px wide (sigma), in no other image more than "
+            f"{next_px:.1f}: the laser may have been moved or focused anew; look, or leave it out"
         )
     return tuple(said.values())
 

@@ -21,6 +21,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.models.calibration import FTest, Provenance
 from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES
 from armscan.records.exposure import Exposure
+from armscan.report.camera import bow_quantities
 from armscan.report.charts import PAGE_WIDTH, Bars, histogram_chart, short, symmetric_edges
 from armscan.report.drawing import (
     ACCENT,
@@ -269,6 +270,8 @@ def _sheets_section(fit: LaserFit) -> Section:
     blocks: list[Block] = [
         Facts(for_people(sheet_quantities(sheet)), f"Sheet {sheet.name}") for sheet in fit.sheets
     ]
+    if bow := bow_quantities(fit.board_bow_mm):
+        blocks.append(Facts(bow, "The board"))
     return Section("The sheets", (*blocks, Text(named), Gallery((_scene(fit),), 560)))
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from armscan.calibration.cameras import calibrate
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import (
     CameraFit,
@@ -119,6 +120,17 @@ def test_a_bow_hides_no_coefficient_of_the_lens() -> None:
         truth, found = camera.parameters[:4], fit.camera.parameters[:4]
         errors.append(normalised_error(truth, found, fit.covariance[:4, :4]))
     assert np.mean(errors) < 4.0 + 4.0 * np.sqrt(8.0 / len(errors))
+
+
+def test_what_unseen_views_ask_for_is_not_given_up_for_a_bow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The choice made on a flat board stands where, the bow being free, it predicts better."""
+    camera = replace(CAMERA, distortion=np.array([-0.12, 0.1, 1.2e-3, 1e-3, 0.0]))
+    views = make_views(Scene(camera=camera, noise_px=0.1, bow_mm=(0.5, 0.4)), 1)[0]
+    assert {"p1", "p2"} <= set(solved(views).free_parameters)
+    monkeypatch.setattr(calibrate, "predicts_better", lambda *_: True)
+    assert "p1" not in solved(views).free_parameters
 
 
 def test_bowed_boards_do_not_spoil_the_camera_unasked() -> None:

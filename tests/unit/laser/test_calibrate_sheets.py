@@ -12,7 +12,9 @@ from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, 
 from armscan.errors import OptionError
 from armscan.geometry.poses import Pose
 from armscan.models.light_sheet import LightSheet
+from armscan.pipeline import laser
 from armscan.pipeline.laser import about_widths
+from armscan.records.exposure import Exposure
 from armscan.records.profile import StripeFlag
 from rigs.sheet_rig import (
     THESIS_PLANE,
@@ -205,6 +207,13 @@ def test_an_image_of_a_much_wider_line_is_named(wider: float, named: bool) -> No
     said = about_widths(replace(fit, images=tuple(images)))
     assert len(said) == named
     assert all(text.startswith(images[2].source) for text in said)
+    boards = list(fit.boards)
+    boards[2] = replace(boards[2], profile=images[2].profile)
+    pairs = [(Exposure(np.zeros((2, 2), np.uint8), image.source), None) for image in images]
+    whole = laser._fit_sheets(pairs, boards, fit.camera, fit.options)
+    assert isinstance(whole, LaserFit)
+    assert set(said) <= set(whole.warnings)
+    assert any("px wide" in warning for warning in whole.warnings) == named
     few = replace(fit, images=tuple(images[:4]), boards=fit.boards[:4])
     assert about_widths(few) == (), "of so few none is the usual one"
 

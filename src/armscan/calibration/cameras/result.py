@@ -552,15 +552,12 @@ def _about_residuals(fit: CameraFit) -> list[str]:
 
 
 def _about_warp(fit: CameraFit) -> list[str]:
-    points = np.concatenate([view.view.points_board_mm for view in fit.views])
-    if (
-        fit.warp is None
-        or not fit.warp.is_significant
-        or not is_much_bowed(fit.warp.bow_mm, points)
-    ):
+    if fit.warp is None or not fit.warp.is_significant:
         return []
-    bow = ", ".join(f"{value:+.3f}" for value in fit.warp.bow_mm)
-    largest = float(abs(fit.warp.bow_mm).sum())
+    bow_mm = fit.warp.bow_mm
+    if not is_much_bowed(bow_mm, np.concatenate([view.view.points_board_mm for view in fit.views])):
+        return []
+    bow, largest = ", ".join(f"{value:+.3f}" for value in bow_mm), float(abs(bow_mm).sum())
     return [
         f"the board is bowed by {bow} mm (along x, along y): that is solved along; a flatter board "
         f"is better, for bends of other shapes are not: {largest:.2g} mm in height"

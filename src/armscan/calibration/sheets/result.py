@@ -386,7 +386,7 @@ class LaserFit(ArrayRecord):
         Why the target's print was subtracted, in words; empty where it was not.
     board_bow_mm
         (2,) bow of the board along x and along y that stripes were placed with; zero for a flat
-        one, empty where the board did not move.
+        one, empty where its views do not tell.
     """
 
     sheets: tuple[SheetFit, ...]

@@ -14,6 +14,7 @@ import pytest
 
 from armscan.calibration.cameras.result import CameraOptions
 from rigs.instrument_arm import run_hand_eye
+from rigs.instrument_naming import run_naming
 from rigs.instrument_stages import Outcome, run_camera, run_sheets
 from rigs.instrument_stereo import run_stereo
 from rigs.instruments import Instrument, draw_instrument
@@ -160,3 +161,14 @@ def test_balls_that_every_exposure_throws_are_solved(seed: int) -> None:
 def test_a_large_ball_that_no_turn_tells_from_a_shift_is_refused() -> None:
     """The arm only shifted: 18 mm open, less than a fifth of the ball's diameter."""
     assert hand_eye(1400002, on_sphere=True).result == "rightly refused"
+
+
+@pytest.mark.parametrize("seed", [2100356, 2101610])
+def test_parallel_lines_are_not_named_by_what_was_calibrated_alone(seed: int) -> None:
+    """Where one's depths end, another's go on: 16 and 35 % of the names were wrong."""
+    made = draw_instrument(seed)
+    camera = run_camera(made)
+    sheets = run_sheets(made, camera.calibration, camera.information)
+    assert sheets.fit is not None
+    (found,) = run_naming(made, sheets.fit.to_calibration(PROVENANCE), sheets.names)
+    assert found.result in {"right", "rightly refused"}

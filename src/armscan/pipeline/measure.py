@@ -142,7 +142,8 @@ def labeller_for(
         return StereoLabeller(sensor, options.depths or LABEL_DEPTHS)
     if n_sheets > 1 and not options.sheet and (is_scan or stripes_cross(sensor)):
         return CrossLabeller(sensor, options.depths or LABEL_DEPTHS)
-    return SingleLabeller(sensor, options.accepted_depths(sensor), options.sheet)
+    depths = options.accepted_depths(sensor)
+    return SingleLabeller(sensor, depths, options.sheet, options.depths or LABEL_DEPTHS)
 
 
 def stripes_cross(sensor: SensorCalibration) -> bool:

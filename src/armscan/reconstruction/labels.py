@@ -15,7 +15,12 @@ from armscan.geometry.arrays import ArrayRecord, BoolArray, IntArray, ints
 from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.epipolar import EpipolarOffset
-from armscan.reconstruction.triangulate import CALIBRATED_DEPTHS, DepthRange, intersect_sheets
+from armscan.reconstruction.triangulate import (
+    CALIBRATED_DEPTHS,
+    LABEL_DEPTHS,
+    DepthRange,
+    intersect_sheets,
+)
 from armscan.records.profile import Profile
 
 
@@ -182,11 +187,9 @@ class StripeLabeller(Protocol):
 
 
 MIN_INSIDE = 0.9
-"""A sheet is possible for a segment if this part of its points lies within its reach."""
+"""A sheet is taken for a segment if this part of its points lies within the depths accepted."""
 MAX_INSIDE_OTHERS = 0.1
-"""It is the only one possible if no other sheet has more than this."""
-CALIBRATED = "within its calibrated depths"
-WIDENED = "within reach of its calibrated depths"
+"""It is the only one possible if no other sheet has more than this within its reach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,23 +197,26 @@ class SingleLabeller:
     """Labels each exposure of one camera by itself; a `StripeLabeller`.
 
     In this order: the user's word; the only sheet there is; the exposure's only laser; and else,
-    segment by segment, the one sheet that puts the segment into its calibrated depth range, if no
-    other sheet does so for its own. Only where no sheet does, the ranges are widened and the same
-    is asked again.
+    segment by segment, the one sheet that puts the segment into the depths accepted, if no other
+    sheet reaches it. A surface may lie outside the depths in which its own line was calibrated and
+    inside those of another line: what others reach only beyond their depths is dropped, too.
 
     Parameters
     ----------
     sensor
         Camera and sheets.
     depths
-        Depths that count as inside.
+        Depths that are accepted.
     sheet_name
         The user's choice; empty for none.
+    reach
+        Depths in which another sheet may have drawn a stripe.
     """
 
     sensor: SensorCalibration
     depths: DepthRange = CALIBRATED_DEPTHS
     sheet_name: str = ""
+    reach: DepthRange = LABEL_DEPTHS
 
     def __post_init__(self) -> None:
         names = [sheet.name for sheet in self.sensor.sheets]
@@ -233,25 +239,9 @@ class SingleLabeller:
         Raises
         ------
         EstimationError
-            If the depth leaves more than one sheet possible.
+            If the depth leaves more than one sheet possible for all that could be labelled.
         """
         (profile,) = profiles
-        sheet, reason = self._sheets(profile, lasers)
-        status = np.where(sheet < 0, PointStatus.OUT_OF_DEPTH, PointStatus.MEASURED)
-        status[~profile.is_accepted] = PointStatus.FLAGGED
-        return LabelledInstant(
-            (LabelledProfile(profile=profile, sheet=sheet, status=status, reason=reason),)
-        )
-
-    def next_lasers(self) -> tuple[str, ...]:
-        """Those of the recording."""
-        return ()
-
-    def reset(self) -> None:
-        """Nothing is remembered."""
-
-    def _sheets(self, profile: Profile, lasers: tuple[str, ...]) -> tuple[IntArray, str]:
-        """(N,) sheet of each point, -1 for none, and how it was found, in words."""
         names = [sheet.name for sheet in self.sensor.sheets]
         known = [names.index(name) for name in lasers if name in names]
         if self.sheet_name:
@@ -262,41 +252,54 @@ class SingleLabeller:
             k, why = known[0], "the laser that was on"
         else:
             return self._by_depth(profile, known or list(range(len(names))))
-        return np.full(len(profile), k), f"sheet {names[k]}, {why}"
+        sheet, status = np.full(len(profile), k), np.full(len(profile), PointStatus.MEASURED)
+        return _labelled(profile, sheet, status, f"sheet {names[k]}, {why}")
 
-    def _by_depth(self, profile: Profile, possible: list[int]) -> tuple[IntArray, str]:
-        chosen = np.full(len(profile), -1)
+    def next_lasers(self) -> tuple[str, ...]:
+        """Those of the recording."""
+        return ()
+
+    def reset(self) -> None:
+        """Nothing is remembered."""
+
+    def _by_depth(self, profile: Profile, possible: list[int]) -> LabelledInstant:
+        sheet = np.full(len(profile), -1)
+        status = np.full(len(profile), PointStatus.OUT_OF_DEPTH)
+        inside = {k: self._is_inside(profile, self.depths, k) for k in possible}
+        reached = {k: self._is_inside(profile, self.reach, k) for k in possible}
         ambiguous: list[str] = []
-        reaches = []
-        for how, accepted in ((CALIBRATED, CALIBRATED_DEPTHS), (WIDENED, self.depths)):
-            inside = {k: self._is_inside(profile, accepted, k) for k in possible}
-            found: set[int] = set()
-            for segment in np.unique(profile.segment[profile.is_accepted & (chosen == -1)]):
-                in_segment = profile.segment == segment
-                used = in_segment & profile.is_accepted
-                share = {k: float(inside[k][used].mean()) for k in possible}
-                best = max(possible, key=lambda k: share[k])
-                others = max((share[k] for k in possible if k != best), default=0.0)
-                if share[best] < MIN_INSIDE:
-                    continue
-                if others > MAX_INSIDE_OTHERS:
-                    shares = (f"{self.sensor.sheets[k].name} {share[k]:.0%}" for k in possible)
-                    ambiguous.append(f"{how}: {', '.join(shares)}")
-                    continue
-                chosen[in_segment] = best
-                found.add(best)
-            if ambiguous:
-                raise EstimationError(
-                    f"{len(ambiguous)} stripe segments may belong to more than one light sheet "
-                    f"(points {ambiguous[0]})",
-                    where=profile.source,
-                    remedy="name the sheet with --sheet, or photograph one laser at a time",
-                )
-            if found:
-                names = ", ".join(self._reach(k) for k in sorted(found))
-                reaches.append(f"the only sheet that puts the stripe {how}: {names}")
-        nowhere = "no sheet puts a stripe within reach of its calibrated depths"
-        return chosen, "; ".join(reaches) or nowhere
+        for segment in np.unique(profile.segment[profile.is_accepted]):
+            in_segment = profile.segment == segment
+            used = in_segment & profile.is_accepted
+            share = {k: float(inside[k][used].mean()) for k in possible}
+            best = max(possible, key=lambda k: share[k])
+            if share[best] < MIN_INSIDE:
+                continue
+            others = {k: float(reached[k][used].mean()) for k in possible if k != best}
+            if max(others.values(), default=0.0) > MAX_INSIDE_OTHERS:
+                status[in_segment] = PointStatus.AMBIGUOUS
+                ambiguous.append(self._shares({best: share[best], **others}))
+                continue
+            sheet[in_segment], status[in_segment] = best, PointStatus.MEASURED
+        found = np.unique(sheet[sheet >= 0]).tolist()
+        if ambiguous and not found:
+            raise EstimationError(
+                f"{len(ambiguous)} stripe segments may belong to more than one light sheet "
+                f"({ambiguous[0]}), and none belongs to one alone",
+                where=profile.source,
+                remedy="name the sheet with --sheet, photograph one laser at a time, or, if no "
+                "surface lies outside the depths in which its line was calibrated, say so by "
+                "--depth-margin 0",
+            )
+        reason = "no sheet puts a stripe into the depths accepted"
+        if found:
+            reached_by = ", ".join(self._reach(k) for k in found)
+            reason = f"the only sheet that reaches the stripe: {reached_by}"
+        return _labelled(profile, sheet, status, reason)
+
+    def _shares(self, inside: dict[int, float]) -> str:
+        shares = (f"{self.sensor.sheets[k].name} {share:.0%}" for k, share in inside.items())
+        return f"points within reach of their depths: {', '.join(shares)}"
 
     def _is_inside(self, profile: Profile, depths: DepthRange, k: int) -> BoolArray:
         sheet = np.full(len(profile), k)
@@ -308,3 +311,10 @@ class SingleLabeller:
         (low, high), (least, most) = sheet.depth_range_mm, self.depths.limits_mm(sheet)
         calibrated = f"{sheet.name} (calibrated Z {low:.0f} to {high:.0f} mm"
         return f"{calibrated}, accepted {least:.0f} to {most:.0f} mm)"
+
+
+def _labelled(profile: Profile, sheet: IntArray, status: IntArray, reason: str) -> LabelledInstant:
+    status[~profile.is_accepted] = PointStatus.FLAGGED
+    return LabelledInstant(
+        (LabelledProfile(profile=profile, sheet=sheet, status=status, reason=reason),)
+    )

@@ -8,7 +8,8 @@ from armscan.errors import EstimationError, OptionError
 from armscan.models.calibration import SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.labels import LabelledProfile, SingleLabeller
+from armscan.pipeline.measure import MeasureOptions, labeller_for
+from armscan.reconstruction.labels import LabelledProfile, PointStatus, SingleLabeller
 from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.profile import Profile, StripeFlag
 from rigs.sheet_rig import PROVENANCE, make_profile
@@ -35,7 +36,7 @@ def leaning(sign: float) -> LightSheet:
     )
 
 
-def two_sheets() -> SensorCalibration:
+def two_sheets(right_mm: tuple[float, float] = RANGE_MM) -> SensorCalibration:
     camera = certain_camera(CAMERA, PROVENANCE)
     sheets = tuple(
         SheetCalibration(
@@ -44,10 +45,10 @@ def two_sheets() -> SensorCalibration:
             rms_mm=0.01,
             n_boards=4,
             n_points=99,
-            depth_range_mm=RANGE_MM,
+            depth_range_mm=depths_mm,
             is_redundant=True,
         )
-        for name, sign in (("left", 1.0), ("right", -1.0))
+        for name, sign, depths_mm in (("left", 1.0, RANGE_MM), ("right", -1.0, right_mm))
     )
     return SensorCalibration(
         camera=camera, sheets=sheets, covariance=np.zeros((25, 25)), provenance=PROVENANCE
@@ -70,8 +71,10 @@ def labelled(
     *,
     sheet_name: str = "",
     lasers: tuple[str, ...] = (),
+    reach: DepthRange | None = None,
 ) -> LabelledProfile:
-    (found,) = SingleLabeller(sensor, depths, sheet_name).label([profile], lasers).profiles
+    labeller = SingleLabeller(sensor, depths, sheet_name, reach or depths)
+    (found,) = labeller.label([profile], lasers).profiles
     return found
 
 
@@ -95,24 +98,8 @@ def test_the_only_laser_that_was_on() -> None:
 
 
 def test_depth_names_a_stripe_that_one_sheet_alone_puts_in_range() -> None:
-    """At x/z = 0.13: left z = 344.8, right z = 265.5. Range of right widened to 265 only."""
-    sensor = two_sheets()
-    wide = SheetCalibration(
-        name="right",
-        sheet=leaning(-1.0),
-        rms_mm=0.01,
-        n_boards=4,
-        n_points=99,
-        depth_range_mm=(262.0, 320.0),
-        is_redundant=True,
-    )
-    sensor = SensorCalibration(
-        camera=sensor.camera,
-        sheets=(sensor.sheets[0], wide),
-        covariance=sensor.covariance,
-        provenance=PROVENANCE,
-    )
-    choice = labelled(stripes(0.13), sensor, DepthRange(0.0))
+    """At x/z = 0.13: left z = 344.8, right z = 265.5. Range of right widened to 262 only."""
+    choice = labelled(stripes(0.13), two_sheets((262.0, 320.0)), DepthRange(0.0))
     assert set(choice.sheet.tolist()) == {1}
     assert "right" in choice.reason
 
@@ -122,55 +109,41 @@ def test_the_words_tell_the_calibrated_depths_from_those_accepted() -> None:
     choice = labelled(stripes(-0.25), two_sheets(), DepthRange(1.5))
     assert set(choice.sheet.tolist()) == {0}
     assert "left (calibrated Z 280 to 320 mm, accepted 220 to 380 mm)" in choice.reason
-    assert "within reach" in choice.reason
 
 
-def test_the_calibrated_depths_decide_before_the_widened_ones() -> None:
-    """At x/z = 0.05: left z = 315.8, calibrated; right z = 285.7, outside its 290 to 320 mm."""
-    sensor = two_sheets()
-    right = SheetCalibration(
-        name="right",
-        sheet=leaning(-1.0),
-        rms_mm=0.01,
-        n_boards=4,
-        n_points=99,
-        depth_range_mm=(290.0, 320.0),
-        is_redundant=True,
-    )
-    sensor = SensorCalibration(
-        camera=sensor.camera,
-        sheets=(sensor.sheets[0], right),
-        covariance=sensor.covariance,
-        provenance=PROVENANCE,
-    )
-    choice = labelled(stripes(0.05), sensor, DepthRange(3.0))
+IN_LEFT = 0.05
+"""Left z = 315.8, calibrated; right z = 285.7, 4.3 mm before its range of 290 to 320 mm."""
+FAR_OF_RIGHT = -0.05
+"""Left z = 285.7, calibrated; right z = 315.8, 15.8 mm behind its range of 280 to 300 mm."""
+
+
+def test_what_another_sheet_reaches_beyond_its_own_depths_is_dropped() -> None:
+    """A surface before the right line's depths would be measured on the left line's sheet."""
+    sensor, within = two_sheets((290.0, 320.0)), DepthRange(0.0)
+    seen = stripes(IN_LEFT, 0.13)
+    choice = labelled(seen, two_sheets((262.0, 284.0)), within, reach=DepthRange(0.1))
+    assert choice.sheet.tolist() == [-1] * 40 + [1] * 40
+    assert choice.count(PointStatus.AMBIGUOUS) == 40
+    with pytest.raises(EstimationError, match="left 100%, right 100%"):
+        labelled(stripes(IN_LEFT), sensor, within, reach=DepthRange(0.5))
+
+
+def test_others_are_looked_for_beyond_the_depths_accepted_unless_a_margin_is_given() -> None:
+    sensor, both = two_sheets((290.0, 320.0)), stripes(IN_LEFT)
+    with pytest.raises(EstimationError, match="--depth-margin 0"):
+        labeller_for(sensor, MeasureOptions()).label([both])
+    (given,) = labeller_for(sensor, MeasureOptions(depths=DepthRange(0.0))).label([both]).profiles
+    assert set(given.sheet.tolist()) == {0}
+
+
+def test_no_reach_leaves_the_calibrated_depths_to_decide() -> None:
+    sensor, within = two_sheets((290.0, 320.0)), DepthRange(0.0)
+    choice = labelled(stripes(IN_LEFT), sensor, within)
     assert set(choice.sheet.tolist()) == {0}
-    assert "within its calibrated depths: left" in choice.reason
-    assert "within reach" not in choice.reason
-
-
-def test_only_segments_outside_all_calibrated_depths_ask_the_widened_ones() -> None:
-    """Left's first stripe as above; the second (z = 240 or 400) is reached by left alone."""
-    sensor = two_sheets()
-    right = SheetCalibration(
-        name="right",
-        sheet=leaning(-1.0),
-        rms_mm=0.01,
-        n_boards=4,
-        n_points=99,
-        depth_range_mm=(290.0, 320.0),
-        is_redundant=True,
+    near = labelled(
+        stripes(FAR_OF_RIGHT), two_sheets((280.0, 300.0)), within, reach=DepthRange(0.5)
     )
-    sensor = SensorCalibration(
-        camera=sensor.camera,
-        sheets=(sensor.sheets[0], right),
-        covariance=sensor.covariance,
-        provenance=PROVENANCE,
-    )
-    choice = labelled(stripes(0.05, -0.25), sensor, DepthRange(1.5))
-    assert set(choice.sheet.tolist()) == {0}
-    assert choice.reason.count("left") == 2
-    assert "within reach" in choice.reason
+    assert set(near.sheet.tolist()) == {0}
 
 
 def test_a_stripe_that_both_sheets_put_in_range_is_not_guessed() -> None:
@@ -181,6 +154,7 @@ def test_a_stripe_that_both_sheets_put_in_range_is_not_guessed() -> None:
 def test_a_stripe_in_no_range_gets_no_sheet() -> None:
     choice = labelled(stripes(FAR, NEAR), two_sheets(), DepthRange(0.0))
     assert set(choice.sheet.tolist()) == {-1}
+    assert choice.count(PointStatus.OUT_OF_DEPTH) == len(choice.profile)
     assert choice.reason.startswith("no sheet")
 
 

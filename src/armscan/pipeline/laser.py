@@ -5,10 +5,10 @@ the stripes, extraction, and the fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import cast, get_args
+from typing import cast
 
 import numpy as np
 
@@ -32,14 +32,11 @@ from armscan.calibration.sheets.result import (
     SkippedImage,
 )
 from armscan.calibration.sheets.stripes_on_board import (
-    BoardImage,
     find_target_edges,
     runs_along_edge,
 )
-from armscan.calibration.sheets.voting import observe_boards
-from armscan.geometry.arrays import IntArray
+from armscan.calibration.sheets.voting import choose_channel, choose_print, observe_boards
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.least_squares import robust_sigma
 from armscan.models.calibration import CameraCalibration, LaserColour, SensorCalibration
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, check_sizes
@@ -61,22 +58,11 @@ PRINT_STAGE = "stripes with and without the print"
 AGAIN_STAGE = "boards and stripes again"
 LITTLE = 0.5
 """Of the usual count of points on the common sheet: with fewer an image is looked at again."""
-LEAST_SHOWN = 2
-"""Photographs that must show a stripe on the common sheet: one makes no sheet, and may be print."""
 LEAST_WIDTHS = 3
 """Images with a stripe on the common sheet from which on the line's width is known."""
 LARGEST_CHI2 = 900.0
 """Two cameras whose poses of one board differ by more, of 6 expected, did not see one placement:
 30 sigma leave room for a board that is not quite flat."""
-SAMPLE = 16
-"""Photographs on which channels are tried, evenly spread over the set. On eight of the fourteen of
-a speckled line on endoscope images chance chose: points off their boards by 0.29 mm, by 0.20 with
-the channel that all fourteen show best."""
-LEAST_SHARE = {3: 0.1, 8: 0.5}
-"""After so many of them, channels with less than this share of the best one's are given up."""
-LEAST_SCATTER_PX = 0.1
-"""Scatter below this does not make a channel better: boards and lens are not known better."""
-CHANNELS: tuple[LaserColour, ...] = get_args(LaserColour)[1:]
 OWN_CAMERA = CameraOptions(distortion="k1k2p1p2", n_folds=0)
 FEWEST_OF_OWN_CAMERA = 5
 """Boards from which on a camera is solved from them, to be set beside the given one: of fewer, it
@@ -170,8 +156,8 @@ def calibrate_sheets_from_pairs(
     known: dict[tuple[int, bool], BoardStripes | FitFailure] = {}
 
     def tried(k: int, less: bool) -> BoardStripes | FitFailure:
-        exposure, done = bare[k][0], k + less * len(bare)
-        progress(ProgressEvent(PRINT_STAGE, done, 2 * len(bare), exposure.source))
+        exposure = bare[k][0]
+        progress(ProgressEvent(PRINT_STAGE, len(known), 2 * len(bare), exposure.source))
         stripes = known[id(exposure), less] = stripes_of(bare[k], colour, less_print=less)
         return stripes
 
@@ -531,88 +517,6 @@ def _same_placement(
     )
 
 
-def choose_channel(
-    n_images: int,
-    stripes_of: Callable[[int, LaserColour], BoardStripes | FitFailure],
-    cameras: HeadCameras,
-    options: SheetOptions,
-) -> tuple[LaserColour, str]:
-    """Try every channel on a sample of a set and take the one with the most evidence.
-
-    One photograph does not tell: a lamp, a red handle, the pattern of the board and JPEG's coarse
-    colours each win somewhere. Over a set the laser's line is the one that is long, straight on the
-    board, narrow, and on the light sheet on which the boards agree.
-
-    ``stripes_of`` gives the stripes of one of ``n_images`` photographs with a board in a channel.
-    With the channel comes why it was taken, in words; ``auto`` and nothing where no channel shows a
-    straight stripe on a board.
-    """
-    sample = _sample(n_images)
-    # The middle one and both ends first: they differ most.
-    order = sorted(
-        range(len(sample)), key=lambda k: k not in {0, len(sample) // 2, len(sample) - 1}
-    )
-    found: dict[LaserColour, list[BoardStripes]] = {channel: [] for channel in CHANNELS}
-    for tried, k in enumerate(order):
-        for channel, stripes in found.items():
-            shown = stripes_of(int(sample[k]), channel)
-            if not isinstance(shown, FitFailure):
-                stripes.append(shown)
-        share = LEAST_SHARE.get(tried + 1)
-        if share is not None and len(order) > tried + 1:
-            weights = {c: _weigh(s, cameras, options)[0] for c, s in found.items()}
-            least = share * max(weights.values())
-            found = {c: stripes for c, stripes in found.items() if weights[c] >= least}
-    evidence = [(_weigh(s, cameras, options), c) for c, s in found.items()]
-    evidence.sort(key=lambda item: -item[0][0])
-    (weight, n_shown, n_points, scatter_px), best = evidence[0]
-    if weight <= 0.0:
-        return "auto", ""
-    reason = (
-        f"{best}: the stripe on the common sheet in {n_shown} of {len(sample)} "
-        f"sampled photographs, {n_points} points that scatter {scatter_px:.2f} px"
-    )
-    if len(evidence) > 1 and evidence[1][0][0] > 0.0:
-        (_, n_shown, n_points, scatter_px), second = evidence[1]
-        reason += f"; next {second} with {n_shown}, {n_points} and {scatter_px:.2f} px"
-    return best, reason
-
-
-def _sample(n_images: int) -> IntArray:
-    """Numbers of a few images, evenly spread over a set."""
-    return np.unique(np.linspace(0, n_images - 1, min(SAMPLE, n_images)).round().astype(np.int64))
-
-
-def choose_print(
-    n_images: int,
-    stripes_of: Callable[[int, bool], BoardStripes | FitFailure],
-    cameras: HeadCameras,
-    options: SheetOptions,
-) -> tuple[bool, str]:
-    """Whether a set shows its lines better where the target's print is taken away, and how so.
-
-    ``stripes_of`` gives the stripes of one of ``n_images`` photographs without a view without laser
-    as it is, or less its print as `predict_print` knows it. Judged as in `choose_channel`.
-    """
-    if not n_images:
-        return False, ""
-    sample = _sample(n_images)
-    evidence = []
-    for less_print in (False, True):
-        found = [stripes_of(int(k), less_print) for k in sample]
-        boards = [item for item in found if isinstance(item, BoardStripes)]
-        evidence.append(_weigh(boards, cameras, options))
-    (as_is, n_before, points_before, _), (less, n_shown, n_points, scatter_px) = evidence
-    if less <= as_is or n_shown < LEAST_SHOWN:
-        return False, ""
-    return True, (
-        f"{n_images} photographs have none without laser: their print is told from its repetition "
-        f"and subtracted; the stripe on the common sheet in {n_shown} of {len(sample)} that were "
-        f"tried, {n_points} points that scatter {scatter_px:.2f} px (as they are: in {n_before}, "
-        f"{points_before} points)"
-    )
-
-
 def _with_predicted_print(
     pair: ExposurePair, placement: BoardPlacement, target: Target, cameras: HeadCameras
 ) -> ExposurePair:
@@ -624,36 +528,6 @@ def _with_predicted_print(
     camera, view, pose = seen
     lit = around_board(view, exposure)
     return exposure, predict_print(lit, view, target, pose.value, cameras.model(camera))
-
-
-def _weigh(
-    boards: Sequence[BoardStripes], cameras: HeadCameras, options: SheetOptions
-) -> tuple[float, int, int, float]:
-    """Weight of a channel's stripes on the common sheet, their photographs, points and scatter.
-
-    The points over the square of their scatter (rms, px) are the precision that a photograph gets
-    from the channel. The weight is the square of the sum of its roots: a short piece of an edge on
-    two boards does not outweigh a line across all.
-    """
-    images = observe_boards(boards, cameras, options).images if boards else ()
-    stripes = [(image, stripe.rows) for image in images for stripe in image.stripes]
-    n = np.array([len(rows) for _, rows in stripes], dtype=np.int64)
-    square = np.array([_scatter_px(image, rows) ** 2 for image, rows in stripes])
-    scatter_px = float(np.sqrt((n * square).sum() / n.sum())) if len(n) else 0.0
-    precision = n / (square + LEAST_SCATTER_PX**2)
-    of = np.repeat(np.arange(len(images)), [len(image.stripes) for image in images])
-    root = np.sqrt(np.bincount(of, precision, minlength=len(images))).sum()
-    weight = float(root**2)
-    return weight, sum(1 for image in images if image.stripes), int(n.sum()), scatter_px
-
-
-def _scatter_px(image: BoardImage, rows: IntArray) -> float:
-    """Robust scatter of a stripe's points across a straight line on the board, in pixels."""
-    flat = image.on_board_mm()[rows]
-    centred = flat - flat.mean(axis=0)
-    along, across = np.linalg.svd(centred, full_matrices=False)[2]
-    x, y = centred @ along, centred @ across
-    return robust_sigma(y - np.polyval(np.polyfit(x, y, 1), x)) / image.mm_per_px(rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

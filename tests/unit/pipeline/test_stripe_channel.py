@@ -9,10 +9,10 @@ import pytest
 
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.result import BoardStripes, SheetOptions
+from armscan.calibration.sheets.voting import choose_channel, choose_print
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import LaserColour
-from armscan.pipeline.laser import choose_channel, choose_print
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
@@ -155,6 +155,24 @@ def test_a_print_is_taken_away_where_that_shows_the_line_better(
     is_taken, reason = choose_print(len(boards), stripes_of, cameras, SheetOptions())
     assert is_taken is expected
     assert bool(reason) is expected
+
+
+def test_a_print_that_shows_no_line_is_given_up_after_three_photographs() -> None:
+    """Telling a print takes a second an image."""
+    rig = rig_of_vga()
+    boards = replace(rig, sigma_stripe_px=1e-3).boards(rig.camera, np.random.default_rng(2))
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+    asked: list[int] = []
+
+    def stripes_of(k: int, is_less: bool) -> BoardStripes | FitFailure:
+        if is_less:
+            asked.append(k)
+            return FitFailure("no stripe")
+        return cut_to(boards[k], 120, 1.0, k)
+
+    assert len(boards) > 3
+    assert choose_print(len(boards), stripes_of, cameras, SheetOptions()) == (False, "")
+    assert sorted(asked) == [0, len(boards) // 2, len(boards) - 1]
 
 
 def test_without_bare_photographs_no_print_is_asked_for() -> None:

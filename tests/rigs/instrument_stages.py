@@ -74,7 +74,7 @@ class Outcome:
     result: str
     reason: str = ""
     chi2: float = float("nan")
-    freedom: int = 0
+    freedom: float = 0
     groups: dict[str, float] = field(default_factory=dict)
     over_bound: float = float("nan")
     over_granted: float = float("nan")
@@ -395,25 +395,24 @@ def judge_sheets(
     names = lights_of(made, fit, lines)
     bowed = [False] * len(made.lights)
     for sheet, name in zip(fit.sheets, names, strict=True):
-        bowed[name] = sheet.sheet.is_bowed
+        bowed[name] = sheet.is_bow_free
     whole = sheet_information(made, information, seen, lines, n_shared)
     first = len(information)
-    best = _light_bounds(whole, first, {k: N_TERMS if bowed[k] else 3 for k in names})
     likely = _likely_bows(made, fit, names)
     for k, precision in likely.items():
         bow = first + N_TERMS * k + np.arange(3, N_TERMS)
         whole[bow, bow] += precision
     widths = {k: N_TERMS if bowed[k] or k in likely else 3 for k in names}
+    best = _light_bounds(whole, first, widths)
     stored = whole[n_shared:, n_shared:]
     best_granted = _light_bounds(stored, first - n_shared, widths)
     given_camera = _given_camera(fit, n_shared)
-    squares, freedom, is_wrong = 0.0, 0, False
+    squares, freedom, is_wrong = 0.0, 0.0, False
     ratios: list[float] = []
     over_granted: list[float] = []
     groups: dict[str, float] = {}
     for number, (sheet, k) in enumerate(zip(fit.sheets, names, strict=True)):
         points = points_of_light(made, lines, k)
-        # A plane that was kept states what it may be bowed by; the bound is that of a plane.
         n = 8 if sheet.covariance[3, 3] > 0.0 else 3
         error, rest = sheet_error(sheet, points, n)
         one = judged(
@@ -423,9 +422,11 @@ def judge_sheets(
         for group, value in one.groups.items():
             groups[group] = max(groups.get(group, 0.0), value)
         light = made.lights[k]
-        is_plane = not (light.cone or light.skew or sheet.sheet.is_bowed)
-        # A true plane, kept as one, has no error in what a bow might be.
-        squares, freedom = squares + one.chi2, freedom + (3 if is_plane else n)
+        squares, freedom = squares + one.chi2, freedom + n
+        if k in likely and not (light.cone or light.skew):
+            # What is known of a true plane's bow beforehand is no error of it.
+            bow_mm = LIKELY_BOW * sheet.sheet.scale_mm * BOW_SHARES
+            freedom -= float((np.diag(sheet.covariance)[3:8] / bow_mm**2).sum())
         _, _, by = sheet.sheet.height_with_jacobian(points)
         for covariance, bounds, found in (
             (given_camera[number], best_granted, over_granted),
@@ -482,7 +483,7 @@ def _given_camera(fit: LaserFit, n_shared: int) -> list[FloatArray]:
 
 
 def _likely_bows(made: Instrument, fit: LaserFit, names: Sequence[int]) -> dict[int, FloatArray]:
-    """(5,) precision of the bow's terms of each light kept as a plane that states a bow."""
+    """(5,) precision of the bow's terms of each light of which no test asked for one."""
     half = 0.5 * made.field_mm
     degrees = np.array([sum(term) for term in BOW_TERMS])
     return {
@@ -494,7 +495,7 @@ def _likely_bows(made: Instrument, fit: LaserFit, names: Sequence[int]) -> dict[
         )
         ** -2.0
         for sheet, k in zip(fit.sheets, names, strict=True)
-        if not sheet.sheet.is_bowed and sheet.covariance[3, 3] > 0.0
+        if not sheet.is_bow_free and sheet.covariance[3, 3] > 0.0
     }
 
 

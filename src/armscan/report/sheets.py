@@ -19,7 +19,7 @@ from armscan.calibration.sheets.result import (
 )
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.models.calibration import FTest, Provenance
-from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES
+from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES, LightSheet
 from armscan.records.exposure import Exposure
 from armscan.report.camera import bow_quantities
 from armscan.report.charts import PAGE_WIDTH, Bars, histogram_chart, short, symmetric_edges
@@ -98,6 +98,11 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
         f"{significant(float(value), 'mm')} {_term(i, j)}"
         for value, (i, j) in zip(sheet.bow_mm, BOW_TERMS, strict=True)
     )
+    if not sheet.is_bowed:
+        bow = "none: a plane"
+    elif not fit.is_bow_free:
+        largest = significant(_largest_bow_mm(sheet), "mm")
+        bow = f"up to {largest}, the likeliest; no test asks for one"
     alone = "no: two stripes fix a plane, only their coplanarity checks it"
     return (
         Quantity("name", "", fit.name),
@@ -149,7 +154,7 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
             "bow_mm",
             "Bow (u along the stripe, v in depth)",
             sheet.bow_mm.tolist(),
-            shown=bow if sheet.is_bowed else "none: a plane",
+            shown=bow,
         ),
         *([_light_source(fit)] if sheet.fan.any() else []),
         fact("Plane or bow, and why", sentence(known.bow_decision)),
@@ -161,6 +166,13 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
             shown=lack_of_fit_text(known.final_test),
         ),
     )
+
+
+def _largest_bow_mm(sheet: LightSheet) -> float:
+    """Within the region that was calibrated."""
+    u, v = np.meshgrid(*2 * (np.linspace(-1.0, 1.0, 21),))
+    terms = zip(sheet.bow_mm, BOW_TERMS, strict=True)
+    return float(np.abs(sum(bow * u**i * v**j for bow, (i, j) in terms)).max())
 
 
 def _light_source(fit: SheetFit) -> Quantity:
@@ -253,11 +265,12 @@ def laser_page(
 
 def _card(fit: SheetFit) -> Quantity:
     low, high = fit.calibration.depth_range_mm
+    plane = "plane with a likely bow" if fit.sheet.is_bowed else "plane"
     return fact(
         f"Sheet {fit.name}",
         f"{significant(fit.points.fitted.rms_mm)} mm rms off the boards",
         f"{fit.calibration.n_boards} boards, Z {low:.0f} to {high:.0f} mm, "
-        f"{'bowed' if fit.sheet.is_bowed else 'plane'}",
+        f"{'bowed' if fit.is_bow_free else plane}",
     )
 
 

@@ -67,13 +67,13 @@ def fits(
 def test_boards_that_claim_too_much_make_no_bow_and_are_charged_their_scatter(
     options: SheetOptions | None,
 ) -> None:
-    """Poses claimed 8 times better than they are: the sheet stays flat and the points' claim right.
+    """Poses claimed 8 times better than they are: no bow is asked for and the points' claim right.
 
     Root mean square over claim averages 1 within four of its own standard errors: the boards' two
     heights each, over all seeds, are 2 x 14 x 8 numbers, so 1 +- 0.047.
     """
     found = fits(0.0, 8.0, options)
-    assert not any(fit.sheets[0].sheet.is_bowed for fit in found)
+    assert not any(fit.sheets[0].is_bow_free for fit in found)
     ratios = [
         f.sheets[0].points.fitted.rms_mm / f.sheets[0].points.fitted.claimed_rms_mm for f in found
     ]
@@ -108,7 +108,7 @@ def test_a_bent_board_is_not_taken_for_a_pose_known_a_hundred_times_worse() -> N
         boards = [bent(board, 0.3 * rng.standard_normal()) for board in rig.boards(rig.camera, rng)]
         fit = calibrate_sheets(boards, rig.calibration(rig.camera))
         assert isinstance(fit, LaserFit), fit
-        assert not fit.sheets[0].sheet.is_bowed
+        assert not fit.sheets[0].is_bow_free
         told = [w for w in fit.warnings if "times as much as their targets" in w]
         factors = [float(w.split("err ")[1].split(" times")[0]) for w in told]
         assert all(factor < 4.0 for factor in factors), factors
@@ -118,7 +118,7 @@ def test_a_bent_board_is_not_taken_for_a_pose_known_a_hundred_times_worse() -> N
 
 def test_a_bow_is_a_bow_though_the_boards_scatter() -> None:
     for fit in fits(0.15, 4.0):
-        assert fit.sheets[0].sheet.is_bowed
+        assert fit.sheets[0].is_bow_free
         sheet = fit.sheets[0].sheet
         truth_mm = 0.15 * (sheet.scale_mm / 20.0) ** 2
         assert abs(sheet.bow_mm[0]) == pytest.approx(truth_mm, rel=0.25)
@@ -131,12 +131,12 @@ def test_a_faint_bow_shows_though_boards_err_by_thirty_times_their_claims() -> N
     """
     seeds = range(4)
     for fit in fits(0.05, 30.0, corner_px=0.3, seeds=seeds):
+        assert fit.sheets[0].is_bow_free
         sheet = fit.sheets[0].sheet
-        assert sheet.is_bowed
         truth_mm = 0.05 * (sheet.scale_mm / 20.0) ** 2
         assert abs(sheet.bow_mm[0]) == pytest.approx(truth_mm, rel=0.25)
     for fit in fits(0.0, 30.0, corner_px=0.3, seeds=seeds):
-        assert not fit.sheets[0].sheet.is_bowed
+        assert not fit.sheets[0].is_bow_free
 
 
 def test_honest_boards_are_charged_nothing() -> None:

@@ -136,11 +136,11 @@ def test_parallel_boards_at_two_depths_are_solved_with_a_warning() -> None:
 def test_a_flat_sheet_stays_flat_and_a_bowed_one_bows() -> None:
     """A bow of 0.15 mm is 5 px of stripe noise's 0.06: found, and followed over all boards."""
     flat = fitted(thesis_rig())
-    assert not flat.sheets[0].sheet.is_bowed
+    assert not flat.sheets[0].is_bow_free
     rig = thesis_rig(bow_uu_mm=0.15, bow_uv_mm=-0.05)
     fit = fitted(rig)
     sheet = fit.sheets[0]
-    assert sheet.sheet.is_bowed, sheet.diagnostics.bow_decision
+    assert sheet.is_bow_free, sheet.diagnostics.bow_decision
     assert sheet.diagnostics.plane_test.p_value < 1e-6
     assert sheet.diagnostics.final_test.p_value > 1e-3
     true_points = np.concatenate(
@@ -160,7 +160,7 @@ def test_three_boards_cannot_tell_a_bow_and_say_so() -> None:
     rig = thesis_rig(bow_uu_mm=0.4)
     fit = fitted(replace(rig, poses=rig.poses[:3]))
     sheet = fit.sheets[0]
-    assert not sheet.sheet.is_bowed
+    assert not sheet.is_bow_free
     assert "3 boards cannot tell" in sheet.diagnostics.bow_decision
     assert any("does not explain" in warning for warning in fit.warnings)
     flat = fitted(replace(thesis_rig(), poses=rig.poses[:3])).sheets[0]

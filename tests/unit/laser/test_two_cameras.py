@@ -79,7 +79,7 @@ def test_joint_errors_of_cameras_and_sheets_are_as_large_as_stated() -> None:
     for seed in range(6):
         rig = flat(fan_rig(500 + seed, 6, 5))
         fit, stereo, of = fitted(rig, seed, is_bow_allowed=False)
-        assert not any(sheet.sheet.is_bowed for sheet in fit.sheets)
+        assert not any(sheet.is_bow_free for sheet in fit.sheets)
         error, place = errors(fit, stereo, of, rig)
         covariance = fit.covariance[np.ix_(place, place)]
         sigma = np.sqrt(np.diag(covariance))

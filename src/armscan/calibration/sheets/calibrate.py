@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -56,7 +57,6 @@ from armscan.calibration.sheets.solve import (
     SheetSolution,
     solve_sheets,
     stack_observations,
-    with_unseen_bow,
 )
 from armscan.calibration.sheets.stripes_on_board import MIN_POINTS, OUTLIER_SIGMA, BoardImage
 from armscan.calibration.sheets.voting import observe_boards
@@ -294,7 +294,8 @@ class _Case:
         what the model does not explain must not make the sheet look better known.
         """
         models, used = self.models, self.observations.select(self.kept)
-        solution = solve_sheets(
+        solved = partial(
+            solve_sheets,
             used,
             [model.sheet for model in models],
             self._errors,
@@ -302,12 +303,11 @@ class _Case:
             sigma_factor=np.array([model.sigma_factor for model in models])[used.sheet],
             are_cameras_held=True,
         )
+        fitted, solution = solved(), solved(may_bow=self.options.is_bow_allowed)
+        if isinstance(fitted, FitFailure):
+            return fitted
         if isinstance(solution, FitFailure):
             return solution
-        may_bow = [self.options.is_bow_allowed] * len(models)
-        stated = with_unseen_bow(solution, used, self._errors, may_bow)
-        if isinstance(stated, FitFailure):
-            return stated
         noise = np.array([model.noise.factor for model in models])
         noise_px = used.sigma_px * noise[used.sheet]
         points = check_points(used, solution, noise_px, self.images, self.cameras)
@@ -315,7 +315,7 @@ class _Case:
         shapes = estimate_shapes_mm(used, solution, used.sigma_px * independent)
         sheets = []
         for k in range(len(models)):
-            fit = self._sheet_fit(k, used, (solution, stated.covariance), points[k], shapes[k])
+            fit = self._sheet_fit(k, used, (solution, fitted.covariance), points[k], shapes[k])
             if isinstance(fit, FitFailure):
                 return _Refused(k, fit)
             sheets.append(fit)
@@ -325,14 +325,16 @@ class _Case:
         ]
         # From the order cameras, bow, sheets to that of a sensor: left camera, sheets, second one.
         n_camera = self.cameras.n_parameters
-        order = np.delete(np.arange(len(stated.covariance)), slice(n_camera, self.errors.n_camera))
+        order = np.delete(
+            np.arange(len(solution.covariance)), slice(n_camera, self.errors.n_camera)
+        )
         order = np.concatenate([order[:N_CAMERA], order[n_camera:], order[N_CAMERA:n_camera]])
         return LaserFit(
             sheets=tuple(sheets),
             images=self._image_evidence(solution),
             camera=self.cameras.left,
             second=self.cameras.second,
-            covariance=stated.covariance[np.ix_(order, order)],
+            covariance=solution.covariance[np.ix_(order, order)],
             diagnostics=SensorDiagnostics(
                 noise_factor=float((noise * scatter).max()),
                 correlation_points=max(model.noise.correlation_points for model in models),
@@ -394,17 +396,20 @@ class _Case:
         points: SheetPointCheck,
         shape_mm: float,
     ) -> SheetFit | FitFailure:
-        """One sheet in words and numbers, of the joint fit and the covariance that is stated."""
-        solution, stated = solved
+        """One sheet in words and numbers, of the joint fit.
+
+        ``solved`` is the solution, and the covariance of the one with planes before it.
+        """
+        solution, of_planes = solved
         name, model, sheet = self.assignment.names[k], self.models[k], solution.sheets[k]
         of_sheet = used.sheet == k
         observations = used.select(of_sheet)
         first = self.errors.n_camera + N_SHEET * k
         own = slice(first, first + N_SHEET)
-        covariance = stated[own, own]
+        covariance = solution.covariance[own, own]
         geometry = sheet_geometry(sheet, observations, self.images)
-        # What the boards' places leave open; a bow that may be unseen is not mended by more depth.
-        fitted_deg = _tilt_sigma_deg(solution.covariance[own, own], sheet.scale_mm)
+        # What the boards' places leave open; a bow that is likely is not mended by more depth.
+        fitted_deg = _tilt_sigma_deg(of_planes[own, own], sheet.scale_mm)
         refused = refuse_underdetermined_tilt(name, geometry, fitted_deg)
         if refused is not None:
             return refused
@@ -441,6 +446,7 @@ class _Case:
                 board_angle_deg=geometry.board_angle_deg,
             ),
             covariance=covariance,
+            is_bow_free=model.is_bowed,
             tilt_sigma_deg=_tilt_sigma_deg(covariance, sheet.scale_mm),
             offset_sigma_mm=float(np.sqrt(covariance[2, 2])),
             comparisons=compare_planes(sheet, observations, self.images, self.cameras),

@@ -322,6 +322,9 @@ class SheetFit(ArrayRecord):
         The sheet, its key figures and its diagnostics.
     covariance
         (8, 8) in the order of `armscan.models.calibration.SHEET_PARAMETER_NAMES`, camera included.
+    is_bow_free
+        Whether a test asked for a bow; else it is the likeliest one of those that lines usually
+        have, or none where a plane was asked for.
     tilt_sigma_deg
         Standard deviation of the normal's direction, the worse axis.
     offset_sigma_mm
@@ -337,6 +340,7 @@ class SheetFit(ArrayRecord):
     calibration: SheetCalibration
     diagnostics: SheetDiagnostics
     covariance: FloatArray = floats(8, 8)
+    is_bow_free: bool
     tilt_sigma_deg: float
     offset_sigma_mm: float
     comparisons: tuple[PlaneComparison, ...]

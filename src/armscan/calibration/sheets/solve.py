@@ -251,6 +251,7 @@ def solve_sheets(
     sigma_factor: float | FloatArray = 1.0,
     is_robust: bool = False,
     are_cameras_held: bool = False,
+    may_bow: bool = False,
 ) -> SheetSolution | FitFailure:
     """Fit the sheets by Gauss-Newton steps.
 
@@ -270,6 +271,11 @@ def solve_sheets(
         Weigh points down by Huber's function on what remains; for finding outliers.
     are_cameras_held
         Solve for the sheets that belong to the cameras as calibrated.
+    may_bow
+        A bow that is not free is not zero but known beforehand to be so to `LIKELY_BOW`: a plane is
+        kept as long as no test asks for more, which is no proof that the sheet is one. Where the
+        stripes say nothing of a bow it stays zero, and uncertain by as much; where they show that
+        there is none, next to nothing is added to what is stated.
 
     Returns
     -------
@@ -278,15 +284,17 @@ def solve_sheets(
         degrees.
     """
     sheets = [replace(sheet, bow_mm=np.zeros(5)) for sheet in start]
-    active = np.concatenate(
+    is_free = np.concatenate(
         [np.arange(N_SHEET) < (N_SHEET if bowed else N_PLANE) for bowed in is_bowed]
     )
+    active = is_free | may_bow
+    precision = np.where(is_free, 0.0, _likely_bows_mm(sheets) ** -2.0)[active]
     n_active = int(active.sum())
     sigma = observations.sigma_px * sigma_factor
     robust = np.ones(len(observations))
     n_held = errors.n_camera if are_cameras_held else 0
     for _ in range(ITERATIONS):
-        system = _linearised(observations, sheets, errors, active)
+        system = _linearised(observations, sheets, errors, active, precision)
         solved = system.solve(robust / sigma**2, n_held)
         if solved is None:
             return _UNDETERMINED
@@ -305,7 +313,7 @@ def solve_sheets(
         elif float(np.abs(full).max()) < STEP_TOLERANCE_MM:
             break
     common = normal.step[n_active:]
-    system = _linearised(observations, sheets, errors, active)
+    system = _linearised(observations, sheets, errors, active, precision)
     remaining = system.residual_px + system.times(np.concatenate([np.zeros(n_active), common]))
     sigmas = np.sqrt(np.diag(normal.covariance))
     return SheetSolution(
@@ -322,54 +330,10 @@ def solve_sheets(
     )
 
 
-def with_unseen_bow(
-    solution: SheetSolution,
-    observations: SheetObservations,
-    errors: CommonErrors,
-    may_bow: Sequence[bool],
-) -> SheetSolution | FitFailure:
-    """The same sheets with the covariance of planes that may be bowed, less than the test sees.
-
-    A plane is kept as long as no test asks for more; that is no proof that the sheet is one. A true
-    bow b leaves it out, and turns the plane that is fitted by ``G b``: with the normal matrix N of
-    plane and bow ``G = N_pp^-1 N_pb``. The errors that are stated grow by ``T M T'``, where
-    ``T = (G, -1)`` and M is the mean square of b that the stripes leave likely: with a bow free
-    that is known to be 0 to `LIKELY_BOW`, and cameras free, that may look like one, its covariance
-    and the square of its mean. Where the stripes show that there is none, next to nothing is added.
-
-    Parameters
-    ----------
-    solution
-        Of cameras that are held; sheets that are bowed keep their freedom.
-    observations, errors
-        What it was solved with.
-    may_bow
-        For each sheet; False where it is known to be a plane.
-    """
-    active = solution.active | np.repeat(np.asarray(may_bow, dtype=np.bool_), N_SHEET)
-    unseen = (active & ~solution.active)[active]
-    if not unseen.any():
-        return solution
-    likely_mm = np.concatenate(
-        [
-            LIKELY_BOW * sheet.scale_mm * np.concatenate([np.ones(N_PLANE), BOW_SHARES])
-            for sheet in solution.sheets
-        ]
-    )
-    precision = np.where(unseen, likely_mm[active] ** -2.0, 0.0)
-    system = _linearised(observations, solution.sheets, errors, active)
-    held = system.solve(solution.weight, errors.n_camera, precision=precision)
-    free = system.solve(solution.weight, 0, precision=precision)
-    if held is None or free is None:
-        return _UNDETERMINED
-    of_bow = np.ix_(unseen, unseen)
-    moved = -held.covariance[:, unseen] @ np.linalg.inv(held.covariance[of_bow])
-    bow_mm = free.step[: len(unseen)][unseen]
-    likely = free.covariance[of_bow] + np.outer(bow_mm, bow_mm)
-    covariance = solution.covariance.copy()
-    places = errors.n_camera + np.flatnonzero(active)
-    covariance[np.ix_(places, places)] += moved @ likely @ moved.T
-    return replace(solution, covariance=covariance)
+def _likely_bows_mm(sheets: Sequence[LightSheet]) -> FloatArray:
+    """(8 S,) likely size of the sheets' bows; of no meaning for the planes' parameters."""
+    shares = np.concatenate([np.ones(N_PLANE), BOW_SHARES])
+    return np.concatenate([LIKELY_BOW * sheet.scale_mm * shares for sheet in sheets])
 
 
 _UNDETERMINED = FitFailure(
@@ -389,6 +353,7 @@ def _linearised(
     sheets: Sequence[LightSheet],
     errors: CommonErrors,
     active: BoolArray,
+    precision: FloatArray,
 ) -> StripeSystem:
     height, residual, by_sheet, by_point = observations.residuals_px(sheets)
     by_camera = np.einsum("ni,nij->nj", by_point, observations.dpoint_dcamera)
@@ -416,7 +381,9 @@ def _linearised(
             by_camera[rows],
         ]
         stripes.append(StripeRows(rows, board, columns, np.concatenate(design, axis=1)))
-    return StripeSystem(tuple(stripes), n_active, n_boards, n_columns, residual, height)
+    bows = np.concatenate([np.append(np.zeros(N_PLANE), sheet.bow_mm) for sheet in sheets])
+    unknowns = n_active, n_boards, n_columns
+    return StripeSystem(tuple(stripes), *unknowns, residual, height, precision, bows[active])
 
 
 def _joint_covariance(
@@ -462,7 +429,9 @@ class StripeSystem:
     """All residuals (N,), in the image and in space, with their derivatives stripe by stripe.
 
     Of the ``n_columns`` unknowns the ``n_sheet`` free parameters of all sheets come first, then six
-    for each of ``n_boards`` boards.
+    for each of ``n_boards`` boards. ``precision`` (n_sheet,) is that with which the sheets' bows
+    are known to be 0 beforehand, 0 for those of which nothing is, ``bow_mm`` (n_sheet,) what they
+    are; both are 0 for other parameters.
     """
 
     stripes: tuple[StripeRows, ...]
@@ -471,6 +440,8 @@ class StripeSystem:
     n_columns: int
     residual_px: FloatArray
     height_mm: FloatArray
+    precision: FloatArray
+    bow_mm: FloatArray
 
     def times(self, unknowns: FloatArray) -> FloatArray:
         """(N,) change of the residuals."""
@@ -491,13 +462,8 @@ class StripeSystem:
         weight: FloatArray,
         n_held: int,
         without_board: int = -1,
-        *,
-        precision: FloatArray | None = None,
     ) -> NormalSolution | None:
         """Solve with weights (N,), the last ``n_held`` unknowns held and one board left out.
-
-        ``precision`` (n_sheet,) is that with which steps of the sheets' parameters are known to be
-        0 beforehand; none if None.
 
         None where the matrix is not positive definite to rounding, so that nothing of it means
         anything.
@@ -509,10 +475,10 @@ class StripeSystem:
         place = np.full(self.n_columns, -1)
         place[shared] = np.arange(len(shared))
         full = np.diag((np.arange(len(shared)) >= n_sheet).astype(np.float64))
-        if precision is not None:
-            full[np.arange(n_sheet), np.arange(n_sheet)] = precision
+        full[np.arange(n_sheet), np.arange(n_sheet)] = self.precision
         cross, board = np.zeros((n_boards, len(shared), 6)), np.tile(np.eye(6), (n_boards, 1, 1))
         pull = np.zeros(self.n_columns)
+        pull[:n_sheet] = self.precision * self.bow_mm
         for stripe in self.stripes:
             if stripe.board == without_board:
                 continue

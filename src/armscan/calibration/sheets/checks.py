@@ -429,11 +429,13 @@ class _Cells:
     """Mean distances (C,) in mm of pieces of the stripes of one sheet, and what they rest on.
 
     ``by_sheet`` (C, F) and ``by_others`` (C, O): derivatives by the sheet's free parameters, and by
-    boards and cameras in their own sigmas. ``noise_mm2`` (C,). ``place_mm`` (C, 2) on the sheet.
-    ``stripe`` (C,) number of the stripe.
+    boards, cameras and a bow that is likely to be small, in their own sigmas; the distances are
+    those without that bow, of which it leaves ``rms_mm``. ``noise_mm2`` (C,). ``place_mm`` (C, 2)
+    on the sheet. ``stripe`` (C,) number of the stripe.
     """
 
     height_mm: FloatArray
+    rms_mm: float
     by_sheet: FloatArray
     by_others: FloatArray
     noise_mm2: FloatArray
@@ -467,11 +469,16 @@ def _cells(
             stripes.append(number)
     by_all = np.array(design)
     is_used = np.any(by_all != 0.0, axis=0)
-    is_sheet = np.arange(system.n_columns) < system.n_sheet
+    is_free = np.arange(system.n_columns) < system.n_sheet
+    likely = np.flatnonzero(system.precision)
+    is_free[likely] = False
+    without_bow = np.array(height) - by_all[:, likely] @ system.bow_mm[likely]
+    by_all[:, likely] /= np.sqrt(system.precision[likely])
     return _Cells(
-        np.array(height),
-        by_all[:, is_used & is_sheet],
-        by_all[:, is_used & ~is_sheet],
+        without_bow,
+        float(np.sqrt(np.mean(np.square(height)))),
+        by_all[:, is_used & is_free],
+        by_all[:, is_used & ~is_free],
         np.array(noise),
         np.array(places),
         np.array(stripes),
@@ -486,8 +493,7 @@ def _shape_mm(cells: _Cells) -> float:
     known = np.diag(cells.noise_mm2) + cells.by_others @ cells.by_others.T
     scale = np.sqrt(np.sum(cells.by_sheet**2, axis=0))
     free = cells.by_sheet / scale
-    largest = LARGEST_SHAPE * float(np.sqrt(np.mean(cells.height_mm**2)))
-    sizes = largest * SHAPE_STEPS
+    sizes = LARGEST_SHAPE * cells.rms_mm * SHAPE_STEPS
     steps = np.gradient(SHAPE_STEPS)
     likelihood = np.array(
         [

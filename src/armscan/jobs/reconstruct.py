@@ -437,8 +437,7 @@ def _scan(
             recording, scanner, points, options,
             progress=job.progress, cache=job.cache, clock=clock, reader=reader,
         )  # fmt: skip
-        odd = _odd_times(recording, scanner)
-        warnings = (*recording.warnings, *recording.session.assumed, *odd, *scan.warnings)
+        warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
         inputs = (*recording_tables(folder), calibration, arm)
         provenance = job.provenance(
             [path for path in inputs if path is not None],
@@ -460,19 +459,6 @@ def _scan(
             clock=clock if is_profiled else None,
             voxel_mm=voxel_mm,
         )
-
-
-def _odd_times(recording: FolderRecording, scanner: ScannerCalibration) -> tuple[str, ...]:
-    """A sentence where a constant time between camera and arm is left open."""
-    has_ids = any(row.trigger_id is not None for row in recording.rows)
-    is_known = scanner.latency_ns != 0 or scanner.latency_sigma_ns is not None
-    if recording.session.clock != "related" or has_ids or is_known:
-        return ()
-    return (
-        "the clocks of cameras and arm were related by when their elements arrived, and the "
-        "scanner's document holds no latency: a moving hand's points lie off by its speed times "
-        "some milliseconds; find it with `armscan calibrate latency`",
-    )
 
 
 def _delivered(

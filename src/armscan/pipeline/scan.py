@@ -34,7 +34,7 @@ from armscan.pipeline.measure import (
     summarised,
 )
 from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
-from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
+from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan, doubt_times
 from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeCounts
 from armscan.reconstruction.place import (
     DELIVERED,
@@ -376,6 +376,7 @@ def measure_long_scan(
         exposures=exposures,
         poses=poses,
         warnings=(
+            *doubt_times(source, scanner),
             *_scan_warnings(exposures, poses),
             *measurement_warnings(counts, found.depths, sensor),
             *extra,

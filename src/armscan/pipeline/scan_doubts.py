@@ -164,6 +164,19 @@ def doubt_scan(
     return ScanDoubt(found)
 
 
+def doubt_times(source: ScanSource, scanner: ScannerCalibration) -> tuple[str, ...]:
+    """A sentence where a constant time between camera and arm is left open."""
+    has_ids = any(row.trigger_id is not None for row in source.rows)
+    is_known = scanner.latency_ns != 0 or scanner.latency_sigma_ns is not None
+    if source.session.clock != "related" or has_ids or is_known:
+        return ()
+    return (
+        "the clocks of cameras and arm were related by when their elements arrived, and the "
+        "scanner's document holds no latency: a moving hand's points lie off by its speed times "
+        "some milliseconds; find it with `armscan calibrate latency`",
+    )
+
+
 def _thinned(
     source: ScanSource,
     scanner: ScannerCalibration,

@@ -27,6 +27,7 @@ from armscan.pipeline.scan import (
 )
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
+from armscan.records.recording import Clock
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.detection_cache import DetectionCache
 from armscan.vision.stripe.extract import extract_stripes
@@ -250,6 +251,20 @@ def test_a_long_scan_is_the_same_scan_with_its_points_elsewhere(
     assert names == ["decoding", "extraction", "naming", "placing", "normals", "passes"]
     assert 0.0 < sum(seconds for _, seconds in profile.stages) < 1.05 * profile.processor_s
     assert profile.peak_mb is None or profile.peak_mb > 50.0
+
+
+@pytest.mark.parametrize(
+    ("clock", "latency_sigma_ns", "is_told"),
+    [("related", None, True), ("related", 200_000.0, False), ("shared", None, False)],
+)
+def test_clocks_related_by_arrival_are_told_where_no_latency_is_known(
+    device: ScannerCalibration, clock: Clock, latency_sigma_ns: float | None, is_told: bool
+) -> None:
+    scan = fake_scan(3)
+    scan = replace(scan, session=replace(scan.session, clock=clock))
+    known = replace(device, latency_sigma_ns=latency_sigma_ns)
+    warnings = measure_scan(as_source(scan), known).warnings
+    assert any("when their elements arrived" in warning for warning in warnings) == is_told
 
 
 def test_a_few_points_without_normal_are_normal(

@@ -198,7 +198,7 @@ def fit_table(n_fits: int) -> None:
                     for sheet in fit.sheets
                     if sheet.calibration.n_boards >= 4
                 ]
-                if bow == "flat" and not any(sheet.sheet.is_bowed for sheet in fit.sheets):
+                if bow == "flat" and not any(sheet.is_bow_free for sheet in fit.sheets):
                     square, count = joint_square(fit, calibration, truth, rig)
                     inside += square < chi2.ppf(0.95, count)
                     normalised, freedom = normalised + square, freedom + count

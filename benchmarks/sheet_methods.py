@@ -142,7 +142,7 @@ def study(name: str, rig: SheetRig, n_runs: int) -> None:
         for method, values in found.items():
             collected[method].append(values)
         inside += is_inside(fit, rig, found["ours"])
-        bowed += fit.sheets[0].sheet.is_bowed
+        bowed += fit.sheets[0].is_bow_free
         made = fit.sheets[0].points
         points.append(
             (

@@ -424,9 +424,7 @@ def judge_sheets(
         light = made.lights[k]
         squares, freedom = squares + one.chi2, freedom + n
         if k in likely and not (light.cone or light.skew):
-            # What is known of a true plane's bow beforehand is no error of it.
-            bow_mm = LIKELY_BOW * sheet.sheet.scale_mm * BOW_SHARES
-            freedom -= float((np.diag(sheet.covariance)[3:8] / bow_mm**2).sum())
+            freedom -= _not_erred(sheet, given_camera[number])
         _, _, by = sheet.sheet.height_with_jacobian(points)
         for covariance, bounds, found in (
             (given_camera[number], best_granted, over_granted),
@@ -454,6 +452,18 @@ def judge_sheets(
         warnings,
         seconds,
     )
+
+
+def _not_erred(sheet: SheetFit, given_camera: FloatArray) -> float:
+    """Of a true plane: what its bow, known to be small beforehand, does not err by.
+
+    Beside a camera that is held the sheet ``H A' W r`` with ``H = (A' W A + P)^-1`` errs by
+    ``H A' W A H = H - H P H``; its covariance says H, and what follows the camera.
+    """
+    precision = np.zeros(N_TERMS)
+    precision[3:] = (LIKELY_BOW * sheet.sheet.scale_mm * BOW_SHARES) ** -2.0
+    known = given_camera @ (precision[:, None] * given_camera)
+    return float(np.trace(np.linalg.solve(sheet.covariance, known)))
 
 
 def _light_bounds(whole: FloatArray, first: int, widths: dict[int, int]) -> dict[int, FloatArray]:

@@ -356,10 +356,10 @@ def measure_long_scan(
     pose_rows = [first_row[found.rows[k]] for k in kept]
     if not len(points):
         raise _nothing_placed(found, exposures, options)
-    extra: tuple[str, ...] = ()
+    extra = doubt_times(source, scanner)
     if options.has_normals:
         with clock.stage("normals", is_alone=True):
-            extra = _add_normals(points, pose_rows, poses, transform, progress)
+            extra += _add_normals(points, pose_rows, poses, transform, progress)
     with clock.stage("passes", is_alone=True):
         doubt = doubt_scan(source, scanner, poses, points=points, pose_rows=pose_rows)
     counts = tuple(found.counts[k] for k in kept)
@@ -376,7 +376,6 @@ def measure_long_scan(
         exposures=exposures,
         poses=poses,
         warnings=(
-            *doubt_times(source, scanner),
             *_scan_warnings(exposures, poses),
             *measurement_warnings(counts, found.depths, sensor),
             *extra,

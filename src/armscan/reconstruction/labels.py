@@ -283,18 +283,24 @@ class SingleLabeller:
             sheet[in_segment], status[in_segment] = best, PointStatus.MEASURED
         found = np.unique(sheet[sheet >= 0]).tolist()
         if ambiguous and not found:
+            remedy = "name the sheet with --sheet, or photograph one laser at a time"
+            if self.reach.margin > 0.0:
+                remedy += (
+                    "; if no surface lies outside the depths in which its line was calibrated, say "
+                    "so by --depth-margin 0"
+                )
             raise EstimationError(
                 f"{len(ambiguous)} stripe segments may belong to more than one light sheet "
                 f"({ambiguous[0]}), and none belongs to one alone",
                 where=profile.source,
-                remedy="name the sheet with --sheet, photograph one laser at a time, or, if no "
-                "surface lies outside the depths in which its line was calibrated, say so by "
-                "--depth-margin 0",
+                remedy=remedy,
             )
         reason = "no sheet puts a stripe into the depths accepted"
         if found:
             reached_by = ", ".join(self._reach(k) for k in found)
             reason = f"the only sheet that reaches the stripe: {reached_by}"
+        if ambiguous:
+            reason += "; what others reach, too, is left out: --sheet names one"
         return _labelled(profile, sheet, status, reason)
 
     def _shares(self, inside: dict[int, float]) -> str:

@@ -18,8 +18,8 @@ from armscan.calibration.sheets.result import (
     SheetImage,
 )
 from armscan.geometry.arrays import BoolArray, FloatArray
-from armscan.models.calibration import FTest, Provenance
-from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES, LightSheet
+from armscan.models.calibration import FTest, Provenance, SheetCalibration
+from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES
 from armscan.records.exposure import Exposure
 from armscan.report.camera import bow_quantities
 from armscan.report.charts import PAGE_WIDTH, Bars, histogram_chart, short, symmetric_edges
@@ -101,8 +101,8 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
     if not sheet.is_bowed:
         bow = "none: a plane"
     elif not fit.is_bow_free:
-        largest = significant(_largest_bow_mm(sheet), "mm")
-        bow = f"up to {largest}, the likeliest; no test asks for one"
+        largest = significant(_largest_bow_mm(stored), "mm")
+        bow = f"up to {largest}, the likeliest of small ones"
     alone = "no: two stripes fix a plane, only their coplanarity checks it"
     return (
         Quantity("name", "", fit.name),
@@ -161,18 +161,26 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
         fact("Lack of fit of a plane", lack_of_fit_text(known.plane_test)),
         Quantity(
             "lack_of_fit_p",
-            "Lack of fit of the sheet",
+            "Lack of fit of the sheet"
+            if fit.is_bow_free
+            else "Lack of fit, boards as they scatter",
             known.final_test.p_value,
             shown=lack_of_fit_text(known.final_test),
         ),
     )
 
 
-def _largest_bow_mm(sheet: LightSheet) -> float:
-    """Within the region that was calibrated."""
-    u, v = np.meshgrid(*2 * (np.linspace(-1.0, 1.0, 21),))
+def _largest_bow_mm(calibrated: SheetCalibration) -> float:
+    """Within the depths that were calibrated."""
+    sheet = calibrated.sheet
+    u, v = np.meshgrid(*2 * (np.linspace(-1.0, 1.0, 81),))
+    places = np.stack([u, v, np.zeros_like(u)], axis=-1) * sheet.scale_mm
+    depth = (places @ sheet.axes + sheet.origin_mm)[..., 2]
+    low, high = calibrated.depth_range_mm
+    is_inside = (depth >= low) & (depth <= high)
+    u, v = u[is_inside], v[is_inside]
     terms = zip(sheet.bow_mm, BOW_TERMS, strict=True)
-    return float(np.abs(sum(bow * u**i * v**j for bow, (i, j) in terms)).max())
+    return float(np.abs(sum(bow * u**i * v**j for bow, (i, j) in terms)).max(initial=0.0))
 
 
 def _light_source(fit: SheetFit) -> Quantity:

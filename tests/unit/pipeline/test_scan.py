@@ -254,15 +254,24 @@ def test_a_long_scan_is_the_same_scan_with_its_points_elsewhere(
 
 
 @pytest.mark.parametrize(
-    ("clock", "latency_sigma_ns", "is_told"),
-    [("related", None, True), ("related", 200_000.0, False), ("shared", None, False)],
+    ("clock", "latency_ns", "latency_sigma_ns", "is_told"),
+    [
+        ("related", 0, None, True),
+        ("related", 0, 200_000.0, False),
+        ("related", 3_000_000, None, False),
+        ("shared", 0, None, False),
+    ],
 )
 def test_clocks_related_by_arrival_are_told_where_no_latency_is_known(
-    device: ScannerCalibration, clock: Clock, latency_sigma_ns: float | None, is_told: bool
+    device: ScannerCalibration,
+    clock: Clock,
+    latency_ns: int,
+    latency_sigma_ns: float | None,
+    is_told: bool,
 ) -> None:
     scan = fake_scan(3)
     scan = replace(scan, session=replace(scan.session, clock=clock))
-    known = replace(device, latency_sigma_ns=latency_sigma_ns)
+    known = replace(device, latency_ns=latency_ns, latency_sigma_ns=latency_sigma_ns)
     warnings = measure_scan(as_source(scan), known).warnings
     assert any("when their elements arrived" in warning for warning in warnings) == is_told
 

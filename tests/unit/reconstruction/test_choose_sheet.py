@@ -124,6 +124,7 @@ def test_what_another_sheet_reaches_beyond_its_own_depths_is_dropped() -> None:
     choice = labelled(seen, two_sheets((262.0, 284.0)), within, reach=DepthRange(0.1))
     assert choice.sheet.tolist() == [-1] * 40 + [1] * 40
     assert choice.count(PointStatus.AMBIGUOUS) == 40
+    assert "others reach" in choice.reason
     with pytest.raises(EstimationError, match="left 100%, right 100%"):
         labelled(stripes(IN_LEFT), sensor, within, reach=DepthRange(0.5))
 
@@ -173,6 +174,7 @@ def test_flagged_points_do_not_vote() -> None:
     )
     choice = labelled(flagged, two_sheets(), DepthRange())
     assert set(choice.sheet.tolist()) == {-1}
+    assert choice.count(PointStatus.FLAGGED) == len(profile)
 
 
 def test_depth_margin_by_hand() -> None:

@@ -81,6 +81,7 @@ MOST_CAST_OUT = 0.2
 """Share of a stripe's points beyond which these are no outliers, but the stripe lies elsewhere."""
 NOTED_FACTOR = 1.5
 """Scatter of boards over its claim from which on it is told."""
+LIKELIEST = "; stored with the likeliest of small bows"
 STRAY_FACTOR = 2.5
 """Scatter of a board over that of the others from which on it is named: it then has less than a
 sixth of their weight."""
@@ -413,6 +414,7 @@ class _Case:
         refused = refuse_underdetermined_tilt(name, geometry, fitted_deg)
         if refused is not None:
             return refused
+        is_told = model.is_bowed or not self.options.is_bow_allowed
         common = self._common_plane(k)
         warnings = geometry_warnings(geometry, common, fitted_deg)
         if model.plane_test.p_value < LACK_OF_FIT_P:
@@ -440,7 +442,7 @@ class _Case:
                 rms_px=float(np.sqrt((residual_px[of_sheet] ** 2).mean())),
                 plane_test=model.plane_test,
                 final_test=model.final_test,
-                bow_decision=model.decision,
+                bow_decision=model.decision + ("" if is_told else LIKELIEST),
                 coplanarity_mm=common.largest_mm if common else 0.0,
                 coplanarity_sigma_mm=common.sigma_largest_mm if common else 0.0,
                 board_angle_deg=geometry.board_angle_deg,

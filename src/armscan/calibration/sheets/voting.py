@@ -457,7 +457,7 @@ def choose_print(
     )
     if less <= as_is or n_shown < LEAST_SHOWN:
         return False, ""
-    before = f"in {n_before}, {points_before} points" if False in found else "next to none"
+    before = f"in {n_before}, {points_before} points" if False in found else "given up after a few"
     return True, (
         f"{n_images} photographs have none without laser: their print is told from its repetition "
         f"and subtracted; the stripe on the common sheet in {n_shown} of {len(sample)} that were "

@@ -541,7 +541,10 @@ def measurement_warnings(
         )
     n_outside = sum(image.count(PointStatus.OUT_OF_DEPTH) for image in images)
     if n_outside:
-        warnings.append(f"{n_outside} points were left out: too far outside the calibrated depths")
+        warnings.append(
+            f"{n_outside} points were left out: too far outside the calibrated depths; a larger "
+            "--depth-margin, in widths of these depths, takes them"
+        )
     if not sensor.camera.has_covariance:
         warnings.append(
             "the camera came without covariance: the points' sigmas leave its errors out"

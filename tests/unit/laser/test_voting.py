@@ -55,6 +55,27 @@ def test_a_line_that_stays_where_it_is_in_the_image_makes_no_sheet() -> None:
     assert fit.skipped == ()
 
 
+def test_one_sheet_that_is_asked_for_is_voted_on_among_many_lines() -> None:
+    """Four others an image, edges of an overexposed board: no fan, where one sheet is said."""
+    rig, rng = thesis_rig(), np.random.default_rng(8)
+    clean = rig.boards(rig.camera, np.random.default_rng(1))
+    boards = []
+    for board in clean:
+        q, _ = own(board)
+        middle, along = q.mean(axis=0), q[-1] - q[0]
+        across = np.array([-along[1], along[0]])
+        others = []
+        for shift in (-0.3, -0.15, 0.15, 0.3):
+            start = middle + shift * across - 0.3 * along
+            end = start + 0.6 * along + rng.uniform(-0.08, 0.08) * across
+            others.append(image_line(tuple(start), tuple(end)))
+        boards.append(with_stripes(board, [*others, own(board)]))
+    found = calibrate_sheets(boards, rig.calibration(rig.camera), SheetOptions(n_sheets=1))
+    assert isinstance(found, LaserFit), found
+    alone = fitted(rig, clean)
+    assert np.allclose(found.sheets[0].sheet.plane, alone.sheets[0].sheet.plane, atol=1e-3)
+
+
 def test_a_board_whose_line_is_another_one_is_named_with_its_distance() -> None:
     rig = thesis_rig()
     boards = rig.boards(rig.camera, np.random.default_rng(2))

@@ -119,7 +119,9 @@ def number_fan(
         return FitFailure(
             f"no numbering puts {HOPELESS_NUMBERED:.0%} of the {len(lines)} stripes on sheets of "
             "one fan",
-            f"check the boards' poses, and that all stripes come from one source; {REMEDY}",
+            "check the boards' poses, and that all stripes come from one source; if there are "
+            "fewer lines, say so by --sheets, and name the channel that shows them by "
+            f"--laser-colour; {REMEDY}",
         )
     certain = _certain(lines, sorted(found.values(), key=lambda fan: fan.cost))
     return certain if isinstance(certain, FitFailure) else certain.assigned(boards, n_sheets)

@@ -94,7 +94,8 @@ def assign_sheets(
     together = next(iter(lasers)) if len(lasers) == 1 else ()
     usual = max(counts, key=lambda n: (counts.count(n), n), default=0)
     n_sheets = wanted or len(together) or usual
-    if not any(len(names) > 1 for names in lasers) and max([n_sheets, *counts]) >= LEAST_FAN:
+    most = max([n_sheets, *([] if wanted else counts)])
+    if not any(len(names) > 1 for names in lasers) and most >= LEAST_FAN:
         return _one_fan(images, wanted, options.sheet_names or tuple(ALPHABET))
     if len(lasers) > 1:
         return FitFailure(

@@ -101,8 +101,8 @@ def observe_boards(
     on one of these sheets. Only where the prints show no sheet, the stripes beside them vote, and
     then on one sheet unless the options say how many there are: the walls and floors behind show
     lines, too. Images whose one laser is named vote among themselves. Nothing is decided where no
-    three boards agree, or where the lines of a fan are coplanar in too many ways: their numbering
-    (`armscan.calibration.sheets.fan`) then judges.
+    three boards agree, or where the lines of a fan are coplanar in too many ways, unless the
+    options say that there are few: their numbering (`armscan.calibration.sheets.fan`) then judges.
     """
     can_vote = len({board.place for board in boards}) >= LEAST_BOARDS
     n_lines = 0 if can_vote else options.n_sheets
@@ -126,7 +126,7 @@ def observe_boards(
         groups.setdefault(board.lasers if len(board.lasers) == 1 else (), []).append(i)
     for group in groups.values():
         inner, wide = [on_print[i] for i in group], [around[i] for i in group]
-        if _most_lines(inner) >= LEAST_FAN:
+        if _most_lines(inner) >= LEAST_FAN and not 0 < options.n_sheets < LEAST_FAN:
             continue
         chosen, off = wide, list[SkippedImage | None]()
         if _most_lines(inner) >= 1 or _most_lines(wide) < LEAST_FAN:

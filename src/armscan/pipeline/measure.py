@@ -542,8 +542,8 @@ def measurement_warnings(
     n_outside = sum(image.count(PointStatus.OUT_OF_DEPTH) for image in images)
     if n_outside:
         warnings.append(
-            f"{n_outside} points were left out: too far outside the calibrated depths; a larger "
-            "--depth-margin, in widths of these depths, takes them"
+            f"{n_outside} points were left out: too far outside the calibrated depths; "
+            "`reconstruct --depth-margin`, in widths of these depths, takes more"
         )
     if not sensor.camera.has_covariance:
         warnings.append(

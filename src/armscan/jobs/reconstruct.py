@@ -27,7 +27,7 @@ from armscan.jobs.live.recordings import count_exposures, recording_mark, record
 from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
 from armscan.pipeline.cluster.extraction import ClusterAddress, ClusterReader
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
-from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of, stripes_for
+from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of, stripes_as_seen
 from armscan.pipeline.measure import reconstruct as reconstruct_images
 from armscan.pipeline.progress import StageClock
 from armscan.pipeline.scan import (
@@ -427,17 +427,31 @@ def _scan(
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     recording = read_recording(folder, None if arm is None else read_arm_model(arm))
-    reader = None
-    if cluster is not None and scanner.sensor is not None:
-        stripes = stripes_for(scanner.sensor, options.measure.stripes)
+    reader, about = None, ""
+    if scanner.sensor is not None:
         cameras = cameras_of(scanner.sensor)
-        reader = ClusterReader(cluster, recording, cameras, stripes, job.cache)
+        seen = ScanInstants(recording, len(cameras))
+        stripes, about = stripes_as_seen(
+            len(seen.lit),
+            lambda k: seen.pair(seen.lit[k].rows[0]),
+            scanner.sensor,
+            options.measure.stripes,
+            job.cache,
+        )
+        options = replace(options, measure=replace(options.measure, stripes=stripes))
+        if cluster is not None:
+            reader = ClusterReader(cluster, recording, cameras, stripes, job.cache)
     with scratch_folder(places[0]) as scratch, scan_spool(scanner, scratch) as points:
         scan = measure_long_scan(
             recording, scanner, points, options,
             progress=job.progress, cache=job.cache, clock=clock, reader=reader,
         )  # fmt: skip
-        warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
+        warnings = (
+            *recording.warnings,
+            *recording.session.assumed,
+            *filter(None, [about]),
+            *scan.warnings,
+        )
         inputs = (*recording_tables(folder), calibration, arm)
         provenance = job.provenance(
             [path for path in inputs if path is not None],

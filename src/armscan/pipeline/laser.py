@@ -5,7 +5,7 @@ the stripes, extraction, and the fit.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import cast
@@ -35,7 +35,7 @@ from armscan.calibration.sheets.stripes_on_board import (
     find_target_edges,
     runs_along_edge,
 )
-from armscan.calibration.sheets.voting import choose_channel, choose_print, observe_boards
+from armscan.calibration.sheets.voting import choose_print, observe_boards, rank_channels
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration, LaserColour, SensorCalibration
 from armscan.models.two_views import StereoCalibration
@@ -127,60 +127,106 @@ def calibrate_sheets_from_pairs(
         wrong = wrong_count(answers, target)
         if wrong is not None:
             return wrong
+    lit = _LitBoards(pairs, places, target, camera, options, cache, progress)
+    colour = options.stripes.laser_colour
+    channels: tuple[tuple[LaserColour, str], ...] = ((colour, ""),)
+    if colour == "auto" and any(pair[0].colour != "mono" for pair in lit.shown):
+        shown = lit.shown
+        channels = (
+            rank_channels(
+                len(shown),
+                lambda k, channel: lit.stripes_of(shown[k], channel),
+                cameras,
+                options.sheets,
+            )
+            or channels
+        )
+    fit = lit.calibrated(channels[0][0])
+    reason = channels[0][1]
+    for channel, about in channels[1:]:
+        if not isinstance(fit, FitFailure):
+            break
+        again = lit.calibrated(channel)
+        if not isinstance(again, FitFailure):
+            why = fit.reason.partition(" (not used: ")[0]
+            fit, reason = again, f"{about}; {channels[0][0]} shows more, but {why}"
+    return fit if isinstance(fit, FitFailure) else replace(fit, channel_reason=reason)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LitBoards:
+    """Photographs of a set with the boards in them: what each channel shows on the boards."""
+
+    pairs: Sequence[ExposurePair]
+    places: Mapping[str, BoardPlacement]
+    target: Target
+    camera: CameraCalibration | StereoCalibration
+    options: LaserOptions
+    cache: DetectionCache | None
+    progress: Progress
+
+    @property
+    def shown(self) -> list[ExposurePair]:
+        """Those in which the board was found."""
+        return [
+            pair
+            for pair in self.pairs
+            if not isinstance(self._place(pair).seen[pair[0].camera], FitFailure)
+        ]
+
+    def _place(self, pair: ExposurePair) -> BoardPlacement:
+        return self.places[placement_of(pair)]
 
     def stripes_of(
+        self,
         pair: ExposurePair,
         colour: LaserColour,
         line_sigma_px: float | None = None,
         *,
         less_print: bool = False,
     ) -> BoardStripes | FitFailure:
-        sigma = options.stripes.line_sigma_px or line_sigma_px
-        chosen = replace(options.stripes, laser_colour=colour, line_sigma_px=sigma, on_print=True)
-        place = places[placement_of(pair)]
-        if less_print:
-            pair = _with_predicted_print(pair, place, target, cameras)
-        return _board_stripes(pair, place, target, cameras, chosen, cache=cache)
-
-    colour, reason = options.stripes.laser_colour, ""
-    shown = [
-        pair
-        for pair in pairs
-        if not isinstance(places[placement_of(pair)].seen[pair[0].camera], FitFailure)
-    ]
-    if colour == "auto" and any(pair[0].colour != "mono" for pair in shown):
-        colour, reason = choose_channel(
-            len(shown), lambda k, channel: stripes_of(shown[k], channel), cameras, options.sheets
+        """Stripes of one photograph, as it is or less the board's print."""
+        sigma = self.options.stripes.line_sigma_px or line_sigma_px
+        chosen = replace(
+            self.options.stripes, laser_colour=colour, line_sigma_px=sigma, on_print=True
         )
-    bare = [pair for pair in shown if pair[1] is None and does_repeat(target)]
-    known: dict[tuple[int, bool], BoardStripes | FitFailure] = {}
+        cameras, place = HeadCameras.of(self.camera), self._place(pair)
+        if less_print:
+            pair = _with_predicted_print(pair, place, self.target, cameras)
+        return _board_stripes(pair, place, self.target, cameras, chosen, cache=self.cache)
 
-    def tried(k: int, less: bool) -> BoardStripes | FitFailure:
-        exposure = bare[k][0]
-        progress(ProgressEvent(PRINT_STAGE, len(known), 2 * len(bare), exposure.source))
-        stripes = known[id(exposure), less] = stripes_of(bare[k], colour, less_print=less)
-        return stripes
+    def calibrated(self, colour: LaserColour) -> LaserFit | FitFailure:
+        """The sheets from the stripes in one channel."""
+        cameras, sheets = HeadCameras.of(self.camera), self.options.sheets
+        bare = [pair for pair in self.shown if pair[1] is None and does_repeat(self.target)]
+        known: dict[tuple[int, bool], BoardStripes | FitFailure] = {}
 
-    less_print, about_print = choose_print(len(bare), tried, cameras, options.sheets)
-    if bare:
-        progress(ProgressEvent(PRINT_STAGE, 2 * len(bare), 2 * len(bare)))
-    found: list[BoardStripes | FitFailure] = []
-    for done, pair in enumerate(pairs):
-        progress(ProgressEvent(STRIPES_STAGE, done, len(pairs), pair[0].source))
-        stripes = known.get((id(pair[0]), less_print))
-        if stripes is None:
-            stripes = stripes_of(pair, colour, less_print=less_print)
-        found.append(stripes)
-    progress(ProgressEvent(STRIPES_STAGE, len(pairs), len(pairs)))
-    if options.stripes.line_sigma_px is None:
-        for k, sigma_px in _poor_images(found, cameras, options.sheets):
-            again = stripes_of(pairs[k], colour, sigma_px, less_print=less_print)
-            if _n_clean(again) > _n_clean(found[k]):
-                found[k] = again
-    fit = _fit_sheets(pairs, found, camera, options.sheets)
-    if isinstance(fit, FitFailure):
-        return fit
-    return replace(fit, laser_colour=colour, channel_reason=reason, print_reason=about_print)
+        def tried(k: int, less: bool) -> BoardStripes | FitFailure:
+            exposure = bare[k][0]
+            self.progress(ProgressEvent(PRINT_STAGE, len(known), 2 * len(bare), exposure.source))
+            stripes = known[id(exposure), less] = self.stripes_of(bare[k], colour, less_print=less)
+            return stripes
+
+        less_print, about_print = choose_print(len(bare), tried, cameras, sheets)
+        if bare:
+            self.progress(ProgressEvent(PRINT_STAGE, 2 * len(bare), 2 * len(bare)))
+        found: list[BoardStripes | FitFailure] = []
+        for done, pair in enumerate(self.pairs):
+            self.progress(ProgressEvent(STRIPES_STAGE, done, len(self.pairs), pair[0].source))
+            stripes = known.get((id(pair[0]), less_print))
+            if stripes is None:
+                stripes = self.stripes_of(pair, colour, less_print=less_print)
+            found.append(stripes)
+        self.progress(ProgressEvent(STRIPES_STAGE, len(self.pairs), len(self.pairs)))
+        if self.options.stripes.line_sigma_px is None:
+            for k, sigma_px in _poor_images(found, cameras, sheets):
+                again = self.stripes_of(self.pairs[k], colour, sigma_px, less_print=less_print)
+                if _n_clean(again) > _n_clean(found[k]):
+                    found[k] = again
+        fit = _fit_sheets(self.pairs, found, self.camera, sheets)
+        if isinstance(fit, FitFailure):
+            return fit
+        return replace(fit, laser_colour=colour, print_reason=about_print)
 
 
 def _fit_sheets(

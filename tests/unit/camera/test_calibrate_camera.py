@@ -76,6 +76,10 @@ def test_noise_is_found_whatever_the_detector_claims() -> None:
     n = honest.degrees_of_freedom
     assert honest.sigma_point_px == pytest.approx(0.08, rel=4.0 / np.sqrt(2.0 * n))
     assert honest.rms_px == pytest.approx(0.08 * np.sqrt(2.0), rel=0.05)
+    blurred = np.array(views[0].covariance_px2)
+    blurred[:2] *= 1e6
+    told = solved([replace(views[0], covariance_px2=blurred), *views[1:]])
+    assert told.sigma_point_px == pytest.approx(0.08, rel=4.0 / np.sqrt(2.0 * n)), "not two corners"
     assert honest.noise_scale == pytest.approx(3.0 * timid.noise_scale, rel=1e-3)
     assert timid.sigma == pytest.approx(honest.sigma, rel=1e-3)
 

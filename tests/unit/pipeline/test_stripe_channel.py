@@ -3,20 +3,26 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from armscan.calibration.sheets.board_points import HeadCameras
-from armscan.calibration.sheets.result import BoardStripes, SheetOptions
-from armscan.calibration.sheets.voting import choose_channel, choose_print
+from armscan.calibration.sheets.board_points import HeadCameras, SeenBoard
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import BoardStripes, LaserFit, SheetOptions
+from armscan.calibration.sheets.voting import choose_print, rank_channels
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import LaserColour
+from armscan.pipeline import laser
+from armscan.pipeline.measure import stripes_as_seen
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
-from rigs.sheet_rig import SheetRig, thesis_rig
+from armscan.vision.targets.target import Chessboard
+from rigs.calibration_documents import sensor_calibration
+from rigs.sheet_rig import SheetRig, make_profile, thesis_rig
 
 WIDTH_PX = 2.0
 
@@ -72,7 +78,7 @@ def test_a_faint_line_over_squares_is_taken_in_a_difference_of_channels(
         return replace(clean[k], profile=profile) if profile.is_accepted.any() else nothing
 
     cameras = HeadCameras.of(rig.calibration(rig.camera))
-    chosen, reason = choose_channel(len(clean), stripes_of, cameras, SheetOptions())
+    (chosen, reason), *_ = rank_channels(len(clean), stripes_of, cameras, SheetOptions())
     assert chosen.startswith(expected + "-")
     assert chosen in reason
     errors = {}
@@ -104,8 +110,92 @@ def test_nothing_is_chosen_where_nothing_is_straight() -> None:
     clean = rig.boards(rig.camera, np.random.default_rng(2))
     cameras = HeadCameras.of(rig.calibration(rig.camera))
     nothing = FitFailure("no stripe")
-    found = choose_channel(len(clean), lambda k, channel: nothing, cameras, SheetOptions())
-    assert found == ("auto", "")
+    found = rank_channels(len(clean), lambda k, channel: nothing, cameras, SheetOptions())
+    assert found == ()
+
+
+def test_after_a_channel_of_many_lines_comes_one_on_which_the_boards_agree() -> None:
+    """Five edges of an overexposed board in grey, which no vote judges, and the line in green."""
+    rig = rig_of_vga()
+    boards = rig.boards(rig.camera, np.random.default_rng(2))
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+
+    def stripes_of(k: int, channel: LaserColour) -> BoardStripes | FitFailure:
+        one = boards[k].profile
+        if channel == "green-excess":
+            return cut_to(boards[k], 120, 1.0, k)
+        if channel != "grey":
+            return FitFailure("no stripe")
+        shifts = [40.0 * n * one.normals_px + 0.3 * (n + k) for n in range(-2, 3)]
+        points = np.concatenate([one.points_px + shift for shift in shifts])
+        stripes = [(part, one.normals_px) for part in np.split(points, 5)]
+        return replace(boards[k], profile=make_profile(one.source, stripes, 0.06), on_edge=None)
+
+    ranked = rank_channels(len(boards), stripes_of, cameras, SheetOptions())
+    assert [channel for channel, _ in ranked] == ["grey", "green-excess"]
+
+
+@pytest.mark.parametrize("second", ["green-excess", None])
+def test_the_next_channel_is_tried_where_the_first_gives_no_sheet(
+    second: LaserColour | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lines of an overexposed board are refused by the fit, not by the choice of a channel."""
+    rig = rig_of_vga()
+    fit = calibrate_sheets(
+        rig.boards(rig.camera, np.random.default_rng(1)), rig.calibration(rig.camera)
+    )
+    assert isinstance(fit, LaserFit)
+    refusal = FitFailure("no numbering holds (not used: b.png: no board)", "look")
+
+    def calibrated(_: object, colour: LaserColour) -> LaserFit | FitFailure:
+        return replace(fit, laser_colour=colour) if colour == "green-excess" else refusal
+
+    ranked = [("grey", "grey: most"), *([] if second is None else [(second, f"{second}: next")])]
+    placement = laser.BoardPlacement("a.png", {0: cast(SeenBoard, (0, None, None))}, None)
+    monkeypatch.setattr(laser, "find_placements", lambda *_: iter([placement]))
+    monkeypatch.setattr(laser, "wrong_count", lambda *_: None)
+    monkeypatch.setattr(laser, "rank_channels", lambda *_: ranked)
+    monkeypatch.setattr(laser._LitBoards, "calibrated", calibrated)
+    size = (rig.camera.height_px, rig.camera.width_px, 3)
+    picture = Exposure(np.zeros(size, np.uint8), "a.png")
+    found = laser.calibrate_sheets_from_pairs(
+        [(picture, None)], Chessboard(7, 5, 10.0), rig.calibration(rig.camera)
+    )
+    if second is None:
+        assert found is refusal
+        return
+    assert isinstance(found, LaserFit)
+    assert found.laser_colour == "green-excess"
+    assert found.channel_reason == "green-excess: next; grey shows more, but no numbering holds"
+
+
+@pytest.mark.parametrize(
+    ("room", "light", "expected"),
+    [(0.0, (255.0, 600.0, 255.0), "green"), (120.0, (0.0, 70.0, 0.0), "green-excess")],
+    ids=["white core in the dark", "faint on a lit wall"],
+)
+def test_a_scan_is_seen_in_the_channel_that_shows_its_lines(
+    room: float, light: tuple[float, float, float], expected: str
+) -> None:
+    """Calibrated in an excess: in the dark the line's middle is white, and it is that of no colour.
+
+    The wall's stripes are stronger than the faint line in its own channel.
+    """
+    y, x = np.mgrid[:200, :320].astype(np.float64)
+    wide, narrow = (np.exp(-0.5 * ((y - 90.3 - 0.05 * x) / s) ** 2) for s in (6.0, 2.0))
+    wall = np.where((x // 24) % 2 > 0, 0.4, 1.0)
+    image = room * wall[:, :, None] + np.random.default_rng(3).normal(2.0, 1.0, (*x.shape, 3))
+    image += narrow[:, :, None] * np.array(light)
+    if not room:
+        # the lens spreads the laser's own light, and the core clips in every channel
+        image += narrow[:, :, None] * 300.0 + wide[:, :, None] * np.array([0.0, 60.0, 0.0])
+    seen = Exposure(np.clip(image, 0, 255).round().astype(np.uint8), "scan.png")
+    sensor = replace(sensor_calibration(), laser_colour="green-excess")
+    stripes, about = stripes_as_seen(7, lambda _: (seen, None), sensor, StripeOptions())
+    assert stripes.laser_colour == expected
+    assert bool(about) is (expected == "green")
+    chosen = StripeOptions(laser_colour="red")
+    assert stripes_as_seen(7, lambda _: (seen, None), sensor, chosen) == (chosen, "")
 
 
 def cut_to(board: BoardStripes, n: int, scatter_px: float, seed: int) -> BoardStripes:
@@ -130,7 +220,7 @@ def test_a_line_on_all_boards_wins_over_a_precise_piece_on_two() -> None:
             return cut_to(boards[k], 40, 0.3, k)
         return FitFailure("no stripe")
 
-    chosen, _ = choose_channel(len(boards), stripes_of, cameras, SheetOptions())
+    (chosen, _), *_ = rank_channels(len(boards), stripes_of, cameras, SheetOptions())
     assert chosen == "red-blue"
 
 

@@ -26,6 +26,7 @@ from armscan.calibration.cameras.distortion import (
     design_effect,
     predicts_better,
     rms,
+    sigma_of_axis,
 )
 from armscan.calibration.cameras.result import (
     MIN_VIEWS,
@@ -207,6 +208,7 @@ def assemble(
         views, prepared, solution, covariance=covariance, is_misfit=is_misfit, camera=camera
     )
     kept = solution.weights > 0.0
+    misses_px = residuals_px(observations, solution.state)[kept]
     coverage = measure_coverage(
         observations.points_px[kept],
         solution.state.rotations[:, :, 2],
@@ -221,8 +223,8 @@ def assemble(
         joint_covariance=covariance[np.ix_(rows, rows)],
         views=fits,
         refused_views=prepared.refused + refused,
-        rms_px=rms(residuals_px(observations, solution.state)[kept]),
-        sigma_point_px=_sigma_point_px(solution),
+        rms_px=rms(misses_px),
+        sigma_point_px=sigma_of_axis(misses_px, solution.degrees_of_freedom),
         noise_scale=_noise_scale(used, solution),
         target_error_mm=target_error.sigma_mm,
         degrees_of_freedom=solution.degrees_of_freedom,
@@ -248,13 +250,6 @@ def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | N
         "tilt the board by 20 to 45 degrees, in a different direction from view to view, and "
         "check the number of columns and rows",
     )
-
-
-def _sigma_point_px(solution: Solution) -> float:
-    kept = solution.weights > 0.0
-    covariances = claimed_covariances(solution.observations)[kept]
-    mean_variance = 0.5 * float(np.mean(np.trace(covariances, axis1=1, axis2=2)))
-    return float(np.sqrt(mean_variance * solution.variance_factor))
 
 
 def _noise_scale(used: Sequence[TargetView], solution: Solution) -> float:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.cameras.distortion import rms
+from armscan.calibration.cameras.distortion import rms, sigma_of_axis
 from armscan.calibration.cameras.joint import (
     N_INTRINSICS,
     N_SHARED,
@@ -50,7 +50,6 @@ from armscan.calibration.cameras.relate import (
     too_few,
 )
 from armscan.calibration.cameras.result import CrossValidation, measure_coverage
-from armscan.calibration.cameras.robust import claimed_covariances
 from armscan.calibration.cameras.stereo_result import (
     MatchedPoints,
     PairFit,
@@ -259,12 +258,12 @@ def _side_fit(evidence: Evidence, side: int) -> SideFit:
     weight = solution.weights[side]
     kept = weight > 0.0
     seen = np.flatnonzero(np.diff(observations.starts) > 0)
-    claimed = claimed_covariances(observations)[kept]
-    variance = 0.5 * float(np.mean(np.trace(claimed, axis1=1, axis2=2)))
+    misses_px = solution.residuals_px()[side][kept]
+    share = weight.sum() / sum(w.sum() for w in solution.weights)
     return SideFit(
         single=evidence.cameras[side],
-        rms_px=rms(solution.residuals_px()[side][kept]),
-        sigma_point_px=float(np.sqrt(variance * solution.variance_factor)),
+        rms_px=rms(misses_px),
+        sigma_point_px=sigma_of_axis(misses_px, share * solution.degrees_of_freedom),
         noise_scale=solution.noise_scales[side],
         n_views=len(seen),
         n_points=int(weight.sum()),

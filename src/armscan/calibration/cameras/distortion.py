@@ -99,6 +99,14 @@ def rms(residuals: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
+def sigma_of_axis(residuals: FloatArray, degrees_of_freedom: float) -> float:
+    """Standard deviation along an axis of points that leave these (N, 2) residuals.
+
+    Of the residuals, not of what detectors claim: two blurred corners would stand for all.
+    """
+    return float(np.sqrt(np.sum(residuals**2) / max(degrees_of_freedom, 1.0)))
+
+
 def subset(
     observations: Observations, weights: FloatArray, views: IntArray
 ) -> tuple[Observations, FloatArray]:

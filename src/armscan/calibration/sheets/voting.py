@@ -11,7 +11,7 @@ its boards then agree on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar, get_args
 
@@ -404,37 +404,39 @@ def _held_against(
     return _Agreement(normal, offset, limit_px, residual, agrees)
 
 
-def choose_channel(
+def rank_channels(
     n_images: int,
     stripes_of: Callable[[int, LaserColour], BoardStripes | FitFailure],
     cameras: HeadCameras,
     options: SheetOptions,
-) -> tuple[LaserColour, str]:
-    """Try every channel on a sample of a set and take the one with the most evidence.
+) -> tuple[tuple[LaserColour, str], ...]:
+    """Try every channel on a sample of a set: that with the most evidence, and the next to try.
 
     One photograph does not tell: a lamp, a red handle, the pattern of the board and JPEG's coarse
     colours each win somewhere. Over a set the laser's line is the one that is long, straight on the
-    board, narrow, and on the light sheet on which the boards agree.
+    board, narrow, and on the light sheet on which the boards agree. Where a channel shows many
+    lines on each board there is no vote: the edges of an overexposed board pass for a fan until the
+    fit refuses them. To be tried then is the best other channel in which the boards did agree.
 
     ``stripes_of`` gives the stripes of one of ``n_images`` photographs with a board in a channel.
-    With the channel comes why it was taken, in words; ``auto`` and nothing where no channel shows a
-    straight stripe on a board.
+    With each channel comes why it was taken, in words; nothing where no channel shows a straight
+    stripe on a board.
     """
     sample = _sample(n_images)
     found = _tried(sample, CHANNELS, stripes_of, cameras, options)
     evidence = [(_weigh(boards, cameras, options), c) for c, boards in found.items()]
-    evidence.sort(key=lambda item: -item[0][0])
-    (weight, n_shown, n_points, scatter_px), best = evidence[0]
-    if weight <= 0.0:
-        return "auto", ""
-    reason = (
-        f"{best}: the stripe on the common sheet in {n_shown} of {len(sample)} "
-        f"sampled photographs, {n_points} points that scatter {scatter_px:.2f} px"
-    )
-    if len(evidence) > 1 and evidence[1][0][0] > 0.0:
-        (_, n_shown, n_points, scatter_px), second = evidence[1]
-        reason += f"; next {second} with {n_shown}, {n_points} and {scatter_px:.2f} px"
-    return best, reason
+    evidence = sorted((e for e in evidence if e[0].weight > 0.0), key=lambda e: -e[0].weight)
+    if not evidence:
+        return ()
+    ranked = evidence[:1] + [e for e in evidence[1:] if not e[0].is_fan][:1]
+    following = "; next {1} with {0.n_shown}, {0.n_points} and {0.scatter_px:.2f} px"
+    reasons = [
+        f"{channel}: the stripe on the common sheet in {shown.n_shown} of {len(sample)} sampled "
+        f"photographs, {shown.n_points} points that scatter {shown.scatter_px:.2f} px"
+        for shown, channel in ranked
+    ]
+    reasons[0] += following.format(*evidence[1]) if len(evidence) > 1 else ""
+    return tuple((channel, why) for (_, channel), why in zip(ranked, reasons, strict=True))
 
 
 def choose_print(
@@ -452,16 +454,17 @@ def choose_print(
         return False, ""
     sample = _sample(n_images)
     found = _tried(sample, (False, True), stripes_of, cameras, options)
-    (as_is, n_before, points_before, _), (less, n_shown, n_points, scatter_px) = (
+    as_is, less = (
         _weigh(found.get(less_print, ()), cameras, options) for less_print in (False, True)
     )
-    if less <= as_is or n_shown < LEAST_SHOWN:
+    if less.weight <= as_is.weight or less.n_shown < LEAST_SHOWN:
         return False, ""
-    before = f"in {n_before}, {points_before} points" if False in found else "given up after a few"
+    before = f"in {as_is.n_shown}, {as_is.n_points} points" if False in found else "given up early"
     return True, (
         f"{n_images} photographs have none without laser: their print is told from its repetition "
-        f"and subtracted; the stripe on the common sheet in {n_shown} of {len(sample)} that were "
-        f"tried, {n_points} points that scatter {scatter_px:.2f} px (as they are: {before})"
+        f"and subtracted; the stripe on the common sheet in {less.n_shown} of {len(sample)} that "
+        f"were tried, {less.n_points} points that scatter {less.scatter_px:.2f} px (as they are: "
+        f"{before})"
     )
 
 
@@ -490,31 +493,56 @@ def _tried(
                 boards.append(shown)
         share = LEAST_SHARE.get(tried + 1)
         if share is not None and len(order) > tried + 1:
-            weights = {way: _weigh(boards, cameras, options)[0] for way, boards in found.items()}
-            least = share * max(weights.values())
-            found = {way: boards for way, boards in found.items() if weights[way] >= least}
+            shown_by = {way: _weigh(boards, cameras, options) for way, boards in found.items()}
+            found = {way: found[way] for way, shown in shown_by.items()
+                     if shown.is_worth(share, shown_by.values())}  # fmt: skip
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """Of stripes on the common sheet: weight, photographs, points, scatter (rms); whether they are
+    so many on each board that none were voted on.
+    """
+
+    weight: float
+    n_shown: int
+    n_points: int
+    scatter_px: float
+    is_fan: bool
+
+    def is_worth(self, share: float, others: Iterable[_Evidence]) -> bool:
+        """False if it is less than this share of the best other, of fans if it is of a fan."""
+        best = {True: 0.0, False: 0.0}
+        for other in others:
+            best[other.is_fan] = max(best[other.is_fan], other.weight)
+        is_blank = self.weight == 0.0 < max(best.values())
+        return not is_blank and self.weight >= share * best[self.is_fan]
 
 
 def _weigh(
     boards: Sequence[BoardStripes], cameras: HeadCameras, options: SheetOptions
-) -> tuple[float, int, int, float]:
-    """Weight of a channel's stripes on the common sheet, their photographs, points and scatter.
+) -> _Evidence:
+    """What a channel shows on the common sheet.
 
-    The points over the square of their scatter (rms, px) are the precision that a photograph gets
-    from the channel. The weight is the square of the sum of its roots: a short piece of an edge on
-    two boards does not outweigh a line across all.
+    The points over the square of their scatter are the precision that a photograph gets from the
+    channel. The weight is the square of the sum of its roots: a short piece of an edge on two
+    boards does not outweigh a line across all.
     """
     images = observe_boards(boards, cameras, options).images if boards else ()
     stripes = [(image, stripe.rows) for image in images for stripe in image.stripes]
     n = np.array([len(rows) for _, rows in stripes], dtype=np.int64)
     square = np.array([_scatter_px(image, rows) ** 2 for image, rows in stripes])
-    scatter_px = float(np.sqrt((n * square).sum() / n.sum())) if len(n) else 0.0
     precision = n / (square + LEAST_SCATTER_PX**2)
     of = np.repeat(np.arange(len(images)), [len(image.stripes) for image in images])
     root = np.sqrt(np.bincount(of, precision, minlength=len(images))).sum()
-    weight = float(root**2)
-    return weight, sum(1 for image in images if image.stripes), int(n.sum()), scatter_px
+    return _Evidence(
+        weight=float(root**2),
+        n_shown=sum(1 for image in images if image.stripes),
+        n_points=int(n.sum()),
+        scatter_px=float(np.sqrt((n * square).sum() / n.sum())) if len(n) else 0.0,
+        is_fan=bool(images) and _most_lines(images) >= LEAST_FAN,
+    )
 
 
 def _scatter_px(image: BoardImage, rows: IntArray) -> float:

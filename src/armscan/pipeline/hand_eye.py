@@ -199,8 +199,6 @@ def observe_plate(
     ------
     InputError
         If the scan has not the sensor's cameras, or its images are not of the camera's sensor.
-    EstimationError
-        If the sheet of a stripe is ambiguous.
     """
     options = options or MeasureOptions()
     scan = ScanInstants(source, len(cameras_of(sensor)))

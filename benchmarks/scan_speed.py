@@ -113,7 +113,7 @@ def pair_rows(repeats: int) -> list[Row]:
 
 def after_stripes(placing: BaseTransform) -> Callable[[], object]:
     """Everything that a scan does with one exposure of 1050 points once they are extracted."""
-    scanner, depths = placing.scanner, DepthRange(50.0)
+    scanner, depths = placing.scanner, DepthRange(20.0)
     sensor = scanner.sensor
     if sensor is None:
         raise SystemExit("the rig has a camera")

@@ -264,6 +264,7 @@ def test_wrong_options(
         ("--stripe-method", "magic", "'magic' is not known"),
         ("--laser-colour", "pink", "'pink' is not known"),
         ("--depth-margin", "-1", "depth margin"),
+        ("--depth-margin", "80", "depth margin 80; give 0 to 20 widths"),
     ],
 )
 def test_wrong_stripe_options(

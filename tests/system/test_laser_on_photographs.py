@@ -164,6 +164,6 @@ def test_the_stripe_on_the_bust_is_in_front_of_the_turntables_axis(
 def test_an_ambiguous_stripe_is_asked_for_not_guessed(sensor: SensorCalibration) -> None:
     on = read_exposure(CICLOP / "laser_object" / "laser.png")
     off = read_exposure(CICLOP / "laser_object" / "laser_background.png")
-    wide = MeasureOptions(depths=DepthRange(margin=30.0))
+    wide = MeasureOptions(depths=DepthRange(margin=20.0))
     with pytest.raises(EstimationError, match="--sheet"):
         reconstruct([on], sensor, backgrounds=[off], options=wide)

@@ -225,7 +225,7 @@ class CameraCalibration(ArrayRecord):
         Root mean square over points of the length of the reprojection residual vector (the
         definition of OpenCV).
     sigma_point_px
-        Estimated standard deviation of one detected coordinate, per axis.
+        Standard deviation of one detected coordinate, per axis, told of the residuals.
     n_views, n_points
         What was used.
     covered_px

@@ -30,6 +30,10 @@ IN_SENSOR = np.eye(3, 4).ravel()
 """Rows of no turn and no shift."""
 
 
+MOST_MARGIN = 20.0
+"""Widths of the calibrated depths; more was meant as percent or as millimetres."""
+
+
 @dataclass(frozen=True, slots=True)
 class DepthRange:
     """Depths that a reconstruction accepts: the calibrated range of the sheet, or more.
@@ -45,9 +49,10 @@ class DepthRange:
     margin: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.margin >= 0.0:
+        if not 0.0 <= self.margin <= MOST_MARGIN:
             raise OptionError(
-                f"depth margin {self.margin}", remedy="give 0 or more, as a part of the range"
+                f"depth margin {self.margin:g}",
+                remedy=f"give 0 to {MOST_MARGIN:g} widths of the calibrated depths: 0.8 for 80 %",
             )
 
     def limits_mm(self, sheet: SheetCalibration) -> tuple[float, float]:

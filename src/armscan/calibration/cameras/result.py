@@ -271,7 +271,7 @@ class CameraFit(ArrayRecord):
     rms_px
         Root mean square over the used points of the residual's length (the definition of OpenCV).
     sigma_point_px
-        Estimated standard deviation of one detected coordinate, per axis.
+        Standard deviation of one detected coordinate, per axis, told of the residuals.
     noise_scale
         By how much the points scatter more than their detector's covariances say: root of chi2
         over the degrees of freedom with these covariances alone. What is done about it:

@@ -143,7 +143,7 @@ class SideFit:
     rms_px
         Root mean square over its used points of the residual's length.
     sigma_point_px
-        Estimated standard deviation of one detected coordinate, per axis.
+        Standard deviation of one detected coordinate, per axis, told of the residuals.
     noise_scale
         By how much its points scatter more than their detector says.
     n_views, n_points

@@ -73,11 +73,15 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class BareChessboard:
-    """Squares without a rim: where they end, the renderer's surround begins."""
+    """Squares without a rim: where they end, the renderer's surround begins.
+
+    Of the outermost squares ``shown`` is left.
+    """
 
     columns: int
     rows: int
     square_mm: float
+    shown: float = 1.0
 
     @property
     def squares(self) -> ChessboardPattern:
@@ -89,8 +93,8 @@ class BareChessboard:
 
     @property
     def extent_board_mm(self) -> tuple[float, float, float, float]:
-        s = self.square_mm
-        return -s, -s, self.columns * s, self.rows * s
+        s, cut = self.square_mm, self.shown
+        return -cut * s, -cut * s, (self.columns - 1 + cut) * s, (self.rows - 1 + cut) * s
 
     def is_light(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
         return self.squares.is_light(x_mm, y_mm)

@@ -135,6 +135,34 @@ def test_after_a_channel_of_many_lines_comes_one_on_which_the_boards_agree() -> 
     assert [channel for channel, _ in ranked] == ["grey", "green-excess"]
 
 
+def test_lines_on_which_the_boards_do_not_agree_do_not_outweigh_one_on_which_they_do() -> None:
+    """Three borders of each board in red, at random places, of more points together."""
+    rig, rng = rig_of_vga(), np.random.default_rng(5)
+    boards = rig.boards(rig.camera, np.random.default_rng(2))
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+    borders = []
+    for board in boards:
+        middle = board.view.points_px.mean(axis=0)
+        reach = 0.4 * np.ptp(board.view.points_px, axis=0).min()
+        stripes = []
+        for angle in rng.uniform(0.0, np.pi) + np.array([0.0, 1.0, 2.0]):
+            along = np.array([np.cos(angle), np.sin(angle)])
+            centre = middle + 0.4 * reach * rng.uniform(-1.0, 1.0, 2)
+            points = centre + np.linspace(-reach, reach, 70)[:, None] * along
+            normals = np.tile([-along[1], along[0]], (70, 1))
+            stripes.append((points + rng.normal(0.0, 0.1, (70, 1)) * normals, normals))
+        profile = make_profile(board.profile.source, stripes, 0.06)
+        borders.append(replace(board, profile=profile, on_edge=None))
+
+    def stripes_of(k: int, channel: LaserColour) -> BoardStripes | FitFailure:
+        if channel == "red":
+            return borders[k]
+        return cut_to(boards[k], 120, 0.1, k) if channel == "green" else FitFailure("no stripe")
+
+    (first, _), *_ = rank_channels(len(boards), stripes_of, cameras, SheetOptions())
+    assert first == "green"
+
+
 @pytest.mark.parametrize("second", ["green-excess", None])
 def test_the_next_channel_is_tried_where_the_first_gives_no_sheet(
     second: LaserColour | None, monkeypatch: pytest.MonkeyPatch

@@ -68,6 +68,24 @@ def test_squares_without_a_rim_on_any_carrier(seed: int, surround: float) -> Non
     assert_right(view, rendered.marks_px)
 
 
+@pytest.mark.parametrize("shown", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_ring_of_cut_squares_costs_its_own_corners_and_not_the_view(
+    seed: int, shown: float
+) -> None:
+    """Where the squares end lies another edge, which pulls such corners by up to 0.9 px."""
+    board = BareChessboard(8, 5, 3.0, shown=shown)
+    rng = np.random.default_rng(seed)
+    rendered = render(
+        board, rng.uniform(75.0, 110.0), tilt_deg=30.0, azimuth_deg=rng.uniform(0.0, 360.0),
+        roll_deg=rng.uniform(0.0, 360.0), lighting=Lighting(surround=0.4),
+    )  # fmt: skip
+    view = found(rendered.image, seed)
+    inner = BOARD.columns * np.arange(1, 4)[:, None] + np.arange(1, 7)
+    assert set(view.point_index.tolist()) == set(inner.ravel().tolist())
+    assert_right(view, rendered.marks_px)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_dim_board_under_a_vignette(seed: int) -> None:
     light = Lighting(light_level=45.0, dark_level=8.0, gradient=0.4)

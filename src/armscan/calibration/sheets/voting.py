@@ -69,6 +69,8 @@ LEAST_SHARE = {3: 0.1, 8: 0.5}
 LEAST_SCATTER_PX = 0.1
 """Scatter below this does not make a channel better: boards and lens are not known better."""
 CHANNELS: tuple[LaserColour, ...] = get_args(LaserColour)[1:]
+LEAST_TELLING = 5
+"""Boards: of three any lines agree by chance, of four many."""
 LEAST_SHOWN = 2
 """Photographs that must show a stripe on the common sheet: one makes no sheet, and may be print."""
 Way = TypeVar("Way", LaserColour, bool)
@@ -526,8 +528,8 @@ def _weigh(
     """What a channel shows on the common sheet.
 
     The points over the square of their scatter are the precision that a photograph gets from the
-    channel. The weight is the square of the sum of its roots: a short piece of an edge on two
-    boards does not outweigh a line across all.
+    channel. The weight is the square of the sum of its roots, over the boards that agree: a short
+    piece of an edge on two boards does not outweigh a line across all.
     """
     images = observe_boards(boards, cameras, options).images if boards else ()
     stripes = [(image, stripe.rows) for image in images for stripe in image.stripes]
@@ -537,12 +539,25 @@ def _weigh(
     of = np.repeat(np.arange(len(images)), [len(image.stripes) for image in images])
     root = np.sqrt(np.bincount(of, precision, minlength=len(images))).sum()
     return _Evidence(
-        weight=float(root**2),
+        weight=float(root**2) * _consensus(images, cameras) ** 2,
         n_shown=sum(1 for image in images if image.stripes),
         n_points=int(n.sum()),
         scatter_px=float(np.sqrt((n * square).sum() / n.sum())) if len(n) else 0.0,
         is_fan=bool(images) and _most_lines(images) >= LEAST_FAN,
     )
+
+
+def _consensus(images: Sequence[BoardImage], cameras: HeadCameras) -> float:
+    """Share of the boards with a straight stripe that have one on the best common sheet.
+
+    After a vote it is 1; it tells of stripes that nobody voted on, a fan's or the borders of boards
+    that agree on nothing. 1 where so few boards show any that it tells nothing.
+    """
+    lines = _Lines.of(images, cameras)
+    n_boards = len(np.unique(lines.board))
+    if n_boards < LEAST_TELLING:
+        return 1.0
+    return sum(sheet.n_boards(lines) for sheet in _agreements(lines, 1)) / n_boards
 
 
 def _scatter_px(image: BoardImage, rows: IntArray) -> float:

@@ -60,6 +60,8 @@ _WHOLE = 0.95
 _PROBES = (0.12, 0.2, 0.28)
 """Steps from the corners along both lines: near, so that what covers a board has to end within
 this much of one of its lines in order to be taken for its end."""
+_OUTWARD = (0.25, 0.35)
+"""Steps beyond the outermost corners at which their squares have to be there: the fit's reach."""
 _ALTERNATES = 0.5
 """Least difference between squares, of the difference beside them, that is one."""
 _ONE_TONE = 0.35
@@ -175,15 +177,19 @@ def _last_side(grey: Grey32, grid: FloatArray) -> Side:
 
 
 def _difference(
-    grey: Grey32, corners_px: FloatArray, along_px: FloatArray, across_px: FloatArray
+    grey: Grey32,
+    corners_px: FloatArray,
+    along_px: FloatArray,
+    across_px: FloatArray,
+    probes: tuple[float, ...] = _PROBES,
 ) -> FloatArray:
     """Level (N,) ahead of each corner less that behind it, on one side; NaN out of view."""
     total = np.zeros(len(corners_px))
     for p in _ALONG:
-        for q in _PROBES:
+        for q in probes:
             ahead = sample(grey, corners_px + p * along_px + q * across_px)
             total += ahead - sample(grey, corners_px - p * along_px + q * across_px)
-    return total / (len(_ALONG) * len(_PROBES))
+    return total / (len(_ALONG) * len(probes))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -308,7 +314,9 @@ SEARCH_SIZE_PX = 1400
 MIN_SEEN_FRACTION = 0.4
 """Least fraction of a board's corners that makes a view."""
 MIN_GOOD_FRACTION = 0.7
-"""Least fraction of the corners found that the sub-pixel fit must accept."""
+"""Least fraction of the corners found that the sub-pixel fit must accept: of all, or of those
+within the outermost ring, which cut squares or a clip at the board's edge may spoil."""
+LEAST_JUDGED = 9
 MAX_SCATTER = 0.03
 """Largest scatter about a smooth lattice, as a fraction of a step: more is no flat board."""
 PRINT_ERROR = 0.02
@@ -471,6 +479,7 @@ def _measured(grey: RawGrey, target: Chessboard, numbered: NumberedCorners) -> _
     within &= ((start > 1.0) & (start < size - 2.0)).all(axis=1)
     cells, start, step_x, step_y = every[within], start[within], step_x[within], step_y[within]
     corners, covariance, is_good = fit_saddles(grey, start, step_x, step_y)
+    is_good &= _has_squares_around(grey, target, cells, corners, (step_x, step_y))
     sigma = np.sqrt(0.5 * np.trace(covariance, axis1=1, axis2=2))
     scatter = float("inf")
     step = float(np.median(np.minimum(np.hypot(*step_x.T), np.hypot(*step_y.T))))
@@ -482,9 +491,42 @@ def _measured(grey: RawGrey, target: Chessboard, numbered: NumberedCorners) -> _
     return _Corners(cells, corners, covariance, is_good, scatter, step)
 
 
+def _has_squares_around(
+    grey: RawGrey,
+    target: Chessboard,
+    cells: IntArray,
+    corners_px: FloatArray,
+    steps_px: tuple[FloatArray, FloatArray],
+) -> BoolArray:
+    """(N,) False for corners of the outermost rows whose squares end within reach of the fit.
+
+    An end so near is one more edge beside the corner, which pulls it: by 0.3 to 0.9 px where a
+    sixth of the squares is left, and ten times what the fit claims.
+    """
+    image, has_squares = np.asarray(grey, np.float32), np.ones(len(cells), dtype=np.bool_)
+    for axis, count in enumerate((target.columns, target.rows)):
+        for end, sign in ((0, -1.0), (count - 1, 1.0)):
+            last = np.flatnonzero(cells[:, axis] == end)
+            along, out = steps_px[1 - axis][last], sign * steps_px[axis][last]
+            for q in _OUTWARD:
+                beyond, within = (
+                    _difference(image, corners_px[last], along, way * out, probes=(q,))
+                    for way in (1.0, -1.0)
+                )
+                ends = np.abs(beyond) < _ALTERNATES * np.abs(within)
+                has_squares[last[ends | (beyond * within > 0.0)]] = False
+    return has_squares
+
+
 def _refusal(exposure: Exposure, target: Chessboard, corners: _Corners) -> FitFailure | None:
     n_good, n_all = int(corners.is_good.sum()), target.columns * target.rows
-    if n_good < MIN_SEEN_FRACTION * n_all or n_good < MIN_GOOD_FRACTION * len(corners.cells):
+    last = (target.columns - 1, target.rows - 1)
+    is_inner = ((corners.cells > 0) & (corners.cells < last)).all(axis=1)
+    inner = corners.is_good[is_inner]
+    is_board = n_good >= MIN_GOOD_FRACTION * len(corners.cells) or (
+        len(inner) >= LEAST_JUDGED and inner.mean() >= MIN_GOOD_FRACTION
+    )
+    if n_good < MIN_SEEN_FRACTION * n_all or not is_board:
         return FitFailure(
             f"{exposure.source}: only {n_good} of {n_all} chessboard corners are "
             "crossings of two straight edges",

@@ -24,6 +24,9 @@ from armscan.vision.targets.target import (
         (" chessboard:11X6:13mm ", Chessboard(11, 6, 13.0)),
         ("chessboard:11x6:1.3cm", Chessboard(11, 6, 13.0)),
         ("chessboard:11x6:0.013m", Chessboard(11, 6, 13.0)),
+        ("chessboard:11x6:13x13.26", Chessboard(11, 6, 13.0, 1.02)),
+        ("circle-grid:11x9:4x4mm", CircleGrid(11, 9, 4.0)),
+        ("circle-grid:11x9:1cmX9mm", CircleGrid(11, 9, 10.0, stretch=0.9)),
         ("chessboard:11x6:0.05mm", Chessboard(11, 6, 0.05)),
         ("charuco:10x7:4:3:DICT_4X4_50", Charuco(10, 7, 4.0, 3.0, "DICT_4X4_50")),
         ("charuco:10x7:4:3:4x4_50", Charuco(10, 7, 4.0, 3.0, "DICT_4X4_50")),
@@ -56,6 +59,10 @@ def test_every_example_is_right(kind: str) -> None:
         ("chessboard:11x6:nan", "no square"),
         ("chessboard:11x6:1e999", "no square"),
         ("chessboard:11x6:13in", "no square"),
+        ("chessboard:11x6:13x", "no square"),
+        ("chessboard:11x6:13x14x15", "no square"),
+        ("chessboard:8x8:13x14", "no image tells which"),
+        ("charuco:10x7:4x4.1:3:DICT_4X4_50", "no square"),
         ("circle-grid:11x9:ten", "no pitch"),
         ("charuco:10x7:4:3", "needs 4 fields"),
         ("charuco:10x7:3:4:DICT_4X4_50", "does not fit"),
@@ -79,7 +86,10 @@ def test_a_length_that_was_meant_in_metres_is_asked_about(text: str) -> None:
     assert f"{text.split(':')[2]}m " in str(caught.value)
 
 
-@pytest.mark.parametrize("text", [*EXAMPLES.values(), "charuco:10x6:4:3:DICT_4X4_50:new"])
+@pytest.mark.parametrize(
+    "text",
+    [*EXAMPLES.values(), "charuco:10x6:4:3:DICT_4X4_50:new", "circle-grid:11x9:3.75x3.76"],
+)
 def test_a_formatted_target_is_read_back(text: str) -> None:
     assert parse_target(format_target(parse_target(text))) == parse_target(text)
 
@@ -89,6 +99,7 @@ def test_a_formatted_target_is_read_back(text: str) -> None:
     [
         ("chessboard:11x6:13", "130 x 65 mm"),
         ("circle-grid:11x9:3.75", "37.5 x 30 mm"),
+        ("chessboard:11x6:13x13.26", "130 x 66.3 mm"),
         ("asymmetric-circle-grid:4x11:5", "35 x 50 mm"),
         ("charuco:10x7:4:3:DICT_4X4_50", "32 x 20 mm"),
     ],

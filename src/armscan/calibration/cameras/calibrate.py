@@ -25,6 +25,7 @@ from armscan.calibration.cameras.distortion import (
     cross_validate,
     design_effect,
     predicts_better,
+    print_stretch,
     rms,
     sigma_of_axis,
 )
@@ -39,6 +40,7 @@ from armscan.calibration.cameras.result import (
     advise,
     largest_angle_deg,
     measure_coverage,
+    rms_reasons,
 )
 from armscan.calibration.cameras.robust import (
     MISFIT_LEVEL,
@@ -61,6 +63,7 @@ from armscan.calibration.cameras.robust import (
 from armscan.calibration.cameras.start import (
     estimate_board_pose,
     repeated_views,
+    seen_stretch,
     starting_state,
     view_homography,
 )
@@ -188,6 +191,7 @@ def assemble(
     found = board_residuals(solution)
     target_error = estimate_target_error(found)
     design = design_effect(solution)
+    stretch, stretch_sigma = print_stretch(solution, options.max_steps)
     sigma0_squared = solution.variance_factor * design.widening
     shift = np.zeros(len(unit))
     if chosen.untested:
@@ -234,6 +238,8 @@ def assemble(
         warp=warp,
         model_reason=chosen.reason,
         design_effect=design.widening,
+        stretch=stretch,
+        stretch_sigma=stretch_sigma,
         warnings=(),
         options=options,
     )
@@ -401,7 +407,7 @@ def calibrate_camera(
         return prepared
     chosen = _solve_model(views, prepared, options)
     if isinstance(chosen, FitFailure):
-        return chosen
+        return chosen if (told := _of_other_cells(views, prepared)) is None else told
     while (bad := _to_leave_out(chosen.solution, options)).any():
         smaller = _without(bad, prepared, chosen.solution)
         if len(smaller.used) < max(3, len(prepared.used) // 2):
@@ -410,7 +416,23 @@ def calibrate_camera(
         if isinstance(again, FitFailure):
             break
         prepared, chosen = smaller, again
-    return assemble(views, prepared, chosen, misfits(chosen.solution), options)
+    fit = assemble(views, prepared, chosen, misfits(chosen.solution), options)
+    if isinstance(fit, FitFailure) or rms_reasons(fit.camera, fit.rms_px):
+        return fit if (told := _of_other_cells(views, prepared)) is None else told
+    return fit
+
+
+def _of_other_cells(views: Sequence[TargetView], prepared: PreparedViews) -> FitFailure | None:
+    """Asked where no camera fits: whether one does if the target's cells are no squares."""
+    stretch = seen_stretch(prepared.homographies, views[0].width_px, views[0].height_px)
+    if stretch is None:
+        return None
+    return FitFailure(
+        "no camera fits the target as it is described, and one does if rows lie "
+        f"{stretch:.2f} times as far apart as columns",
+        "measure the print both ways and give both lengths, as in chessboard:6x5:28x44.3; print "
+        "without fitting to the page",
+    )
 
 
 def misfits(solution: Solution) -> BoolArray:

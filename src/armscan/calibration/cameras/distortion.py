@@ -13,12 +13,17 @@ from scipy.special import chdtrc
 
 from armscan.calibration.cameras.adjustment import (
     SHARED_NAMES,
+    SINGULAR_CONDITION,
     Observations,
     State,
     adjust,
     basis_of,
+    condition_number,
+    damped_step,
     joint_covariance,
     linearise,
+    normal_equations,
+    predict,
     reduced_normal_matrix,
 )
 from armscan.calibration.cameras.result import (
@@ -452,3 +457,44 @@ def coefficients_left_at_zero(
     rows = [SHARED_NAMES.index(name) for name in names]
     pull = equations.shared_gradient[-len(names) :]
     return LeftAtZero(determined[0], np.asarray(determined[0][:, rows] @ pull))
+
+
+def print_stretch(solution: Solution, max_steps: int) -> tuple[float, float]:
+    """By how much the print is longer from row to row than is said of it, as a part, and its sigma.
+
+    From column to column it is taken for right. Printers feed paper by half a percent too far; the
+    camera takes that up in its focal lengths and its centre. One step with one unknown more, and
+    another from the solution over the print so stretched, whose residuals tell the sigma. (0, inf)
+    if the views do not tell.
+    """
+    first = _stretch_step(solution)
+    if not np.isfinite(first[1]):
+        return first
+    observations = solution.observations
+    longer = observations.board_mm * np.array([1.0, 1.0 + first[0], 1.0])
+    stretched = replace(observations, board_mm=longer)
+    found = adjust(stretched, solution.state, solution.basis, solution.weights, max_steps)
+    if isinstance(found, FitFailure):
+        return first
+    again = replace(solution, observations=stretched, state=found.state, equations=found.system)
+    rest, sigma = _stretch_step(again)
+    widening = float(np.sqrt(design_effect(again).widening))
+    return (1.0 + first[0]) * (1.0 + rest) - 1.0, sigma * widening
+
+
+def _stretch_step(solution: Solution) -> tuple[float, float]:
+    """Change of the stretch in one step, and its sigma for points that err on their own."""
+    observations = solution.observations
+    prediction = predict(observations, solution.state)
+    if prediction is None:
+        return 0.0, np.inf
+    predicted, by_shared, by_pose = prediction
+    ahead = solution.state.rotations[observations.view_of_point, :, 1]
+    by_stretch = by_pose[:, :, 3:] @ (observations.board_mm[:, 1:2] * ahead)[:, :, None]
+    free = np.concatenate([by_shared @ solution.basis, by_stretch], axis=2)
+    equations = normal_equations(observations, predicted, free, by_pose, solution.weights)
+    step, reduced = damped_step(equations, 0.0), reduced_normal_matrix(equations)
+    if step is None or not condition_number(reduced) < SINGULAR_CONDITION:
+        return 0.0, np.inf
+    variance = float(np.linalg.inv(reduced)[-1, -1]) * solution.variance_factor
+    return float(step[0][-1]), float(np.sqrt(variance))

@@ -216,6 +216,39 @@ def intrinsics_from_homographies(
     )
 
 
+FOCALS = np.geomspace(0.4, 6.0, 200)
+"""Of the image's longer side."""
+FAR_BETTER, LEAST_STRETCHED = 100.0, 0.03
+"""By what factor of the squares other cells must explain views better, and how unlike squares."""
+
+
+def seen_stretch(homographies: Sequence[FloatArray], width_px: int, height_px: int) -> float | None:
+    """How many times as far apart as columns rows lie, where square cells explain no view.
+
+    A pinhole with its axis in the middle of the image sees the board's x and y as two directions at
+    right angles, of one length. Focal length and ratio of lengths are found from V homographies
+    (3, 3) of flat boards, as by eq. 2.34 with one unknown more; None where square
+    cells do about as well.
+    """
+    to_middle = np.array(
+        [[1.0, 0.0, -0.5 * width_px], [0.0, 1.0, -0.5 * height_px], [0.0, 0.0, 1.0]]
+    )
+    columns = np.array([to_middle @ each for each in homographies])[:, :, :2]
+    best, least, least_square = 1.0, np.inf, np.inf
+    for focal_px in FOCALS * max(width_px, height_px):
+        turned = columns / np.array([focal_px, focal_px, 1.0])[:, None]
+        length = np.linalg.norm(turned, axis=1)
+        cosine = (turned[:, :, 0] * turned[:, :, 1]).sum(axis=1) / length.prod(axis=1)
+        ratio = np.log(length[:, 1] / length[:, 0])
+        common = float(np.median(ratio))
+        misfit = float((cosine**2).sum() + ((ratio - common) ** 2).sum())
+        least_square = min(least_square, float((cosine**2).sum() + (ratio**2).sum()))
+        if misfit < least:
+            best, least = float(np.exp(common)), misfit
+    is_told = least_square > FAR_BETTER * least and abs(np.log(best)) > LEAST_STRETCHED
+    return best if is_told else None
+
+
 def _solve(rows: FloatArray, free: tuple[int, ...]) -> FloatArray:
     b = np.zeros(5)
     b[list(free)] = np.linalg.svd(rows[:, free])[2][-1]

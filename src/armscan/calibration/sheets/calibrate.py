@@ -416,7 +416,7 @@ class _Case:
             return refused
         is_told = model.is_bowed or not self.options.is_bow_allowed
         common = self._common_plane(k)
-        warnings = geometry_warnings(geometry, common, fitted_deg)
+        warnings = (*geometry_warnings(geometry, common, fitted_deg), *points.warnings)
         if model.plane_test.p_value < LACK_OF_FIT_P:
             outlier = find_outlier_view(observations, sheet, self.errors)
             if outlier is not None:

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal, TypeAlias
 
+from scipy.special import chdtri
+
 from armscan.errors import OptionError
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, floats, ints
 from armscan.geometry.estimate import Estimate
@@ -299,6 +301,10 @@ class BoardPointCheck:
     left_out: BoardDistances | None
 
 
+BEYOND_CLAIM = 1.5
+BY_CHANCE = 1e-3
+
+
 @dataclass(frozen=True, slots=True)
 class SheetPointCheck:
     """Points of one sheet: all, every board having taken part in the fit, and board by board.
@@ -311,6 +317,22 @@ class SheetPointCheck:
     left_out_rms_mm: float
     left_out_claimed_mm: float
     boards: tuple[BoardPointCheck, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Says that points lie farther off boards that took no part than is claimed for them.
+
+        Not before chance puts so few boards there once in a thousand calibrations.
+        """
+        n = sum(1 for board in self.boards if board.left_out is not None)
+        ratio = self.left_out_rms_mm / self.left_out_claimed_mm if n else 0.0
+        if not ratio > max(BEYOND_CLAIM, math.sqrt(chdtri(n, BY_CHANCE) / n)):
+            return ()
+        return (
+            f"points lie {self.left_out_rms_mm:.3g} mm (rms) off boards that were left out, where "
+            f"{self.left_out_claimed_mm:.3g} mm is claimed: take sigmas for {ratio:.1f} times as "
+            "large; is the camera that of these photographs, and are the boards flat?",
+        )
 
 
 class SheetFit(ArrayRecord):

@@ -119,9 +119,10 @@ def _borders(
 ) -> TargetEdges:
     """Borders of all squares, corner to corner and one square beyond the inner corners."""
     corners = target.points_board_mm[:, :2]
-    low = corners.min(axis=0) - target.square_mm
-    high = corners.max(axis=0) + target.square_mm
-    counts = np.rint((high - low) / target.square_mm).astype(int)
+    stretch = target.stretch if isinstance(target, Chessboard) else 1.0
+    square_mm = target.square_mm * np.array([1.0, stretch])
+    low, high = corners.min(axis=0) - square_mm, corners.max(axis=0) + square_mm
+    counts = np.rint((high - low) / square_mm).astype(int)
     x, y = (np.linspace(low[i], high[i], counts[i] + 1) for i in range(2))
     lines = [np.array([[value, low[1]], [value, high[1]]]) for value in x]
     lines += [np.array([[low[0], value], [high[0], value]]) for value in y]

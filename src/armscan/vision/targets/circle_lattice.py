@@ -280,7 +280,8 @@ def number_grid(
     grid.
     """
     blobs = np.array(list(lattice.values()), dtype=np.int64)
-    wanted = np.rint(target.points_board_mm[:, :2] / target.pitch_mm).astype(np.int64)
+    pitches_mm = target.pitch_mm * np.array([1.0, target.stretch])
+    wanted = np.rint(target.points_board_mm[:, :2] / pitches_mm).astype(np.int64)
     number = {(x, y): k for k, (x, y) in enumerate(wanted.tolist())}
     best: tuple[float, NumberedGrid] | None = None
     for quarter_turns in range(4):

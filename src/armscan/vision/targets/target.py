@@ -27,19 +27,24 @@ from armscan.records.exposure import Exposure
 
 @dataclass(frozen=True, slots=True)
 class CircleGrid:
-    """Grid of circles; ``is_asymmetric`` shifts every second row by half a pitch (as OpenCV)."""
+    """Grid of circles; ``is_asymmetric`` shifts every second row by half a pitch (as OpenCV).
+
+    Rows lie ``stretch`` times the pitch apart.
+    """
 
     columns: int
     rows: int
     pitch_mm: float
     is_asymmetric: bool = False
+    stretch: float = 1.0
 
     @property
     def points_board_mm(self) -> FloatArray:
         """(columns * rows, 3) circle centres in the Board frame, row by row."""
         j, i = np.mgrid[: self.rows, : self.columns]
         x = (2 * i + j % 2) * self.pitch_mm if self.is_asymmetric else i * self.pitch_mm
-        return np.stack([x, j * self.pitch_mm, 0.0 * x], axis=-1).reshape(-1, 3)
+        y = j * self.pitch_mm * self.stretch
+        return np.stack([x, y, 0.0 * x], axis=-1).reshape(-1, 3)
 
     @property
     def size_mm(self) -> float:
@@ -56,17 +61,18 @@ class CircleGrid:
 
 @dataclass(frozen=True, slots=True)
 class Chessboard:
-    """Chessboard, counted in inner corners."""
+    """Chessboard, counted in inner corners; rows lie ``stretch`` times a square's width apart."""
 
     columns: int
     rows: int
     square_mm: float
+    stretch: float = 1.0
 
     @property
     def points_board_mm(self) -> FloatArray:
         """(columns * rows, 3) inner corners in the Board frame, row by row."""
         j, i = np.mgrid[: self.rows, : self.columns]
-        return np.stack([i, j, 0 * i], axis=-1).reshape(-1, 3) * self.square_mm
+        return np.stack([i, self.stretch * j, 0 * i], axis=-1).reshape(-1, 3) * self.square_mm
 
     @property
     def size_mm(self) -> float:
@@ -150,7 +156,8 @@ def parse_target(text: str) -> Target:
         ``chessboard:COLSxROWS:SQUARE_MM`` (inner corners) or
         ``charuco:COLSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY`` (squares), which ``:old`` or ``:new``
         may follow. A length is in mm unless it bears a unit: ``13``, ``13mm``, ``1.3cm``,
-        ``0.013m``.
+        ``0.013m``. A print that came out longer one way than the other has two: ``13x13.1`` is
+        from column to column and from row to row; not of a ChArUco board.
 
     Raises
     ------
@@ -169,12 +176,18 @@ def parse_target(text: str) -> Target:
     if len(fields) != n_fields and not has_layout:
         raise _wrong(text, kind, f"needs {n_fields} fields after '{kind}', has {len(fields)}")
     columns, rows = _counts(text, kind, fields[0])
-    if kind == "chessboard":
-        return Chessboard(columns, rows, _length_mm(text, kind, "square", fields[1]))
     if kind == "charuco":
         return _charuco(text, columns, rows, fields)
-    is_asymmetric = kind == "asymmetric-circle-grid"
-    return CircleGrid(columns, rows, _length_mm(text, kind, "pitch", fields[1]), is_asymmetric)
+    name = "square" if kind == "chessboard" else "pitch"
+    lengths = [
+        _length_mm(text, kind, name, part) for part in re.split("[xX]", fields[1], maxsplit=1)
+    ]
+    stretch = lengths[-1] / lengths[0]
+    if stretch != 1.0 and columns == rows:
+        raise _wrong(text, kind, "of as many columns as rows no image tells which length is which")
+    if kind == "chessboard":
+        return Chessboard(columns, rows, lengths[0], stretch)
+    return CircleGrid(columns, rows, lengths[0], kind == "asymmetric-circle-grid", stretch)
 
 
 def rightness(board: FloatArray, points_px: FloatArray) -> float:
@@ -193,8 +206,14 @@ def format_target(target: Target) -> str:
         return f"{text}:{target.dictionary}{layout}"
     if isinstance(target, CircleGrid):
         kind = "asymmetric-circle-grid" if target.is_asymmetric else "circle-grid"
-        return f"{kind}:{counts}:{target.pitch_mm:.12g}"
-    return f"chessboard:{counts}:{target.square_mm:.12g}"
+        return f"{kind}:{counts}:{_pitches(target)}"
+    return f"chessboard:{counts}:{_pitches(target)}"
+
+
+def _pitches(target: CircleGrid | Chessboard) -> str:
+    pitch_mm = target.size_mm
+    second = "" if target.stretch == 1.0 else f"x{pitch_mm * target.stretch:.12g}"
+    return f"{pitch_mm:.12g}{second}"
 
 
 def describe_target(target: Target) -> str:

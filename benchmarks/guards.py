@@ -170,7 +170,8 @@ def camera_case(seed: int) -> Case:
 
     name = (views.found[k].source,)
     whole = ("board of other proportions (2 %)", "two views", "all views parallel")
-    return Case(calibrate, {one: name for one in CAMERA_FAULTS if one not in whole})
+    words = {one: name for one in CAMERA_FAULTS if one not in whole}
+    return Case(calibrate, {**words, "board of other proportions (2 %)": ("row to row",)})
 
 
 def _judged_camera(made: Instrument, fit: CameraFit) -> Said:

@@ -15,6 +15,7 @@ from armscan.calibration.cameras.result import (
     CameraOptions,
     reasons_to_refuse,
 )
+from armscan.geometry.estimate import FitFailure
 from armscan.vision.targets.target import TargetView
 from rigs.camera_scene import Scene, board_pose, make_views, view_of
 
@@ -83,13 +84,19 @@ def test_repeated_views_take_one_line() -> None:
     assert "2 more" in about[0]
 
 
-def test_a_target_stretched_along_one_side_is_told_by_fx_and_fy() -> None:
+@pytest.mark.parametrize("stretch", [4.0 / 3.0, 1.02])
+def test_a_target_stretched_along_one_side_is_told(stretch: float) -> None:
     """A pitch of 15 x 20 mm taken for 15 x 15: the camera's fy swallows it."""
     views, _ = make_views(Scene(max_tilt_deg=30.0), 3)
     stretched = [
-        replace(view, points_board_mm=view.points_board_mm * [1.0, 0.75, 1.0]) for view in views
+        replace(view, points_board_mm=view.points_board_mm * [1.0, 1.0 / stretch, 1.0])
+        for view in views
     ]
     assert not [text for text in solved(views).warnings if "fx is" in text]
-    fit = solved(stretched)
-    assert any("fx is 0.7" in text for text in fit.warnings)
-    assert reasons_to_refuse(fit)
+    if stretch > 1.1:
+        refusal = calibrate_camera(stretched, OPTIONS)
+        assert isinstance(refusal, FitFailure)
+        assert "rows lie 1.34 times" in refusal.reason, "pinholes: 1.333 is the truth"
+        return
+    warnings = solved(stretched).warnings
+    assert any("% longer from row to row" in text for text in warnings)

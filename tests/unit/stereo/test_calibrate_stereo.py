@@ -22,6 +22,7 @@ from armscan.models.camera import CameraModel
 from armscan.models.two_views import IntrinsicsUse
 from rigs.stereo_rig import (
     CONVERGING,
+    GRID,
     LEFT,
     RIGHT,
     StereoScene,
@@ -190,6 +191,26 @@ def test_swapped_lists_are_named() -> None:
     centre = CONVERGING.translation_mm
     assert any("LEFT of the left one" in warning for warning in fit.warnings)
     assert np.abs(fit.views.right_from_left.inverse().translation_mm - centre).max() < 1.0
+
+
+@pytest.mark.parametrize("right", [1.003, 0.997], ids=["both agree", "they do not"])
+def test_a_stretched_print_is_told_where_both_cameras_say_so(right: float) -> None:
+    """Of one print they cannot say different things: that would be the lenses."""
+    left_scene, right_scene = (
+        StereoScene(target=replace(GRID, stretch=stretch)) for stretch in (1.003, right)
+    )
+    pairs = []
+    for left, other in zip(
+        make_pairs(left_scene, 3)[0], make_pairs(right_scene, 3)[0], strict=True
+    ):
+        seen = [
+            None if v is None else replace(v, points_board_mm=GRID.points_board_mm[v.point_index])
+            for v in (left.left, other.right)
+        ]
+        pairs.append(StereoPair(*seen))
+    told = [w for w in solved(pairs, StereoScene()).warnings if "the print seems" in w]
+    assert bool(told) is (right > 1.0)
+    assert all("0.30 % longer" in text for text in told)
 
 
 def test_hold_out_predicts_pairs_that_were_not_used() -> None:

@@ -449,7 +449,7 @@ def advise(
         *_about_model(fit),
         *_about_residuals(fit),
         *_about_warp(fit),
-        *_about_stretch(fit),
+        *about_stretch(fit.stretch, fit.stretch_sigma, _board_points(fit)),
     ]
     return replace(fit, warnings=tuple(warnings))
 
@@ -557,11 +557,15 @@ def _about_residuals(fit: CameraFit) -> list[str]:
     ]
 
 
+def _board_points(fit: CameraFit) -> FloatArray:
+    return np.concatenate([view.view.points_board_mm for view in fit.views])
+
+
 def _about_warp(fit: CameraFit) -> list[str]:
     if fit.warp is None or not fit.warp.is_significant:
         return []
     bow_mm = fit.warp.bow_mm
-    if not is_much_bowed(bow_mm, np.concatenate([view.view.points_board_mm for view in fit.views])):
+    if not is_much_bowed(bow_mm, _board_points(fit)):
         return []
     bow, largest = ", ".join(f"{value:+.3f}" for value in bow_mm), float(abs(bow_mm).sum())
     return [
@@ -575,17 +579,20 @@ STRETCH_SIGMAS, LEAST_STRETCH = 4.0, 1e-3
 where the target is said to be so (0.282 px in place of 0.298, 0.257 of 0.305)."""
 
 
-def _about_stretch(fit: CameraFit) -> list[str]:
-    if abs(fit.stretch) < max(LEAST_STRETCH, STRETCH_SIGMAS * fit.stretch_sigma):
+def about_stretch(stretch: float, sigma: float, points_board_mm: FloatArray) -> list[str]:
+    """Says that a target with these points (N, 3) is longer or shorter from row to row than said.
+
+    Nothing of what is small, or not certain; see `CameraFit`.
+    """
+    if abs(stretch) < max(LEAST_STRETCH, STRETCH_SIGMAS * sigma):
         return []
-    x, y, _ = np.ptp(np.concatenate([view.view.points_board_mm for view in fit.views]), axis=0)
-    part, sigma = 100.0 * abs(fit.stretch), 100.0 * fit.stretch_sigma
-    way = "longer" if fit.stretch > 0.0 else "shorter"
+    x, y, _ = np.ptp(points_board_mm, axis=0)
+    way = "longer" if stretch > 0.0 else "shorter"
     return [
-        f"the print seems {part:.2f} % {way} from row to row than is said of it (± {sigma:.2f} %, "
-        "beside its length from column to column): measure it both ways, "
-        f"{x:.5g} mm and {y * (1.0 + fit.stretch):.5g} mm would fit, and give the target both, as "
-        "in chessboard:9x6:25x25.15"
+        f"the print seems {100.0 * abs(stretch):.2f} % {way} from row to row than is said of it "
+        f"(± {100.0 * sigma:.2f} %, beside its length from column to column): measure it both "
+        f"ways, {x:.5g} mm and {y * (1.0 + stretch):.5g} mm would fit, and give the target both, "
+        "as in chessboard:9x6:25x25.15"
     ]
 
 

@@ -24,6 +24,7 @@ from armscan.calibration.cameras.result import (
     Coverage,
     CrossValidation,
     about_coverage,
+    about_stretch,
     focal_reasons,
     is_much_bowed,
     rms_reasons,
@@ -268,6 +269,8 @@ ODD_GIVEN_LEVEL = 9.0
 BIAS_SIGMAS = 4.0
 LEANING = 2.0
 """A baseline is horizontal if it is this many times longer along x than along y."""
+AGREEING = 3.0
+"""Sigmas by which two cameras may differ about one print."""
 
 
 def advise(fit: StereoFit) -> StereoFit:
@@ -276,6 +279,7 @@ def advise(fit: StereoFit) -> StereoFit:
         *_about_solution(fit),
         *_about_sides(fit),
         *_about_board(fit),
+        *_about_stretch(fit),
         *_about_pairs(fit),
         *_about_epipolar(fit),
         *_about_cameras(fit),
@@ -325,6 +329,20 @@ def _about_board(fit: StereoFit) -> list[str]:
         f"the board is bowed by {along_x:+.3f}, {along_y:+.3f} mm (along x, along y), as each "
         "camera by itself shows: the pairs are solved with it; a flatter board is better",
     ]
+
+
+def _about_stretch(fit: StereoFit) -> list[str]:
+    """What both cameras by themselves say of the print, if they agree; else it is not the print."""
+    cameras = [side.single.fit for side in fit.sides if side.single.fit is not None]
+    if len(cameras) < len(fit.sides):
+        return []
+    stretch = np.array([camera.stretch for camera in cameras])
+    sigma = np.array([camera.stretch_sigma for camera in cameras])
+    if not np.isfinite(sigma).all() or abs(stretch[0] - stretch[1]) > AGREEING * np.hypot(*sigma):
+        return []
+    weight = sigma**-2 / (sigma**-2).sum()
+    points = np.concatenate([view.view.points_board_mm for own in cameras for view in own.views])
+    return about_stretch(float(weight @ stretch), float(np.sqrt(weight**2 @ sigma**2)), points)
 
 
 def _about_sides(fit: StereoFit) -> list[str]:

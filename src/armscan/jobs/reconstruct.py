@@ -27,7 +27,13 @@ from armscan.jobs.live.recordings import count_exposures, recording_mark, record
 from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
 from armscan.pipeline.cluster.extraction import ClusterAddress, ClusterReader
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
-from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of, stripes_as_seen
+from armscan.pipeline.measure import (
+    MeasureOptions,
+    Reconstruction,
+    cameras_of,
+    scan_as_seen,
+    stripes_for,
+)
 from armscan.pipeline.measure import reconstruct as reconstruct_images
 from armscan.pipeline.progress import StageClock
 from armscan.pipeline.scan import (
@@ -431,15 +437,10 @@ def _scan(
     if scanner.sensor is not None:
         cameras = cameras_of(scanner.sensor)
         seen = ScanInstants(recording, len(cameras))
-        stripes, about = stripes_as_seen(
-            len(seen.lit),
-            lambda k: seen.pair(seen.lit[k].rows[0]),
-            scanner.sensor,
-            options.measure.stripes,
-            job.cache,
-        )
-        options = replace(options, measure=replace(options.measure, stripes=stripes))
+        measure, about = scan_as_seen(seen, scanner.sensor, options.measure, job.cache)
+        options = replace(options, measure=measure)
         if cluster is not None:
+            stripes = stripes_for(scanner.sensor, measure.stripes)
             reader = ClusterReader(cluster, recording, cameras, stripes, job.cache)
     with scratch_folder(places[0]) as scratch, scan_spool(scanner, scratch) as points:
         scan = measure_long_scan(

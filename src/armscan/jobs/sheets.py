@@ -346,7 +346,14 @@ def _other_size(target: Target, parent: Provenance) -> tuple[str, ...]:
     same = all(known.get(f"{kind}.{name}") == str(getattr(target, name)) for name in COUNTS)
     name = next((name for name in SIZES if hasattr(target, name)), "")
     size = known.get(f"{kind}.{name}")
-    if not same or size is None or float(size) == target.size_mm:
+    if not same or size is None:
+        return ()
+    if float(known.get(f"{kind}.stretch", "1")) != getattr(target, "stretch", 1.0):
+        return (
+            "the camera was calibrated with another length from row to row of this board: give "
+            "both commands the same target",
+        )
+    if float(size) == target.size_mm:
         return ()
     return (
         f"the camera was calibrated with a board of {float(size):g} mm from point to point, this "

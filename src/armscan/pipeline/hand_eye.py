@@ -110,8 +110,7 @@ def observe_stripes(
         If the scan has no arm or not the sensor's cameras, if its images are not of the camera's
         sensor, or if one view stands for different poses.
     EstimationError
-        If no exposure has a pose, none of the images can be read, or the sheet of a stripe is
-        ambiguous.
+        If no exposure has a pose, or none of the images can be read.
     """
     options = options or MeasureOptions()
     poses = exposure_poses(source.rows, source.arm, source.session.clock)

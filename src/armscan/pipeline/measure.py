@@ -24,6 +24,7 @@ from armscan.models.camera import CameraModel
 from armscan.pipeline.instants import (
     ExposurePair,
     InstantImages,
+    ScanInstants,
     check_sizes,
     pair_exposures,
 )
@@ -61,8 +62,9 @@ TRIMMED_AFTER = 100
 """Instants after which the cache is kept small."""
 LEAST_APART_RAD = 0.5
 """Stripes whose directions differ by more are told from each other by direction."""
-LOOKED_AT = 5
-"""Images of a scan of which the channel is judged, evenly spread."""
+LOOKED_AT, LEAST_LINE = 10, 30
+"""Images of a scan of which the channel is judged, evenly spread, and points that make a line in
+one: a glint in a single image decides nothing."""
 LITTLE_SEEN = 0.7
 """Of the points that the laser's own channel shows: with fewer a difference of channels is left. On
 lit boards of three public sets a difference shows 0.8 to 12 times as many, of lines that are white
@@ -76,7 +78,9 @@ NOTHING_MEASURED_REMEDY = (
     "check that the images show a laser line, that camera and sheet are the right ones, and give a "
     "larger --depth-margin if the object stood further outside the calibrated depths"
 )
-OF_SEVERAL_SHEETS_REMEDY = "name the sheet with --sheet, or photograph one laser at a time"
+OF_SEVERAL_SHEETS_REMEDY = (
+    "photograph one laser at a time, or name its sheet with --sheet where one was on alone"
+)
 NO_REACH_REMEDY = (
     "if no surface lies outside the depths in which its line was calibrated, say so by "
     "--depth-margin 0"
@@ -309,7 +313,7 @@ def stripes_as_seen(
     if options.laser_colour != "auto" or not other:
         return calibrated, ""
     own = replace(calibrated, laser_colour=cast(LaserColour, channel))
-    n_own = n_calibrated = n_seen = 0
+    counts: list[tuple[int, int]] = []
     for k in sorted(
         {n * n_exposures // LOOKED_AT for n in range(LOOKED_AT)} & {*range(n_exposures)}
     ):
@@ -319,16 +323,35 @@ def stripes_as_seen(
             # the scan itself tells which it cannot read
             continue
         if lit.colour != "mono":
-            n_seen += 1
-            n_own += int(cached_profile(lit, own, dark, cache).is_accepted.sum())
-            n_calibrated += int(cached_profile(lit, calibrated, dark, cache).is_accepted.sum())
-    if n_calibrated >= LITTLE_SEEN * n_own:
+            n_own, n_calibrated = (
+                int(cached_profile(lit, way, dark, cache).is_accepted.sum())
+                for way in (own, calibrated)
+            )
+            if max(n_own, n_calibrated) >= LEAST_LINE:
+                counts.append((n_own, n_calibrated))
+    n_better = sum(1 for n_own, n in counts if n < LITTLE_SEEN * n_own)
+    total, total_calibrated = np.array(counts).reshape(-1, 2).sum(axis=0)
+    if 2 * n_better <= len(counts) or total_calibrated >= LITTLE_SEEN * total:
         return calibrated, ""
     return own, (
-        f"the stripes are taken in {channel}, which shows {n_own} points of them in {n_seen} "
+        f"the stripes are taken in {channel}, which shows {total} points of them in {len(counts)} "
         f"sampled images; {calibrated.laser_colour}, in which the sensor was calibrated, shows "
-        f"{n_calibrated}, for their middle is white: --laser-colour chooses otherwise"
+        f"{total_calibrated}, as of lines whose middle is white: --laser-colour chooses otherwise"
     )
+
+
+def scan_as_seen(
+    instants: ScanInstants,
+    sensor: SensorCalibration,
+    options: MeasureOptions,
+    cache: DetectionCache | None = None,
+) -> tuple[MeasureOptions, str]:
+    """`stripes_as_seen` of the first camera's exposures with a laser on, and why if it differs."""
+    lit = instants.lit
+    stripes, about = stripes_as_seen(
+        len(lit), lambda k: instants.pair(lit[k].rows[0]), sensor, options.stripes, cache
+    )
+    return (replace(options, stripes=stripes), about) if about else (options, "")
 
 
 def extract_profile(
@@ -436,12 +459,12 @@ def reconstruct(
     left = pair_exposures(exposures, backgrounds)
     _check_cameras(sensor, len(left), len(rights))
     cameras = [left] if sensor.second is None else [left, pair_exposures(rights, right_backgrounds)]
-    stripes, about = stripes_as_seen(len(left), left.__getitem__, sensor, options.stripes, cache)
-    options = replace(options, stripes=stripes)
     images: list[LabelledProfile] = []
     clouds: list[PointCloud] = []
     weak: list[str] = []
     labeller = labeller_for(sensor, options)
+    stripes, about = stripes_as_seen(len(left), left.__getitem__, sensor, options.stripes, cache)
+    options = replace(options, stripes=stripes)
     for instant in measure_instants(
         _stills(cameras, progress), labeller, sensor, options, is_pass=False, cache=cache
     ):
@@ -509,7 +532,8 @@ def nothing_measured(images: Sequence[StripeCounts], options: MeasureOptions) ->
         if (count := sum(image.count(status) for image in images))
     )
     remedy = NOTHING_MEASURED_REMEDY
-    if any(map(_is_of_several_sheets, images)):
+    n_several = sum(image.count(PointStatus.AMBIGUOUS) for image in images)
+    if n_several > 0.5 * (n_points - n_flagged):
         remedy = OF_SEVERAL_SHEETS_REMEDY
         if options.depths is None or options.depths.margin > 0.0:
             remedy += f"; {NO_REACH_REMEDY}"
@@ -592,7 +616,7 @@ def measurement_warnings(
     if empty:
         warnings.append(f"{len(empty)} images gave no point: {', '.join(empty[:LISTED])}")
     unnamed = [image.source for image, n in both if n == 0 and _is_of_several_sheets(image)]
-    if unnamed:
+    if unnamed and sensor.second is None:
         warnings.append(
             f"stripes of {len(unnamed)} images may be of more than one sheet, "
             f"{', '.join(unnamed[:LISTED])}: {OF_SEVERAL_SHEETS_REMEDY}"

@@ -31,6 +31,7 @@ from armscan.pipeline.measure import (
     measure_instants,
     measurement_warnings,
     nothing_measured,
+    scan_as_seen,
     summarised,
 )
 from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
@@ -257,11 +258,17 @@ def measure_scan(
     EstimationError
         If no exposure has a pose, or nothing was measured.
     """
+    options, about = options or ScanOptions(), ""
+    if scanner.sensor is not None:
+        seen = ScanInstants(source, len(cameras_of(scanner.sensor)))
+        measure, about = scan_as_seen(seen, scanner.sensor, options.measure, cache)
+        options = replace(options, measure=measure)
     with scan_spool(scanner) as points:
         scan = measure_long_scan(
             source, scanner, points, options, progress=progress, cache=cache, most_images=None
         )
         cloud = points.cloud()
+    scan = replace(scan, warnings=(*filter(None, [about]), *scan.warnings))
     marks = scan.cloud
     cloud = replace(
         cloud,

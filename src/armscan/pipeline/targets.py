@@ -96,7 +96,7 @@ def wrong_count(found: Sequence[TargetView | FitFailure], target: Target) -> Fit
     asked = sorted((target.columns, target.rows), reverse=True)
     is_by_squares = asked == [columns + 1, rows + 1]
     why = "; it looks as if squares were counted" if is_by_squares else ""
-    right = format_target(replace(target, columns=columns, rows=rows))
+    right = format_target(replace(target, columns=columns, rows=rows, stretch=1.0))
     return FitFailure(
         f"{n_usual} of the first {len(found)} images show a board of {columns} x {rows} points, "
         f"none one of {target.columns} x {target.rows}{why}",

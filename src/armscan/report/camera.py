@@ -95,9 +95,20 @@ def camera_quantities(fit: CameraFit, n_images: int) -> tuple[Quantity, ...]:
         ),
         Quantity("sigma_point_px", "", fit.sigma_point_px),
         Quantity("covered_fraction", "", fit.coverage.fraction),
+        *_stretch_quantities(fit),
         hold_out_quantity(held_out, "images"),
         *parameter_quantities(fit),
         *(bow_quantities(fit.warp.bow_mm) if fit.warp is not None else ()),
+    )
+
+
+def _stretch_quantities(fit: CameraFit) -> tuple[Quantity, ...]:
+    """Of the print from row to row, as a part; nothing where the views do not tell."""
+    if not math.isfinite(fit.stretch_sigma):
+        return ()
+    return (
+        Quantity("stretch", "", fit.stretch),
+        Quantity("stretch_sigma", "", fit.stretch_sigma),
     )
 
 

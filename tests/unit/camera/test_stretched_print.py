@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armscan.calibration.cameras.calibrate import calibrate_camera
-from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.calibration.cameras.result import CameraFit, CameraOptions, reasons_to_refuse
 from armscan.geometry.estimate import FitFailure
 from armscan.vision.targets.target import TargetView
 from rigs.camera_scene import CAMERA, GRID, Scene, make_views, normalised_error
@@ -56,11 +56,26 @@ def test_a_print_that_is_given_as_it_is_leaves_nothing() -> None:
     assert silent.rms_px > 1.2 * said.rms_px
 
 
+@pytest.mark.parametrize("stretch", [1.0, 1.1])
+def test_a_print_that_is_far_off_is_refused_and_can_be_forced(stretch: float) -> None:
+    reasons = reasons_to_refuse(solved(views_of(stretch, 2)))
+    assert any("1.10 times as far apart" in reason for reason in reasons) is (stretch > 1.0)
+
+
+def test_with_a_fixed_aspect_nothing_is_told() -> None:
+    """Pixels that are not quite square would pass for the print."""
+    options = replace(OPTIONS, is_aspect_fixed=True)
+    fit = calibrate_camera(views_of(1.0, 1), options)
+    assert isinstance(fit, CameraFit)
+    assert not warned(fit)
+
+
 def test_cells_that_are_no_squares_are_named_where_no_camera_fits() -> None:
     """A page fitted to another format: the views look parallel, or show no focal length."""
-    refusal = calibrate_camera(views_of(1.58, 1), OPTIONS)
-    assert isinstance(refusal, FitFailure)
-    told = float(refusal.reason.split("rows lie ")[1].split()[0])
+    fit = calibrate_camera(views_of(1.58, 1), OPTIONS)
+    reasons = (fit.reason,) if isinstance(fit, FitFailure) else reasons_to_refuse(fit)
+    (said,) = [text for text in reasons if "times as far apart" in text]
+    told = float(said.split(" times as far apart")[0].split()[-1])
     assert told == pytest.approx(1.58, abs=0.03), "of views with distortion, taken for a pinhole's"
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Boards agree on a sheet; lines that are straight and elsewhere are outvoted and named."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,15 @@ import pytest
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.calibrate import calibrate_sheets
-from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, SheetOptions
+from armscan.calibration.sheets.result import (
+    BoardDistances,
+    BoardPointCheck,
+    BoardStripes,
+    LaserFit,
+    PointUse,
+    SheetOptions,
+    SheetPointCheck,
+)
 from armscan.calibration.sheets.voting import observe_boards
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
@@ -129,6 +138,24 @@ def test_a_stripe_beside_the_print_is_used_where_the_boards_agree_on_it() -> Non
     assert np.sqrt((missed**2).mean()) < 4.0 * fit.sheets[0].offset_sigma_mm
     strict = calibrate_sheets(boards, rig.calibration(rig.camera), SheetOptions(margin_mm=0.0))
     assert not isinstance(strict, LaserFit)
+
+
+def test_points_beyond_what_is_claimed_of_left_out_boards_are_warned_of() -> None:
+    claimed = BoardDistances(9, 0.0, 1.0, 1.0, 1.0)
+    for n, ratio, is_said in ((6, 2.0, False), (6, 2.6, True), (60, 1.6, True), (60, 1.4, False)):
+        boards = tuple(BoardPointCheck(f"{k}.png", 300.0, claimed, claimed) for k in range(n))
+        check = SheetPointCheck(claimed, ratio, 1.0, boards)
+        assert bool(check.warnings) is is_said
+        assert all(f"{ratio:.1f} times as large" in text for text in check.warnings)
+    unknown = SheetPointCheck(claimed, math.nan, math.nan, ())
+    assert unknown.warnings == ()
+
+
+def test_the_warning_reaches_the_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SheetPointCheck, "warnings", ("beyond",))
+    rig = thesis_rig()
+    fit = fitted(rig, rig.boards(rig.camera, np.random.default_rng(1)))
+    assert all("beyond" in sheet.warnings for sheet in fit.sheets)
 
 
 @pytest.mark.parametrize("bow_mm", [0.0, 0.15])

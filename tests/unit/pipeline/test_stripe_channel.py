@@ -12,6 +12,7 @@ from armscan.calibration.sheets.board_points import HeadCameras, SeenBoard
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, SheetOptions
 from armscan.calibration.sheets.voting import choose_print, rank_channels
+from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import LaserColour
@@ -219,11 +220,36 @@ def test_a_scan_is_seen_in_the_channel_that_shows_its_lines(
         image += narrow[:, :, None] * 300.0 + wide[:, :, None] * np.array([0.0, 60.0, 0.0])
     seen = Exposure(np.clip(image, 0, 255).round().astype(np.uint8), "scan.png")
     sensor = replace(sensor_calibration(), laser_colour="green-excess")
-    stripes, about = stripes_as_seen(7, lambda _: (seen, None), sensor, StripeOptions())
+
+    def pair_of(k: int) -> tuple[Exposure, None]:
+        if k == 0:
+            raise InputError("cut off")
+        return seen, None
+
+    stripes, about = stripes_as_seen(7, pair_of, sensor, StripeOptions())
     assert stripes.laser_colour == expected
     assert bool(about) is (expected == "green")
+    own = stripes_as_seen(7, pair_of, replace(sensor, laser_colour="green"), StripeOptions())
+    assert own == (StripeOptions(laser_colour="green"), ""), "nothing is looked at"
     chosen = StripeOptions(laser_colour="red")
     assert stripes_as_seen(7, lambda _: (seen, None), sensor, chosen) == (chosen, "")
+
+
+def test_a_glint_in_one_image_of_a_scan_does_not_change_its_channel() -> None:
+    y, x = np.mgrid[:200, :320].astype(np.float64)
+    wall = np.where((x // 24) % 2 > 0, 48.0, 120.0)[:, :, None] * np.ones(3)
+    line = np.exp(-0.5 * ((y - 90.3 - 0.05 * x) / 2.0) ** 2)[:, :, None] * [0.0, 70.0, 0.0]
+    glint = np.exp(-0.5 * ((y - 60.0) / 2.0) ** 2) * (np.abs(x - 100.0) < 40.0)
+    rng = np.random.default_rng(4)
+
+    def pair_of(k: int) -> tuple[Exposure, None]:
+        light = line if k else glint[:, :, None] * [255.0, 400.0, 255.0]
+        image = wall + light + rng.normal(0.0, 1.0, (*x.shape, 3))
+        return Exposure(np.clip(image, 0, 255).round().astype(np.uint8), f"{k}.png"), None
+
+    sensor = replace(sensor_calibration(), laser_colour="green-excess")
+    stripes, about = stripes_as_seen(6, pair_of, sensor, StripeOptions())
+    assert (stripes.laser_colour, about) == ("green-excess", "")
 
 
 def cut_to(board: BoardStripes, n: int, scatter_px: float, seed: int) -> BoardStripes:

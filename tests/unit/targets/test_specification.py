@@ -62,6 +62,7 @@ def test_every_example_is_right(kind: str) -> None:
         ("chessboard:11x6:13x", "no square"),
         ("chessboard:11x6:13x14x15", "no square"),
         ("chessboard:8x8:13x14", "no image tells which"),
+        ("chessboard:11x6:1.3cmx1.31", "too unlike"),
         ("charuco:10x7:4x4.1:3:DICT_4X4_50", "no square"),
         ("circle-grid:11x9:ten", "no pitch"),
         ("charuco:10x7:4:3", "needs 4 fields"),

@@ -191,7 +191,10 @@ def assemble(
     found = board_residuals(solution)
     target_error = estimate_target_error(found)
     design = design_effect(solution)
-    stretch, stretch_sigma = print_stretch(solution, options.max_steps)
+    stretch, stretch_sigma = 0.0, np.inf
+    if not options.is_aspect_fixed:
+        # with fy held to fx, pixels that are not square would pass for the print's stretch
+        stretch, stretch_sigma = print_stretch(solution, options.max_steps)
     sigma0_squared = solution.variance_factor * design.widening
     shift = np.zeros(len(unit))
     if chosen.untested:
@@ -417,14 +420,19 @@ def calibrate_camera(
             break
         prepared, chosen = smaller, again
     fit = assemble(views, prepared, chosen, misfits(chosen.solution), options)
-    if isinstance(fit, FitFailure) or rms_reasons(fit.camera, fit.rms_px):
+    if isinstance(fit, FitFailure):
         return fit if (told := _of_other_cells(views, prepared)) is None else told
-    return fit
+    stretch = _seen_stretch(views, prepared) if rms_reasons(fit.camera, fit.rms_px) else None
+    return fit if stretch is None else replace(fit, stretch=stretch - 1.0, stretch_sigma=0.0)
+
+
+def _seen_stretch(views: Sequence[TargetView], prepared: PreparedViews) -> float | None:
+    return seen_stretch(prepared.homographies, views[0].width_px, views[0].height_px)
 
 
 def _of_other_cells(views: Sequence[TargetView], prepared: PreparedViews) -> FitFailure | None:
     """Asked where no camera fits: whether one does if the target's cells are no squares."""
-    stretch = seen_stretch(prepared.homographies, views[0].width_px, views[0].height_px)
+    stretch = _seen_stretch(views, prepared)
     if stretch is None:
         return None
     return FitFailure(

@@ -60,7 +60,7 @@ _WHOLE = 0.95
 _PROBES = (0.12, 0.2, 0.28)
 """Steps from the corners along both lines: near, so that what covers a board has to end within
 this much of one of its lines in order to be taken for its end."""
-_OUTWARD = (0.25, 0.35)
+_OUTWARD = (0.2, 0.28)
 """Steps beyond the outermost corners at which their squares have to be there: the fit's reach."""
 _ALTERNATES = 0.5
 """Least difference between squares, of the difference beside them, that is one."""
@@ -316,7 +316,7 @@ MIN_SEEN_FRACTION = 0.4
 MIN_GOOD_FRACTION = 0.7
 """Least fraction of the corners found that the sub-pixel fit must accept: of all, or of those
 within the outermost ring, which cut squares or a clip at the board's edge may spoil."""
-LEAST_JUDGED = 9
+LEAST_JUDGED = 6
 MAX_SCATTER = 0.03
 """Largest scatter about a smooth lattice, as a fraction of a step: more is no flat board."""
 PRINT_ERROR = 0.02
@@ -523,10 +523,10 @@ def _refusal(exposure: Exposure, target: Chessboard, corners: _Corners) -> FitFa
     last = (target.columns - 1, target.rows - 1)
     is_inner = ((corners.cells > 0) & (corners.cells < last)).all(axis=1)
     inner = corners.is_good[is_inner]
-    is_board = n_good >= MIN_GOOD_FRACTION * len(corners.cells) or (
-        len(inner) >= LEAST_JUDGED and inner.mean() >= MIN_GOOD_FRACTION
-    )
-    if n_good < MIN_SEEN_FRACTION * n_all or not is_board:
+    n_inner = max(LEAST_JUDGED, MIN_SEEN_FRACTION * (last[0] - 1) * (last[1] - 1))
+    is_inside = len(inner) >= n_inner and inner.mean() >= MIN_GOOD_FRACTION
+    least = max(MIN_SEEN_FRACTION * n_all, MIN_GOOD_FRACTION * len(corners.cells))
+    if n_good < least and not is_inside:
         return FitFailure(
             f"{exposure.source}: only {n_good} of {n_all} chessboard corners are "
             "crossings of two straight edges",

@@ -98,9 +98,15 @@ def predict_print(
     return replace(exposure, image=predicted.reshape(exposure.image.shape)) if is_told else None
 
 
+MOST_STRETCHED = 0.1
+"""Cells are taken for square."""
+
+
 def does_repeat(target: Target) -> bool:
     """Whether a target's print is the same in cells enough to be told from them."""
-    return not isinstance(target, Charuco) and min(np.bincount(_kinds(target))) >= LEAST_CELLS
+    if isinstance(target, Charuco) or abs(target.stretch - 1.0) > MOST_STRETCHED:
+        return False
+    return bool(min(np.bincount(_kinds(target))) >= LEAST_CELLS)
 
 
 def _kinds(target: Target) -> IntArray:

@@ -143,6 +143,7 @@ EXAMPLES = {
 SMALLEST_UNASKED_MM = 0.1
 """A smaller length without a unit is asked about: it was likely meant in metres."""
 _UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+MOST_STRETCH = 2.0
 _MIN_COUNT = {"circle-grid": 3, "asymmetric-circle-grid": 2, "chessboard": 3, "charuco": 3}
 
 
@@ -183,6 +184,8 @@ def parse_target(text: str) -> Target:
         _length_mm(text, kind, name, part) for part in re.split("[xX]", fields[1], maxsplit=1)
     ]
     stretch = lengths[-1] / lengths[0]
+    if not MOST_STRETCH**-1 <= stretch <= MOST_STRETCH:
+        raise _wrong(text, kind, f"lengths of {lengths[0]:g} and {lengths[1]:g} mm are too unlike")
     if stretch != 1.0 and columns == rows:
         raise _wrong(text, kind, "of as many columns as rows no image tells which length is which")
     if kind == "chessboard":

@@ -51,14 +51,11 @@ def run_naming(
             wrong += int((is_named & (found.sheet != truth)).sum())
             named, asked = named + int(is_named.sum()), asked + len(profile)
     except ArmscanError as error:
-        yield Outcome(stage, "wrongly refused", str(error), seconds=time.process_time() - begun)
-        return
-    if not named:
         # What several lines in one image are, nothing but their depth tells.
         result = "rightly refused" if len(lights) > 1 and not is_cross else "wrongly refused"
-        yield Outcome(stage, result, found.reason, seconds=time.process_time() - begun)
+        yield Outcome(stage, result, str(error), seconds=time.process_time() - begun)
         return
-    share = wrong / named
+    share = wrong / max(named, 1)
     yield Outcome(
         stage,
         "right" if share < MOST_WRONG else "wrong",

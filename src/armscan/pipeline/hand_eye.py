@@ -110,7 +110,8 @@ def observe_stripes(
         If the scan has no arm or not the sensor's cameras, if its images are not of the camera's
         sensor, or if one view stands for different poses.
     EstimationError
-        If no exposure has a pose, or none of the images can be read.
+        If no exposure has a pose, none of the images can be read, or the sheet of a stripe is
+        ambiguous.
     """
     options = options or MeasureOptions()
     poses = exposure_poses(source.rows, source.arm, source.session.clock)
@@ -198,6 +199,8 @@ def observe_plate(
     ------
     InputError
         If the scan has not the sensor's cameras, or its images are not of the camera's sensor.
+    EstimationError
+        If the sheet of a stripe is ambiguous.
     """
     options = options or MeasureOptions()
     scan = ScanInstants(source, len(cameras_of(sensor)))

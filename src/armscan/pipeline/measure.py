@@ -78,13 +78,6 @@ NOTHING_MEASURED_REMEDY = (
     "check that the images show a laser line, that camera and sheet are the right ones, and give a "
     "larger --depth-margin if the object stood further outside the calibrated depths"
 )
-OF_SEVERAL_SHEETS_REMEDY = (
-    "photograph one laser at a time, or name its sheet with --sheet where one was on alone"
-)
-NO_REACH_REMEDY = (
-    "if no surface lies outside the depths in which its line was calibrated, say so by "
-    "--depth-margin 0"
-)
 RULE_OF_ROWS_REMEDY = (
     "give the recording of a scan, with scanner.json, that has each laser alone before both "
     "(column lasers of exposures.csv), or leave --method thesis out"
@@ -214,6 +207,8 @@ def measure_instants(
     ------
     InputError
         If an image is not of its camera's sensor.
+    EstimationError
+        If the sheet of a stripe is ambiguous.
     """
     clock = clock or StageClock()
     depths = options.accepted_depths(sensor)
@@ -453,7 +448,7 @@ def reconstruct(
         If images and backgrounds do not pair, are not of the camera's sensor, or if the images are
         not of as many cameras as the sensor has.
     EstimationError
-        If nothing was measured at all.
+        If the sheet of a stripe is ambiguous, or nothing was measured at all.
     """
     options = options or MeasureOptions()
     left = pair_exposures(exposures, backgrounds)
@@ -476,7 +471,7 @@ def reconstruct(
     cloud = merge_clouds(clouds)
     if len(cloud) == 0:
         counts = [image.counts for image in images]
-        raise nothing_measured(counts, options)
+        raise nothing_measured(counts, is_by_thesis=options.is_by_thesis)
     depths = SheetDepths.of(sensor)
     SheetDepths.add(depths, cloud.sheet, cloud.points_mm[:, 2])
     counts = [image.counts for image in images]
@@ -508,7 +503,9 @@ def _check_cameras(sensor: SensorCalibration, n_left: int, n_right: int) -> None
         )
 
 
-def nothing_measured(images: Sequence[StripeCounts], options: MeasureOptions) -> EstimationError:
+def nothing_measured(
+    images: Sequence[StripeCounts], *, is_by_thesis: bool = False
+) -> EstimationError:
     """Why these images gave no point at all, to be raised."""
     n_points = sum(map(len, images))
     if n_points == 0:
@@ -519,7 +516,7 @@ def nothing_measured(images: Sequence[StripeCounts], options: MeasureOptions) ->
         sum(image.count(status) for image in images)
         for status in (PointStatus.STRAY, PointStatus.FLAGGED)
     )
-    if options.is_by_thesis and n_stray and n_stray + n_flagged == n_points:
+    if is_by_thesis and n_stray and n_stray + n_flagged == n_points:
         return EstimationError(
             f"the rule of rows gave none of {n_stray} stripe points to a sheet: it compares them "
             "with the rows of earlier exposures of one laser alone",
@@ -531,21 +528,10 @@ def nothing_measured(images: Sequence[StripeCounts], options: MeasureOptions) ->
         for status in PointStatus
         if (count := sum(image.count(status) for image in images))
     )
-    remedy = NOTHING_MEASURED_REMEDY
-    n_several = sum(image.count(PointStatus.AMBIGUOUS) for image in images)
-    if n_several > 0.5 * (n_points - n_flagged):
-        remedy = OF_SEVERAL_SHEETS_REMEDY
-        if options.depths is None or options.depths.margin > 0.0:
-            remedy += f"; {NO_REACH_REMEDY}"
     return EstimationError(
-        f"none of {n_points} stripe points could be measured: {counts}", remedy=remedy
+        f"none of {n_points} stripe points could be measured: {counts}",
+        remedy=NOTHING_MEASURED_REMEDY,
     )
-
-
-def _is_of_several_sheets(image: StripeCounts) -> bool:
-    """True if that is why it gave no point."""
-    n_asked = len(image) - image.count(PointStatus.FLAGGED)
-    return image.count(PointStatus.AMBIGUOUS) > 0.5 * n_asked
 
 
 def summarised(warnings: Sequence[str]) -> tuple[str, ...]:
@@ -615,12 +601,6 @@ def measurement_warnings(
     empty = [image.source for image, n in both if n == 0]
     if empty:
         warnings.append(f"{len(empty)} images gave no point: {', '.join(empty[:LISTED])}")
-    unnamed = [image.source for image, n in both if n == 0 and _is_of_several_sheets(image)]
-    if unnamed and sensor.second is None:
-        warnings.append(
-            f"stripes of {len(unnamed)} images may be of more than one sheet, "
-            f"{', '.join(unnamed[:LISTED])}: {OF_SEVERAL_SHEETS_REMEDY}"
-        )
     doubtful = [image.source for image, n in both if 0 < n < CLEAN_SHARE * len(image)]
     if doubtful:
         warnings.append(

@@ -256,7 +256,7 @@ def measure_scan(
         If the scanner has no camera, the scan no arm or not as many cameras as the scanner, or an
         image is not of the scanner's sensor.
     EstimationError
-        If no exposure has a pose, or nothing was measured.
+        If no exposure has a pose, the sheet of a stripe is ambiguous, or nothing was measured.
     """
     options, about = options or ScanOptions(), ""
     if scanner.sensor is not None:
@@ -539,7 +539,7 @@ def _nothing_placed(
             f"all {n_outside} measured points lie outside the volume {options.volume}",
             remedy="give limits in mm in the arm's base frame, or none",
         )
-    return nothing_measured(found.counts, options.measure)
+    return nothing_measured(found.counts, is_by_thesis=options.measure.is_by_thesis)
 
 
 def _add_normals(

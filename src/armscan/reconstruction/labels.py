@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from armscan.errors import OptionError
+from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import ArrayRecord, BoolArray, IntArray, ints
 from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
@@ -234,7 +234,13 @@ class SingleLabeller:
         base_from_sensor: Pose[Base, Sensor] | None = None,
         t_ns: int = 0,
     ) -> LabelledInstant:
-        """See `StripeLabeller`; pose and time do not matter."""
+        """See `StripeLabeller`; pose and time do not matter.
+
+        Raises
+        ------
+        EstimationError
+            If the depth leaves more than one sheet possible for all that could be labelled.
+        """
         (profile,) = profiles
         names = [sheet.name for sheet in self.sensor.sheets]
         known = [names.index(name) for name in lasers if name in names]
@@ -276,17 +282,25 @@ class SingleLabeller:
                 continue
             sheet[in_segment], status[in_segment] = best, PointStatus.MEASURED
         found = np.unique(sheet[sheet >= 0]).tolist()
+        if ambiguous and not found:
+            remedy = "name the sheet with --sheet, or photograph one laser at a time"
+            if self.reach.margin > 0.0:
+                remedy += (
+                    "; if no surface lies outside the depths in which its line was calibrated, say "
+                    "so by --depth-margin 0"
+                )
+            raise EstimationError(
+                f"{len(ambiguous)} stripe segments may belong to more than one light sheet "
+                f"({ambiguous[0]}), and none belongs to one alone",
+                where=profile.source,
+                remedy=remedy,
+            )
         reason = "no sheet puts a stripe into the depths accepted"
         if found:
             reached_by = ", ".join(self._reach(k) for k in found)
             reason = f"the only sheet that reaches the stripe: {reached_by}"
-        if ambiguous and found:
+        if ambiguous:
             reason += "; what others reach, too, is left out: --sheet names one"
-        elif ambiguous:
-            reason = (
-                f"{len(ambiguous)} stripe segments may belong to more than one sheet "
-                f"({ambiguous[0]}), and none belongs to one alone"
-            )
         return _labelled(profile, sheet, status, reason)
 
     def _shares(self, inside: dict[int, float]) -> str:

@@ -4,11 +4,11 @@
 import numpy as np
 import pytest
 
-from armscan.errors import OptionError
+from armscan.errors import EstimationError, OptionError
 from armscan.models.calibration import SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.pipeline.measure import MeasureOptions, labeller_for, nothing_measured
+from armscan.pipeline.measure import MeasureOptions, labeller_for
 from armscan.reconstruction.labels import LabelledProfile, PointStatus, SingleLabeller
 from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.profile import Profile, StripeFlag
@@ -125,19 +125,14 @@ def test_what_another_sheet_reaches_beyond_its_own_depths_is_dropped() -> None:
     assert choice.sheet.tolist() == [-1] * 40 + [1] * 40
     assert choice.count(PointStatus.AMBIGUOUS) == 40
     assert "others reach" in choice.reason
-    alone = labelled(stripes(IN_LEFT), sensor, within, reach=DepthRange(0.5))
-    assert "left 100%, right 100%" in alone.reason
-    assert alone.count(PointStatus.AMBIGUOUS) == 40
-    assert set(alone.sheet.tolist()) == {-1}
+    with pytest.raises(EstimationError, match="left 100%, right 100%"):
+        labelled(stripes(IN_LEFT), sensor, within, reach=DepthRange(0.5))
 
 
 def test_others_are_looked_for_beyond_the_depths_accepted_unless_a_margin_is_given() -> None:
     sensor, both = two_sheets((290.0, 320.0)), stripes(IN_LEFT)
-    (open_to_all,) = labeller_for(sensor, MeasureOptions()).label([both]).profiles
-    assert open_to_all.count(PointStatus.AMBIGUOUS) == 40
-    assert "--depth-margin 0" in (
-        nothing_measured([open_to_all.counts], MeasureOptions()).remedy or ""
-    )
+    with pytest.raises(EstimationError, match="--depth-margin 0"):
+        labeller_for(sensor, MeasureOptions()).label([both])
     (given,) = labeller_for(sensor, MeasureOptions(depths=DepthRange(0.0))).label([both]).profiles
     assert set(given.sheet.tolist()) == {0}
 
@@ -153,13 +148,8 @@ def test_no_reach_leaves_the_calibrated_depths_to_decide() -> None:
 
 
 def test_a_stripe_that_both_sheets_put_in_range_is_not_guessed() -> None:
-    choice = labelled(stripes(0.0), two_sheets(), DepthRange())
-    assert set(choice.sheet.tolist()) == {-1}
-    options = MeasureOptions(depths=DepthRange(0.0))
-    remedy = nothing_measured([choice.counts], options).remedy
-    assert remedy is not None
-    assert "--sheet" in remedy
-    assert "margin" not in remedy, "it was given"
+    with pytest.raises(EstimationError, match="--sheet"):
+        labelled(stripes(0.0), two_sheets(), DepthRange())
 
 
 def test_a_stripe_in_no_range_gets_no_sheet() -> None:

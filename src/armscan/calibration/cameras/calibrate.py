@@ -191,10 +191,9 @@ def assemble(
     found = board_residuals(solution)
     target_error = estimate_target_error(found)
     design = design_effect(solution)
-    stretch, stretch_sigma = 0.0, np.inf
-    if not options.is_aspect_fixed:
-        # with fy held to fx, pixels that are not square would pass for the print's stretch
-        stretch, stretch_sigma = print_stretch(solution, options.max_steps)
+    # with fy held to fx, pixels that are not square would pass for the print's stretch
+    is_told = not options.is_aspect_fixed
+    stretch = print_stretch(solution, options.max_steps) if is_told else (0.0, np.inf)
     sigma0_squared = solution.variance_factor * design.widening
     shift = np.zeros(len(unit))
     if chosen.untested:
@@ -241,8 +240,8 @@ def assemble(
         warp=warp,
         model_reason=chosen.reason,
         design_effect=design.widening,
-        stretch=stretch,
-        stretch_sigma=stretch_sigma,
+        stretch=stretch[0],
+        stretch_sigma=stretch[1],
         warnings=(),
         options=options,
     )

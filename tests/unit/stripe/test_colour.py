@@ -45,6 +45,25 @@ def test_saturated_core_with_halo(overdrive: float) -> None:
     assert (np.abs(error) < 5.0 * good.sigma_px).all()
 
 
+def test_glow_that_fills_the_lasers_own_channel_leaves_the_others() -> None:
+    rng = np.random.default_rng(8)
+    y, x = np.mgrid[:240, :320]
+    distance = (y - 100.0 - 0.2 * x) / np.hypot(1.0, 0.2)
+    core = 700.0 * np.exp(-0.5 * (distance / 3.0) ** 2)
+    # what the surface scatters, more of it on one side
+    glow = 900.0 * np.exp(-0.5 * ((distance - 2.0) / 10.0) ** 2)
+    light = np.stack([core + glow, core, 0.9 * core], axis=2) + 8.0
+    image = np.clip(light + rng.normal(0.0, 1.5, light.shape), 0.0, 255.0).astype(np.uint8)
+    profile = extract_stripes(Exposure(image, "glow"), StripeOptions(laser_colour="red"))
+    good = profile.select(profile.is_accepted)
+    column, row = good.points_px.T
+    error = (row - 100.0 - 0.2 * column) / np.hypot(1.0, 0.2)
+    assert (image[..., 0] == 255).mean() > 0.1
+    assert len(good) > 290
+    assert np.abs(error.mean()) < 0.02
+    assert (np.abs(error) < 5.0 * good.sigma_px).all()
+
+
 def test_line_of_another_colour_is_left_out() -> None:
     laser = SCENE.expose_red(3, overdrive=1.0).image.copy()
     other = StripeScene((line(10.0),), 320, 240).expose(4).image

@@ -452,6 +452,9 @@ SATURATED_SHARE = 0.12
 LEAST_CORE_HEIGHT = 8.0
 """A channel shows the core if it rises by this much above its surroundings there."""
 LINE_SHARE = 0.4
+FLAT_RISE = 50.0
+"""Of 255: photographs of strangers have rises of 0 to 42, in which the two other channels give two
+to ten times as many points, and of 61 to 200, in which they give fewer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -509,8 +512,9 @@ def colour_plane(
     Of ``auto``, the colour is found in this one image. For a colour, the laser's own channel is
     used; where its core is saturated, the least saturated channel that still shows the core is
     added: it rises where the first has reached its limit, while the halo and dim parts of the line
-    stay with the laser's colour; only ridges with the laser's colour around them count. For a
-    difference, what the channels have in common, the room's light on a printed pattern, cancels.
+    stay with the laser's colour; where it is flat far around the core, the two others stand for it;
+    only ridges with the laser's colour around them count. For a difference, what the channels have
+    in common, the room's light on a printed pattern, cancels.
     """
     images = split_channels(exposure, background)
     factor = exposure.full_scale / NORMAL_SCALE
@@ -528,10 +532,8 @@ def colour_plane(
     if colour not in CHANNELS:
         image = _difference(images, colour)
     else:
-        image, gate = images.channels[own], colour_excess(images, colour)
-        core = _core_channel(images, gate, own)
-        if core is not None:
-            image, clipped = image + images.channels[core], images.clipped[core]
+        gate = colour_excess(images, colour)
+        image, clipped = _shown_line(images, gate, own)
     return StripePlane(
         image=image,
         clipped=clipped,
@@ -550,16 +552,36 @@ def _difference(images: ColourImages, colour: LaserColour) -> FloatImage:
     return images.channels[CHANNELS.index(first)] - images.channels[CHANNELS.index(second)]
 
 
-def _core_channel(images: ColourImages, excess: FloatImage, own: int) -> int | None:
-    """The channel that shows a core in which the laser's own is saturated; None if none is."""
+def _shown_line(images: ColourImages, excess: FloatImage, own: int) -> tuple[FloatImage, MaskImage]:
+    """(H, W) sum of the channels that show the line, and where it no longer rises."""
+    image, clipped = images.channels[own], images.clipped[own]
     s = RIDGE_STEP_PX
     ridge = ridge_height(excess)
-    if not ridge.size or images.clipped[own].size == 1:
-        return None
-    line = ridge > LINE_SHARE * float(np.quantile(ridge, RIDGE_QUANTILE))
-    core = line & (images.clipped[own][s:-s, s:-s] > 0)
-    if core.sum() <= SATURATED_SHARE * line.sum():
-        return None
+    if not ridge.size or clipped.size == 1:
+        return image, clipped
+    least = LINE_SHARE * float(np.quantile(ridge, RIDGE_QUANTILE))
+    line, full = ridge > least, clipped[s:-s, s:-s] > 0
+    first, second = (k for k in range(3) if k != own)
+    others = images.channels[first] + images.channels[second]
+    # a core that is white has no excess
+    white = full & (ridge_height(others) > least)
+    if white.sum() > SATURATED_SHARE * line.sum() and _is_flat(image, white):
+        return others, np.minimum(images.clipped[first], images.clipped[second])
+    halo = line & full
+    core = _core_channel(images, halo, own) if halo.sum() > SATURATED_SHARE * line.sum() else None
+    return (
+        (image, clipped) if core is None else (image + images.channels[core], images.clipped[core])
+    )
+
+
+def _is_flat(image: FloatImage, where: BoolArray) -> bool:
+    """True where a saturated channel hardly rises: the halo beside the line has filled it, too."""
+    return float(np.median(ridge_height(image)[where])) < FLAT_RISE
+
+
+def _core_channel(images: ColourImages, core: BoolArray, own: int) -> int | None:
+    """The channel that shows a core in which the laser's own is saturated; None if none does."""
+    s = RIDGE_STEP_PX
     heights = [float(np.median(ridge_height(c)[core])) for c in images.channels]
     shares = [float(m[s:-s, s:-s][core].mean()) if m.size > 1 else 0.0 for m in images.clipped]
     others = [k for k in range(3) if k != own and heights[k] > LEAST_CORE_HEIGHT]

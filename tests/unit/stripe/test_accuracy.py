@@ -3,7 +3,10 @@
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
+from armscan.records.exposure import Exposure
+from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
 from rigs.stripe_image import (
     NO_NOISE,
@@ -102,6 +105,25 @@ def test_saturated_line_is_fitted_on_its_flanks() -> None:
     result = score(StripeScene((line(20.0, peak=700.0),), 320, 240), SEEDS)
     assert result.rms_px < NOISE_LIMIT_PX
     assert abs(result.error_px.mean()) < BIAS_LIMIT_PX
+
+
+@pytest.mark.parametrize("sigma_px", [0.3, 0.4, 0.5, 0.6])
+@pytest.mark.parametrize("peak", [120.0, 220.0, 500.0])
+def test_line_thinner_than_its_pixels_is_complete(sigma_px: float, peak: float) -> None:
+    """Of 500 one or two pixels are clipped: two are left beside them for centre, height, width."""
+    rng = np.random.default_rng(1)
+    row, column = np.mgrid[:480, :640]
+    centre = 240.0 + 30.0 * np.sin(column / 90.0)
+    edges = (ndtr((row + side - centre) / sigma_px) for side in (0.5, -0.5))
+    light = peak * np.sqrt(2.0 * np.pi) * sigma_px * np.subtract(*edges)
+    image = np.clip(15.0 + light + rng.normal(0.0, 1.5, light.shape), 0.0, 255.0)
+    profile = extract_stripes(Exposure(image.round().astype(np.uint8), "thin"))
+    good = profile.select(profile.is_accepted)
+    x, y = good.points_px.T
+    error = y - 240.0 - 30.0 * np.sin(x / 90.0)
+    assert len(good) > 630
+    assert 0.5 < np.sqrt(np.mean((error / good.sigma_px) ** 2)) < 1.5
+    assert np.sqrt((error**2).mean()) < NOISE_LIMIT_PX
 
 
 def test_weak_line_is_complete() -> None:

@@ -30,11 +30,16 @@ SIDE_FAR = 5.3
 SIDE_SPAN = SIDE_NEAR + SIDE_FAR
 ITERATIONS = 12
 LEAST_PIXELS = 5
+LEAST_HALF_PX = 2.5
+"""Of the window, so that it holds as many pixels wherever the centre lies."""
 CENTRE, AMPLITUDE, SIGMA, VARIANCE, SKEW, SKEW_NORM, CLIPPED, BEND_GAIN = range(8)
 FIT_COLUMNS = 8
 """Columns of a fit result."""
 
 
+WIDTH_WEIGHT = 4.0
+"""Of the logarithm of a width over the typical one, which is known beforehand to a half: where
+clipping or a thin line leaves two or three pixels, these tell a centre only beside a width."""
 FOOT_SIGMAS = 3.2
 LEAST_REACH_SIGMAS = 1.4
 """The window shrinks beside another line, so that its foot stays outside."""
@@ -288,6 +293,8 @@ def accumulate(pixels: Row, pixel: int, noise: Row, lanes: RowOut) -> None:
 def take_steps(is_last: bool, lanes: Row, state: FloatsOut, variance: FloatsOut) -> int:
     """Solve the normal equations of the open lanes and move those that are not done.
 
+    What is known beforehand of a width, log(own / sigma) = 0, is one more row of them.
+
     ``lanes``: (18 `LANES`,) of `accumulate`. ``state``: (7 `LANES`,). ``variance``: (`LANES`,)
     output: the centre's, of lanes that end here; 0 of those that fail or go on. Returns count of
     lanes that go on.
@@ -303,6 +310,10 @@ def take_steps(is_last: bool, lanes: Row, state: FloatsOut, variance: FloatsOut)
         b0 = float(lanes[(SUMS + 6) * LANES + k])
         b1 = float(lanes[(SUMS + 7) * LANES + k])
         b2 = float(lanes[(SUMS + 8) * LANES + k])
+        sigma = state[IN_SIGMA * LANES + k]
+        own = state[START_SIGMA * LANES + k]
+        h22 += WIDTH_WEIGHT
+        b2 += WIDTH_WEIGHT * 2.0 * (own - sigma) / (own + sigma)
         c00 = h11 * h22 - h12 * h12
         c01 = h02 * h12 - h01 * h22
         c02 = h01 * h12 - h02 * h11
@@ -315,14 +326,12 @@ def take_steps(is_last: bool, lanes: Row, state: FloatsOut, variance: FloatsOut)
         step0 = (c00 * b0 + c01 * b1 + c02 * b2) * share
         step1 = (c01 * b0 + c11 * b1 + c12 * b2) * share
         step2 = (c02 * b0 + c12 * b1 + c22 * b2) * share
-        sigma = state[IN_SIGMA * LANES + k]
         is_end = is_sound & (is_last | (state[IS_DONE * LANES + k] > 0.0))
         variance[k] = c00 * share if is_end else 0.0
         is_small = (abs(step0) < 2e-3 * sigma) & (abs(step2) < 0.02)
         state[IS_DONE * LANES + k] = 1.0 if is_small else 0.0
         half = 0.5 * sigma
         centre = state[IN_CENTRE * LANES + k] + min(max(step0, -half), half)
-        own = state[START_SIGMA * LANES + k]
         wider = sigma * exponential(min(max(step2, -0.25), 0.25))
         is_near = abs(centre - state[START * LANES + k]) < 2.0 * own + 1.0
         is_near &= (wider > 0.4 * own) & (wider < 2.5 * own + 0.5)
@@ -508,7 +517,7 @@ def fit_profiles(
             is_column = int(points[i, 5]) == COLUMN
             start = points[i, 1] if is_column else points[i, 0]
             last = (height if is_column else width) - 1
-            half = max(reach[i] * sigma_px[i], 2.0)
+            half = max(reach[i] * sigma_px[i], LEAST_HALF_PX)
             from_ = max(math.ceil(start - half), 0)
             stop = min(math.floor(start + half), last)
             result[i, CLIPPED] = 0.0

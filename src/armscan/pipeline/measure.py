@@ -605,7 +605,8 @@ def measurement_warnings(
     if doubtful:
         warnings.append(
             f"less than half of what looked like a stripe could be measured in "
-            f"{', '.join(doubtful[:LISTED])}: see in the pictures whether it is a laser line"
+            f"{', '.join(doubtful[:LISTED])}: see in the pictures whether it is a laser line "
+            "(of colour images another --laser-colour may show more of it)"
         )
     assumed = [image.source for image, n in both if n and image.flags & StripeFlag.NOISE_ASSUMED]
     if assumed:

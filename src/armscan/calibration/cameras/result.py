@@ -644,7 +644,8 @@ def focal_reasons(camera: CameraModel, sigma_fx_px: float, sigma_fy_px: float) -
         return ()
     return (
         f"the camera's focal length is known to {100.0 * known_to:.1f} % only, "
-        f"{100.0 * LARGEST_FOCAL_SIGMA:.0f} % is the limit",
+        f"{100.0 * LARGEST_FOCAL_SIGMA:.0f} % is the limit (boards tilted by some 30 degrees, "
+        "one to the left, one to the right, one up, one down, tell it)",
     )
 
 

@@ -20,18 +20,14 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
-from armscan.simulation.objects.boards import (
-    CirclePattern,
-    Lighting,
-    RenderedTarget,
-    render_flat_target,
-)
+from armscan.simulation.objects.boards import CirclePattern
 from armscan.simulation.optics.camera import RenderCamera
 from armscan.thesis.ellipse import thesis_centres
 from armscan.vision.targets.circle_edges import measure_circles
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import CircleGrid, TargetView
+from rigs.flat_prints import Lighting, RenderedTarget, render_flat_target
 from rigs.plain_scanner import plain_camera
 from rigs.slow_renderer import add_noise
 

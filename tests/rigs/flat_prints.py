@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints that the twin does not hold before its heads: chessboards and ChArUco boards."""
+"""Photographs of prints, also of those that the twin does not hold before its heads: chessboards
+and ChArUco boards.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,15 @@ import numpy as np
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.poses import Pose
+from armscan.simulation.objects.boards import (
+    FLAT,
+    FlatPattern,
+    PrintedBoard,
+    Substrate,
+    print_reflectance,
+)
+from armscan.simulation.optics.camera import RenderCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,3 +133,95 @@ def _lattice_distance(x_mm: FloatArray, y_mm: FloatArray, step_mm: float) -> Flo
     dx = np.abs(x_mm - step_mm * np.rint(x_mm / step_mm))
     dy = np.abs(y_mm - step_mm * np.rint(y_mm / step_mm))
     return np.minimum(dx, dy)
+
+
+@dataclass(frozen=True, slots=True)
+class Lighting:
+    """Grey levels of the print (8-bit scale: 255 is full scale).
+
+    Parameters
+    ----------
+    light_level, dark_level
+        Levels of the two tones where the illumination is full.
+    surround
+        Reflectance beyond the print, between the two tones.
+    gradient
+        Fraction of the illumination lost from one border of the image to the opposite one.
+    gradient_azimuth_rad
+        Direction in the image along which it gets darker; 0 is to the right.
+    """
+
+    light_level: float = 200.0
+    dark_level: float = 40.0
+    surround: float = 1.0
+    gradient: float = 0.0
+    gradient_azimuth_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedTarget:
+    """A rendered image with its truth.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey levels without noise.
+    marks_px
+        (N, 2) true projections of the pattern's marks.
+    """
+
+    image: FloatArray
+    marks_px: FloatArray
+
+
+def render_flat_target(
+    camera: RenderCamera,
+    pattern: FlatPattern,
+    rotation: FloatArray,
+    translation_mm: FloatArray,
+    lighting: Lighting | None = None,
+    *,
+    substrate: Substrate = FLAT,
+) -> RenderedTarget:
+    """Render a print seen by a camera.
+
+    Parameters
+    ----------
+    camera
+        Lens, sensor and blur.
+    pattern
+        The print.
+    rotation, translation_mm
+        (3, 3) and (3,): ``camera_from_board``.
+    lighting
+        Grey levels and illumination.
+    substrate
+        Paper and bow.
+
+    Raises
+    ------
+    InputError
+        If the camera looks at the back of the print.
+    """
+    light = Lighting() if lighting is None else lighting
+    board = PrintedBoard(pattern, Pose(rotation, translation_mm), substrate=substrate)
+    span = light.light_level - light.dark_level
+    reflectance = print_reflectance(board, camera, light.surround)
+    levels = light.dark_level + span * reflectance.astype(np.float64)
+    marks = pattern.marks_board_mm.copy()
+    marks[:, 2] += substrate.height_mm(pattern, marks[:, 0], marks[:, 1])
+    return RenderedTarget(
+        levels * illumination(camera, light),
+        camera.project(board.sensor_from_board.apply(marks)),
+    )
+
+
+def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
+    """Return the relative illumination (H, W), 1 where it is full."""
+    if lighting.gradient == 0.0:
+        return np.broadcast_to(1.0, (camera.height_px, camera.width_px))
+    u = (np.arange(camera.width_px) / max(camera.width_px - 1, 1))[None, :] - 0.5
+    v = (np.arange(camera.height_px) / max(camera.height_px - 1, 1))[:, None] - 0.5
+    cosine, sine = np.cos(lighting.gradient_azimuth_rad), np.sin(lighting.gradient_azimuth_rad)
+    along = (u * cosine + v * sine) / (abs(cosine) + abs(sine))
+    return np.asarray(1.0 - lighting.gradient * (along + 0.5))

@@ -11,14 +11,9 @@ import numpy as np
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure, SensorWindow
-from armscan.simulation.objects.boards import (
-    FlatPattern,
-    Lighting,
-    RenderedTarget,
-    render_flat_target,
-)
+from armscan.simulation.objects.boards import FlatPattern
 from armscan.simulation.optics.camera import RenderCamera
-from rigs.flat_prints import ChessboardPattern
+from rigs.flat_prints import ChessboardPattern, Lighting, RenderedTarget, render_flat_target
 from rigs.plain_scanner import plain_camera
 from rigs.slow_renderer import add_noise
 

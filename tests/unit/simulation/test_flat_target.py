@@ -10,17 +10,10 @@ import pytest
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Board, Pose, Sensor
-from armscan.simulation.objects.boards import (
-    CirclePattern,
-    Lighting,
-    PrintedBoard,
-    illumination,
-    render_board,
-    render_flat_target,
-)
+from armscan.simulation.objects.boards import CirclePattern, PrintedBoard, render_board
 from armscan.simulation.optics.camera import RenderCamera
 from armscan.simulation.optics.scene import RoomLight
-from rigs.flat_prints import ChessboardPattern
+from rigs.flat_prints import ChessboardPattern, Lighting, illumination, render_flat_target
 
 CAMERA = RenderCamera(1000.0, 1000.0, 150.3, 99.8, width_px=300, height_px=200, blur_sigma_px=0.8)
 TILTED = cv2.Rodrigues(np.array([0.5, -0.4, 0.2]))[0]

@@ -14,11 +14,12 @@ import numpy as np
 from armscan.geometry.poses import Points, Pose
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.simulation.head import build_head
-from armscan.simulation.objects.boards import CirclePattern, Lighting, render_flat_target
+from armscan.simulation.objects.boards import CirclePattern
 from armscan.simulation.objects.fixtures import N_MARKERS
 from armscan.simulation.objects.rings import Marked, RingMarker, draw_markers
 from armscan.simulation.optics.scene import Floor, Scene, Sphere
 from armscan.simulation.twin import build_twin
+from rigs.flat_prints import Lighting, render_flat_target
 
 CAMERA = build_head("thesis-multi", seed=3).camera.cropped(1300, 800, 500, 420)
 FACE = (0.5, 0.5, 0.5)

@@ -14,13 +14,7 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Board, Pose, Sensor
 from armscan.simulation.head import Head, Tolerances, Window, build_head
-from armscan.simulation.objects.boards import (
-    CirclePattern,
-    Lighting,
-    PrintedBoard,
-    Substrate,
-    render_flat_target,
-)
+from armscan.simulation.objects.boards import CirclePattern, PrintedBoard, Substrate
 from armscan.simulation.objects.shapes import FlatPlate
 from armscan.simulation.optics.camera import RenderCamera
 from armscan.simulation.optics.lasers import LineLaser, Section
@@ -33,6 +27,7 @@ from armscan.simulation.station import (
     exposure_light,
     render_exposure,
 )
+from rigs.flat_prints import Lighting, render_flat_target
 from rigs.photographed_instrument import MisruledChessboard, draw_instrument
 
 LOPSIDED = Section(skew=0.3, tail_low=0.05, tail_high=0.15, tail_sigmas=2.0)

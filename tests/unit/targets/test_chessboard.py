@@ -8,11 +8,10 @@ from scipy.special import erf
 
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
-from armscan.simulation.objects.boards import Lighting, RenderedTarget
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.saddle import fit_saddles
 from armscan.vision.targets.target import Charuco, Chessboard, TargetView
-from rigs.flat_prints import CharucoPattern, ChessboardPattern
+from rigs.flat_prints import CharucoPattern, ChessboardPattern, Lighting, RenderedTarget
 from rigs.target_scenes import exposure, nees, render
 
 BOARD = Chessboard(7, 4, 3.0)

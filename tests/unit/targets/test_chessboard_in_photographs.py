@@ -10,10 +10,9 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
-from armscan.simulation.objects.boards import Lighting, RenderedTarget
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView
-from rigs.flat_prints import ChessboardPattern
+from rigs.flat_prints import ChessboardPattern, Lighting, RenderedTarget
 from rigs.target_scenes import (
     BareChessboard,
     exposure,

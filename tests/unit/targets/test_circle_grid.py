@@ -7,11 +7,12 @@ import pytest
 from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
-from armscan.simulation.objects.boards import CirclePattern, Lighting, RenderedTarget
+from armscan.simulation.objects.boards import CirclePattern
 from armscan.vision.targets.circle_edges import measure_circles
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import CircleGrid, TargetView
+from rigs.flat_prints import Lighting, RenderedTarget
 from rigs.target_scenes import camera, exposure, model, nees, render
 
 TARGET = CircleGrid(6, 5, 3.75)

@@ -11,13 +11,13 @@ from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure, SensorWindow
-from armscan.simulation.objects.boards import CirclePattern, FlatPattern, Lighting
+from armscan.simulation.objects.boards import CirclePattern, FlatPattern
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.repeated_print import predict_print
 from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView, parse_target
-from rigs.flat_prints import ChessboardPattern
+from rigs.flat_prints import ChessboardPattern, Lighting
 from rigs.target_scenes import (
     NOISE,
     camera,

@@ -276,121 +276,35 @@ _KNOT_STEP_PX = 8
 _KNOT_TOLERANCE = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
-class Lighting:
-    """Grey levels of the print (8-bit scale: 255 is full scale).
+def print_reflectance(
+    board: PrintedBoard, camera: RenderCamera, surround: float = 1.0
+) -> NDArray[np.float32]:
+    """(H, W) part of the light tone in each pixel, blurred by the lens.
 
-    Parameters
-    ----------
-    light_level, dark_level
-        Levels of the two tones where the illumination is full.
-    surround
-        Reflectance beyond the print, between the two tones.
-    gradient
-        Fraction of the illumination lost from one border of the image to the opposite one.
-    gradient_azimuth_rad
-        Direction in the image along which it gets darker; 0 is to the right.
-    """
-
-    light_level: float = 200.0
-    dark_level: float = 40.0
-    surround: float = 1.0
-    gradient: float = 0.0
-    gradient_azimuth_rad: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RenderedTarget:
-    """A rendered image with its truth.
-
-    Parameters
-    ----------
-    image
-        (H, W) grey levels without noise.
-    marks_px
-        (N, 2) true projections of the pattern's marks.
-    """
-
-    image: FloatArray
-    marks_px: FloatArray
-
-
-def render_flat_target(
-    camera: RenderCamera,
-    pattern: FlatPattern,
-    rotation: FloatArray,
-    translation_mm: FloatArray,
-    lighting: Lighting | None = None,
-    *,
-    substrate: Substrate = FLAT,
-) -> RenderedTarget:
-    """Render a print seen by a camera.
-
-    Parameters
-    ----------
-    camera
-        Lens, sensor and blur.
-    pattern
-        The print.
-    rotation, translation_mm
-        (3, 3) and (3,): ``camera_from_board``.
-    lighting
-        Grey levels and illumination.
-    substrate
-        Paper and bow.
+    ``surround`` is that part beyond the print.
 
     Raises
     ------
     InputError
         If the camera looks at the back of the print.
     """
-    light = Lighting() if lighting is None else lighting
-    board = _BoardPlane.of(camera, rotation, translation_mm, _Print(pattern, substrate))
-    span = light.light_level - light.dark_level
-    whole = PixelBox.of(camera)
-    reflectance = _reflectance(board, light.surround, whole)
-    levels = light.dark_level + span * reflectance.astype(np.float64)
-    marks = pattern.marks_board_mm.copy()
-    marks[:, 2] += substrate.height_mm(pattern, marks[:, 0], marks[:, 1])
-    return RenderedTarget(
-        levels * illumination(camera, light),
-        camera.project(marks @ np.asarray(rotation).T + translation_mm),
-    )
+    return _reflectance(_BoardView.of(board, camera), surround, PixelBox.of(camera))
 
 
-def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
-    """Return the relative illumination (H, W), 1 where it is full."""
-    if lighting.gradient == 0.0:
-        return np.broadcast_to(1.0, (camera.height_px, camera.width_px))
-    u = (np.arange(camera.width_px) / max(camera.width_px - 1, 1))[None, :] - 0.5
-    v = (np.arange(camera.height_px) / max(camera.height_px - 1, 1))[:, None] - 0.5
-    cosine, sine = np.cos(lighting.gradient_azimuth_rad), np.sin(lighting.gradient_azimuth_rad)
-    along = (u * cosine + v * sine) / (abs(cosine) + abs(sine))
-    return np.asarray(1.0 - lighting.gradient * (along + 0.5))
-
-
-@dataclass(frozen=True, slots=True)
-class _Print:
-    """A pattern on its substrate."""
-
-    pattern: FlatPattern
-    substrate: Substrate
-
-
-def _reflectance(board: _BoardPlane, surround: float, box: PixelBox) -> NDArray[np.float32]:
-    """(H, W) part of the light tone in each pixel of a box, blurred by the lens."""
-    camera, pattern = board.camera, board.print_.pattern
-    if isinstance(pattern, CirclePattern) and board.print_.substrate == FLAT:
+def _reflectance(view: _BoardView, surround: float, box: PixelBox) -> NDArray[np.float32]:
+    """As `print_reflectance`, of the pixels of a box."""
+    camera, pattern = view.camera, view.board.pattern
+    if isinstance(pattern, CirclePattern) and view.board.substrate == FLAT:
         is_endless = surround == float(not pattern.is_light_on_dark)
         if is_endless:
-            return _discs(camera, pattern, board, box)
-    fine = _fine_reflectance(board, surround)
+            return _discs(camera, pattern, view, box)
+    fine = _fine_reflectance(view, surround)
     whole = _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
     return np.ascontiguousarray(whole[box.within(PixelBox.of(camera))])
 
 
 def _discs(
-    camera: RenderCamera, pattern: CirclePattern, board: _BoardPlane, box: PixelBox
+    camera: RenderCamera, pattern: CirclePattern, view: _BoardView, box: PixelBox
 ) -> NDArray[np.float32]:
     """As `_reflectance`, disc by disc, of a print whose ground goes on beyond its border."""
     tone = np.full(box.shape, not pattern.is_light_on_dark, np.float32)
@@ -401,7 +315,7 @@ def _discs(
     radius = 0.5 * pattern.diameter_mm
     rim = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(_RIM_STEPS)], axis=1)
     centres = pattern.marks_board_mm
-    rims = board.project((centres[:, None, :] + rim).reshape(-1, 3)).reshape(-1, _RIM_STEPS, 2)
+    rims = view.project((centres[:, None, :] + rim).reshape(-1, 3)).reshape(-1, _RIM_STEPS, 2)
     kernel = blur_kernel(SUBPIXELS * camera.blur_sigma_px)
     for centre, pixels in zip(centres, rims, strict=True):
         if not np.isfinite(pixels).all():
@@ -413,7 +327,7 @@ def _discs(
             continue
         cells = np.zeros((SUBPIXELS * height, SUBPIXELS * width), np.float32)
         disc = np.array([centre[0], centre[1], radius])
-        disc_cells(disc, own.left, own.top, lens, knots_x, knots_y, board.board_from_ray, cells)
+        disc_cells(disc, own.left, own.top, lens, knots_x, knots_y, view.board_from_ray, cells)
         blurred = cv2.sepFilter2D(cells, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
         cover = _bin(np.asarray(blurred, dtype=np.float32))
         part = tone[inside.within(box)]
@@ -434,9 +348,9 @@ def _lens_knots(camera: RenderCamera) -> tuple[FloatArray, FloatArray, FloatArra
     return np.array(lens), x, y
 
 
-def _fine_reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32]:
-    camera, pattern = board.camera, board.print_.pattern
-    x, y = board.coarse_mm()
+def _fine_reflectance(view: _BoardView, surround: float) -> NDArray[np.float32]:
+    camera, pattern = view.camera, view.board.pattern
+    x, y = view.coarse_mm()
     reach_mm = _reach_mm(x, y)
     beyond_mm = _beyond_border_mm(pattern, x, y)
     is_on_print = beyond_mm <= 0.0
@@ -444,7 +358,7 @@ def _fine_reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32
     edge_mm = pattern.edge_distance_mm(x[is_on_print], y[is_on_print])
     near_edge[is_on_print] |= edge_mm < reach_mm
     in_halo = np.zeros_like(near_edge)
-    in_halo[is_on_print] = edge_mm < reach_mm + board.print_.substrate.reach_mm
+    in_halo[is_on_print] = edge_mm < reach_mm + view.board.substrate.reach_mm
     tone = np.full(x.shape, surround, dtype=np.float32)
     tone[is_on_print] = pattern.is_light(x[is_on_print], y[is_on_print])
     size = (SUBPIXELS * camera.width_px, SUBPIXELS * camera.height_px)
@@ -454,7 +368,7 @@ def _fine_reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32
         chunk = _CHUNK * (SAMPLES // samples) ** 2
         for start in range(0, len(rows), chunk):
             v, u = rows[start : start + chunk], columns[start : start + chunk]
-            cells = _sample(board, np.stack([u, v], axis=-1), samples, surround)
+            cells = _sample(view, np.stack([u, v], axis=-1), samples, surround)
             for b in range(SUBPIXELS):
                 for a in range(SUBPIXELS):
                     fine[SUBPIXELS * v + b, SUBPIXELS * u + a] = cells[:, b, a]
@@ -462,31 +376,33 @@ def _fine_reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32
 
 
 def _sample(
-    board: _BoardPlane, pixels_px: IntArray, samples: int, surround: float
+    view: _BoardView, pixels_px: IntArray, samples: int, surround: float
 ) -> NDArray[np.float32]:
     """Mean reflectance (N, SUBPIXELS, SUBPIXELS) of the fine cells (row, column) of pixels (N, 2).
 
     Each cell has ``samples`` x ``samples`` samples.
     """
-    centre, d_du, d_dv = board.linearised_mm(pixels_px.astype(np.float64))
+    centre, d_du, d_dv = view.linearised_mm(pixels_px.astype(np.float64))
     n = SUBPIXELS * samples
     offset = (np.arange(n) + 0.5) / n - 0.5
     step_u = d_du[:, :, None] * offset
     step_v = d_dv[:, :, None] * offset
     points = centre[:, :, None, None] + step_v[:, :, :, None] + step_u[:, :, None, :]
-    tones = _tones(board.print_, points[:, 0], points[:, 1], surround)
+    tones = _tones(view.board, points[:, 0], points[:, 1], surround)
     cells = tones.reshape(-1, SUBPIXELS, samples, SUBPIXELS, samples).mean(axis=(2, 4))
     return np.asarray(cells, dtype=np.float32)
 
 
-def _tones(print_: _Print, x: FloatArray, y: FloatArray, surround: float) -> NDArray[np.float32]:
-    light = print_.pattern.is_light(x, y)
-    if print_.substrate.spread_mm > 0.0:
-        edge_mm = print_.pattern.edge_distance_mm(x, y)
-        tones = print_.substrate.reflectance(light, edge_mm).astype(np.float32)
+def _tones(
+    board: PrintedBoard, x: FloatArray, y: FloatArray, surround: float
+) -> NDArray[np.float32]:
+    light = board.pattern.is_light(x, y)
+    if board.substrate.spread_mm > 0.0:
+        edge_mm = board.pattern.edge_distance_mm(x, y)
+        tones = board.substrate.reflectance(light, edge_mm).astype(np.float32)
     else:
         tones = light.astype(np.float32)
-    return np.where(_beyond_border_mm(print_.pattern, x, y) <= 0.0, tones, np.float32(surround))
+    return np.where(_beyond_border_mm(board.pattern, x, y) <= 0.0, tones, np.float32(surround))
 
 
 def _beyond_border_mm(pattern: FlatPattern, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -511,32 +427,26 @@ def _bin(fine: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _BoardPlane:
-    """Where pixels meet the board."""
+class _BoardView:
+    """Where pixels of a camera meet a board."""
 
+    board: PrintedBoard
     camera: RenderCamera
     board_from_ray: FloatArray
-    rotation: FloatArray
-    translation_mm: FloatArray
-    print_: _Print
 
     @staticmethod
-    def of(
-        camera: RenderCamera, rotation: FloatArray, translation_mm: FloatArray, print_: _Print
-    ) -> _BoardPlane:
-        r = np.asarray(rotation, dtype=np.float64)
-        t = np.asarray(translation_mm, dtype=np.float64)
+    def of(board: PrintedBoard, camera: RenderCamera) -> _BoardView:
+        r, t = board.sensor_from_board.rotation, board.sensor_from_board.translation_mm
         if float(r[:, 2] @ t) <= 0.0:
             raise InputError(
                 "the camera looks at the back of the print",
                 remedy="turn the board: its z axis points away from the camera",
             )
-        plane = np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t]))
-        return _BoardPlane(camera, plane, r, t, print_)
+        return _BoardView(board, camera, np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t])))
 
     def project(self, points_board_mm: FloatArray) -> FloatArray:
         """(N, 2) pixels of points (N, 3) of the board; NaN behind the camera."""
-        return self.camera.project(points_board_mm @ self.rotation.T + self.translation_mm)
+        return self.camera.project(self.board.sensor_from_board.apply(points_board_mm))
 
     def exact_mm(self, pixels_px: FloatArray) -> FloatArray:
         """(..., 2) board coordinates seen by (..., 2) pixels; far away if the ray misses."""
@@ -544,23 +454,22 @@ class _BoardPlane:
         h = rays @ self.board_from_ray[:, :2].T + self.board_from_ray[:, 2]
         # The third component is 1 / depth: rays that never meet the plane see the surround.
         flat = np.asarray(h[..., :2] / np.maximum(h[..., 2:], 1e-9))
-        if not any(self.print_.substrate.bow_mm):
+        if not any(self.board.substrate.bow_mm):
             return flat
         return self._on_bow_mm(flat)
 
     def _on_bow_mm(self, flat_mm: FloatArray) -> FloatArray:
         """Where rays that meet the flat board at (..., 2) meet the bowed one."""
-        x_min, y_min, x_max, y_max = self.print_.pattern.extent_board_mm
+        pattern, pose = self.board.pattern, self.board.sensor_from_board
+        x_min, y_min, x_max, y_max = pattern.extent_board_mm
         size = np.array([x_max - x_min, y_max - y_min])
         low, high = np.array([x_min, y_min]) - size, np.array([x_max, y_max]) + size
-        eye = -self.rotation.T @ self.translation_mm
+        eye = -pose.rotation.T @ pose.translation_mm
         met = flat_mm
         for _ in range(_BOW_STEPS):
             # far beyond the print the parabola is not followed
             near = np.clip(met, low, high)
-            height = self.print_.substrate.height_mm(
-                self.print_.pattern, near[..., 0], near[..., 1]
-            )
+            height = self.board.substrate.height_mm(pattern, near[..., 0], near[..., 1])
             met = flat_mm + (height / eye[2])[..., None] * (eye[:2] - flat_mm)
         return np.asarray(met)
 
@@ -609,9 +518,7 @@ def render_board(
     -------
     (H, W) parts of full scale, blurred by the lens, without noise.
     """
-    pose = board.sensor_from_board
-    print_ = _Print(board.pattern, board.substrate)
-    plane = _BoardPlane.of(camera, pose.rotation, pose.translation_mm, print_)
+    view = _BoardView.of(board, camera)
     outline, kernel = outline_px(board, camera), blur_kernel(camera.blur_sigma_px)
     thickness = len(kernel) + 5
     box = PixelBox.around(outline, 2 * thickness, camera)
@@ -621,7 +528,7 @@ def render_board(
     corners = np.rint((outline - box.corner_px) * (1 << _OUTLINE_BITS)).astype(np.int32)
     cv2.fillPoly(mask, [corners], (255,), lineType=cv2.LINE_AA, shift=_OUTLINE_BITS)
     cv2.polylines(rim, [corners], True, (1,), thickness=thickness, shift=_OUTLINE_BITS)
-    tone, lit = _reflectance(plane, 1.0, box), _lamp_on_board(board, camera, lamp)
+    tone, lit = _reflectance(view, 1.0, box), _lamp_on_board(board, camera, lamp)
     lay_over(background, box.corner_px, tone, lit, mask, rim, kernel, board.dark, board.light)
     return background
 

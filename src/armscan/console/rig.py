@@ -280,7 +280,7 @@ class TwinBench:
     def _views(self, scene: TwinScene) -> list[list[int]]:
         groups: dict[object, list[int]] = {}
         for k, row in enumerate(self.scan_source(scene).rows):
-            groups.setdefault(row.t_ns if row.view is None else row.view, []).append(k)
+            groups.setdefault(row.arrangement, []).append(k)
         return list(groups.values())
 
     def take(self, step: StepName, folder: Path, k: int) -> tuple[Exposure, ...]:

@@ -104,9 +104,8 @@ class GrowingRecording:
 
     def take_back(self) -> None:
         """Take the latest view out of the list, and samples of the arm that came after the rest."""
-        views = [row.t_ns if row.view is None else row.view for row in self.rows]
-        both = zip(self.rows, views, strict=True)
-        self.rows = [row for row, view in both if view != views[-1]]
+        last = self.rows[-1].arrangement if self.rows else None
+        self.rows = [row for row in self.rows if row.arrangement != last]
         until = max((row.t_ns for row in self.rows), default=-1)
         self.samples = [one for one in self.samples if one[0] <= until]
 

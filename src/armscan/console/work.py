@@ -324,8 +324,8 @@ def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> t
     """
     journey = Journey(folder, read_settings(folder / SETTINGS_FILE))
     source = read_recording(journey.recording(step))
-    views = [row.t_ns if row.view is None else row.view for row in source.rows]
-    latest = [k for k, view in enumerate(views) if view == views[-1]]
+    rows = source.rows
+    latest = [k for k, row in enumerate(rows) if row.arrangement == rows[-1].arrangement]
     by_camera: dict[int, list[Exposure]] = {}
     for k in latest:
         by_camera.setdefault(source.rows[k].camera, []).append(source.exposure(k))

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from armscan.devices.inbox import Inbox
 from armscan.devices.protocols import Arm, ArmFlag, ArmSample, DeviceInfo, DeviceKind
@@ -57,7 +58,8 @@ def encode_sample(sample: ArmSample) -> bytes:
     content, values = 0, np.zeros(0)
     if sample.pose is not None:
         content |= HAS_POSE
-        values = np.concatenate([sample.pose.translation_mm, _quaternion(sample.pose.rotation)])
+        quaternion = np.roll(Rotation.from_matrix(sample.pose.rotation).as_quat(), 1)
+        values = np.concatenate([sample.pose.translation_mm, quaternion])
     if sample.joints_rad is not None:
         content |= HAS_JOINTS
         values = np.concatenate([values, sample.joints_rad])
@@ -184,38 +186,11 @@ _KNOWN = int(ArmFlag.AT_REST | ArmFlag.REFERENCED | ArmFlag.END_STOP | ArmFlag.I
 
 def _pose(values: FloatArray) -> Pose[Base, Tool] | None:
     """A pose of x, y, z, qw, qx, qy, qz; None if it is none."""
-    w, x, y, z = values[3:]
     norm = float(np.linalg.norm(values[3:]))
     is_near = bool((np.abs(values[:3]) < _LARGEST_MM).all())
     if not is_near or not abs(norm - 1.0) < _QUATERNION_TOLERANCE:
         return None
-    w, x, y, z = np.array([w, x, y, z]) / norm
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return Pose(rotation, values[:3])
-
-
-def _quaternion(rotation: FloatArray) -> FloatArray:
-    """(4,) w, x, y, z, by the largest of the four (Shepperd 1978)."""
-    r = rotation
-    trace = np.trace(r)
-    squares = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
-    k = int(np.argmax(squares))
-    if k == 0:
-        q = [1 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
-    else:
-        i, j, m = k - 1, k % 3, (k + 1) % 3
-        q = [0.0] * 4
-        q[0] = r[m, j] - r[j, m]
-        q[i + 1] = 1 + r[i, i] - r[j, j] - r[m, m]
-        q[j + 1] = r[j, i] + r[i, j]
-        q[m + 1] = r[m, i] + r[i, m]
-    return np.asarray(np.array(q) / np.linalg.norm(q))
+    return Pose(Rotation.from_quat(np.roll(values[3:], -1)).as_matrix(), values[:3])
 
 
 class Link(Protocol):

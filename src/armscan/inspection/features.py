@@ -38,6 +38,7 @@ from armscan.inspection.selection import (
     fit_robustly,
     select,
 )
+from armscan.inspection.sphere import cap_deg
 from armscan.inspection.uncertainty import FitLinearised, measured_length
 from armscan.records.cloud import PointCloud
 
@@ -380,11 +381,7 @@ def _seen_deg(shape: Shape, points: FloatArray) -> float:
     if shape.kind in ("plane", "line"):
         return math.nan
     if shape.kind == "sphere":
-        outward = local / np.linalg.norm(local, axis=1, keepdims=True)
-        mean = outward.mean(axis=0)
-        size = float(np.linalg.norm(mean))
-        least = float((outward @ mean).min()) / size if size > 1e-9 else -1.0
-        return 2.0 * math.degrees(math.acos(max(-1.0, min(1.0, least))))
+        return 2.0 * cap_deg(local)
     turn = np.sort(np.arctan2(local[:, 1], local[:, 0]))
     gaps = np.diff(np.concatenate([turn, [turn[0] + 2.0 * math.pi]]))
     return 360.0 - math.degrees(float(gaps.max()))

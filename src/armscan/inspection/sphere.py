@@ -176,7 +176,7 @@ def _described(
             "least-squares sphere",
             text,
         ),
-        seen_cap_deg=_cap_deg(points[is_fitted] - sphere.centre_mm),
+        seen_cap_deg=cap_deg(points[is_fitted] - sphere.centre_mm),
     )
 
 
@@ -193,7 +193,8 @@ def linearised_sphere(sphere: Sphere, points_mm: FloatArray) -> FitLinearised:
     )
 
 
-def _cap_deg(offset_mm: FloatArray) -> float:
+def cap_deg(offset_mm: FloatArray) -> float:
+    """Half opening of the cap about the mean direction of offsets (N, 3) that holds them all."""
     outward = offset_mm / np.linalg.norm(offset_mm, axis=1, keepdims=True)
     mean = outward.mean(axis=0)
     size = float(np.linalg.norm(mean))

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armscan.errors import ArmscanError, FileFormatError
 from armscan.geometry.arrays import IntArray
@@ -199,16 +200,21 @@ def describe_points(path: Path) -> dict[str, Any]:
     """Count and extent of probed points."""
     points = read_probed_points(path)
     kind = "centres of the tip" if points.are_tip_centres else "on the surface"
-    low, high = points.points_mm.min(axis=0), points.points_mm.max(axis=0)
     return {
         "what": f"{len(points)} probed points, {kind}",
         "points": len(points),
         "tip_diameter_mm": points.tip_diameter_mm,
         "features": sorted(set(points.features)),
-        **{
-            f"{axis}_range_mm": [round(float(low[k]), 4), round(float(high[k]), 4)]
-            for k, axis in enumerate("xyz")
-        },
+        **{f"{axis}_mm": limits for axis, limits in _ranges(points.points_mm.T).items()},
+    }
+
+
+def _ranges(axes: Iterable[NDArray[Any]]) -> dict[str, list[float]]:
+    """Least and greatest of values (N,) along x, y and z; nothing of none."""
+    return {
+        f"{name}_range": [round(float(values.min()), 4), round(float(values.max()), 4)]
+        for name, values in zip("xyz", axes, strict=True)
+        if len(values)
     }
 
 
@@ -424,19 +430,15 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
     content: dict[str, Any] = {"what": f"point cloud, {len(vertices.table)} points"}
     if "cov_xx_mm2" in fields:
         content |= _carried(read_ply(path))
-    if len(vertices.table) and {"x", "y", "z"} <= set(fields):
-        for axis in "xyz":
-            values = vertices.table[axis]
-            content[f"{axis}_range"] = [
-                round(float(values.min()), 4),
-                round(float(values.max()), 4),
-            ]
+    if {"x", "y", "z"} <= set(fields):
+        content |= _ranges(vertices.table[axis] for axis in "xyz")
     content["properties"] = fields
     return content
 
 
 def _cloud(cloud: PointCloud) -> dict[str, Any]:
-    return {"what": f"point cloud, {len(cloud)} points", **_carried(cloud), **_extent(cloud)}
+    ranges = _ranges(cloud.points_mm.T)
+    return {"what": f"point cloud, {len(cloud)} points", **_carried(cloud), **ranges}
 
 
 def _carried(cloud: PointCloud) -> dict[str, Any]:
@@ -448,13 +450,6 @@ def _carried(cloud: PointCloud) -> dict[str, Any]:
         "exposures": list(cloud.exposure_sources),
         "median_sigma_mm": float(np.median(cloud.sigma_mm)) if len(cloud) else 0.0,
     }
-
-
-def _extent(cloud: PointCloud) -> dict[str, Any]:
-    if not len(cloud):
-        return {}
-    low, high = cloud.points_mm.min(axis=0).tolist(), cloud.points_mm.max(axis=0).tolist()
-    return {f"{axis}_range": [round(low[k], 4), round(high[k], 4)] for k, axis in enumerate("xyz")}
 
 
 def _observations(path: Path) -> dict[str, Any]:

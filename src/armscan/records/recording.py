@@ -114,6 +114,11 @@ class ExposureRow:
     trigger_id: int | None = None
     view: str | None = None
 
+    @property
+    def arrangement(self) -> str | int:
+        """Alike of rows of one view, or else of one instant: they saw one rigid arrangement."""
+        return self.t_ns if self.view is None else self.view
+
 
 NO_TRIGGER = -1
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.fusion.digest import CloudDigest
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import FloatArray
 from armscan.inspection.cleaning import Cleaning
 from armscan.models.calibration import Provenance, SensorCalibration
 from armscan.pipeline.measure import Reconstruction
@@ -30,6 +30,7 @@ from armscan.report.drawing import (
     raster_markup,
     scene_markup,
     styled,
+    uniform_dots,
 )
 from armscan.report.page import Gallery, Legend, Page, Picture, Section, Text, page_of
 from armscan.report.photographs import evenly_chosen, stripe_gallery
@@ -555,13 +556,9 @@ def _cleaned_view(found: Cleaning, points_mm: FloatArray, colours: list[str]) ->
         if step > 1:
             name = "left" if k < 0 else found.steps[k].name
             thinned.append(f"one point in {step} of '{name}'")
-        dots.append(_coloured_dots(points_mm, rows[::step], LEFT_COLOUR if k < 0 else colours[k]))
+        colour = LEFT_COLOUR if k < 0 else colours[k]
+        dots.append(uniform_dots(points_mm[rows[::step]], colour))
     caption = f"Shown is {', '.join(thinned)}." if thinned else ""
     title = "Points by the filter that took them"
     scene = scene_markup(dots, [], [], title, is_z_up=found.cloud.frame != "Sensor")
     return Picture(scene, caption, f"{title} ({found.cloud.frame} frame)")
-
-
-def _coloured_dots(points_mm: FloatArray, rows: IntArray, colour: str) -> SceneDots:
-    rgb = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], dtype=np.uint8)
-    return SceneDots(points_mm[rows], np.tile(rgb, (len(rows), 1)))

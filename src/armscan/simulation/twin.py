@@ -28,7 +28,6 @@ from armscan.simulation.instrument import (
 )
 from armscan.simulation.objects.fixtures import BALL_DIAMETER_MM, STEP_HEIGHTS_MM
 from armscan.simulation.objects.rings import DISC_DIAMETER_MM, RING_DIAMETER_MM
-from armscan.simulation.optics.camera import RenderCamera
 from armscan.simulation.scenes import (
     Recorded,
     camera_shots,
@@ -63,13 +62,13 @@ class InstrumentTruth:
     @property
     def camera_parameters(self) -> FloatArray:
         """(9,) ``fx fy cx cy`` in px and ``k1 k2 p1 p2 k3``."""
-        return _parameters(self.instrument.head.camera)
+        return self.instrument.head.camera.numbers
 
     @property
     def right_camera_parameters(self) -> FloatArray | None:
         """(9,) the same of the right camera; None for a head of one camera."""
         cameras = self.instrument.head.cameras
-        return _parameters(cameras[RIGHT].camera) if len(cameras) > RIGHT else None
+        return cameras[RIGHT].camera.numbers if len(cameras) > RIGHT else None
 
     @property
     def right_from_sensor(self) -> Pose[CameraRight, Sensor] | None:
@@ -185,11 +184,6 @@ class InstrumentTruth:
             content["right_camera_parameters"] = right.tolist()
             content["right_from_sensor"] = _pose(self.right_from_sensor)
         return (json.dumps(content, indent=1) + "\n").encode()
-
-
-def _parameters(camera: RenderCamera) -> FloatArray:
-    c = camera
-    return np.array([c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3])
 
 
 def _pose(pose: Pose[Any, Any]) -> dict[str, Any]:

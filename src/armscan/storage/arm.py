@@ -237,15 +237,7 @@ def arm_columns(
 
 def _times(table: CsvTable) -> IntArray:
     times = table.ints("t_ns")
-    seen: dict[int, int] = {}
-    for k, time in enumerate(times.tolist()):
-        if time in seen:
-            raise FileFormatError(
-                f"t_ns {time} appears again (first in line {table.lines[seen[time]]})",
-                where=table.place(k),
-                remedy="remove one of the two samples",
-            )
-        seen[time] = k
+    table.refuse_repeats("t_ns", times.tolist(), "remove one of the two samples")
     back = np.flatnonzero(np.diff(times) < 0)
     if len(back):
         raise FileFormatError(

@@ -28,6 +28,7 @@ STALE_SECONDS = 86_400.0
 """Where files cannot be locked, what an interrupted run left is taken for a rest after a day."""
 
 
+MAKE_ROOM = "free some space or choose another folder"
 _NAMES_TO_COME: dict[Path, Path] = {}
 """Folders that `replaced_folder` lends, and how the folder is called whose place they take."""
 
@@ -227,13 +228,18 @@ def make_folder(folder: Path, *, with_parents: bool = False) -> None:
     OutputError
         If the disk refuses.
     """
-    try:
+    with _refusing("the folder cannot be made", folder, "choose another place"):
         folder.mkdir(parents=with_parents, exist_ok=True)
+
+
+@contextmanager
+def _refusing(fact: str, where: Path, remedy: str = MAKE_ROOM) -> Iterator[None]:
+    """Tell what the system refuses as an `OutputError` of this fact, with the system's reason."""
+    try:
+        yield
     except OSError as error:
         raise OutputError(
-            f"the folder cannot be made ({error.strerror})",
-            where=path_text(folder),
-            remedy="choose another place",
+            f"{fact} ({error.strerror or error})", where=path_text(where), remedy=remedy
         ) from error
 
 
@@ -251,14 +257,9 @@ def sole_writer(folder: Path) -> Iterator[None]:
     if fcntl is None:
         yield
         return
-    try:
+    remedy = "check its rights, or choose another folder"
+    with _refusing("the folder cannot be read", folder, remedy):
         handle = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise OutputError(
-            f"the folder cannot be read ({error.strerror})",
-            where=path_text(folder),
-            remedy="check its rights, or choose another folder",
-        ) from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -309,7 +310,7 @@ def write_files(contents: Mapping[Path, Content], *, is_overwriting: bool = Fals
         raise OutputError(
             f"{what} was written ({error.strerror})",
             where=", ".join(path_text(path) for path in contents),
-            remedy="free some space or choose another folder",
+            remedy=MAKE_ROOM,
         ) from error
     finally:
         for part in parts.values():
@@ -362,24 +363,19 @@ def new_folder(folder: Path, beside: Mapping[Path, bytes] | None = None) -> Iter
     _remove_rests(target)
     partial = _part_name(target)
     try:
-        partial.mkdir()
-        with _locked(partial):
-            yield partial
-            write_files(beside or {})
-            try:
-                if target.exists():
-                    target.rmdir()
-                partial.rename(target)
-            except BaseException:
-                for path in beside or ():
-                    path.unlink(missing_ok=True)
-                raise
-    except OSError as error:
-        raise OutputError(
-            f"nothing was written ({error.strerror or error})",
-            where=path_text(folder),
-            remedy="free some space or choose another folder",
-        ) from error
+        with _refusing("nothing was written", folder):
+            partial.mkdir()
+            with _locked(partial):
+                yield partial
+                write_files(beside or {})
+                try:
+                    if target.exists():
+                        target.rmdir()
+                    partial.rename(target)
+                except BaseException:
+                    for path in beside or ():
+                        path.unlink(missing_ok=True)
+                    raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
@@ -407,22 +403,17 @@ def replaced_folder(folder: Path, check: Callable[[], None]) -> Iterator[Path]:
     target = folder.resolve()
     partial = _part_name(target)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _bring_back(target)
-        check()
-        _remove_rests(target)
-        partial.mkdir()
-        with _locked(partial):
-            _NAMES_TO_COME[partial] = folder
-            yield partial
+        with _refusing("nothing was written", folder):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _bring_back(target)
             check()
-            _swap(partial, target)
-    except OSError as error:
-        raise OutputError(
-            f"nothing was written ({error.strerror or error})",
-            where=path_text(folder),
-            remedy="free some space or choose another folder",
-        ) from error
+            _remove_rests(target)
+            partial.mkdir()
+            with _locked(partial):
+                _NAMES_TO_COME[partial] = folder
+                yield partial
+                check()
+                _swap(partial, target)
     finally:
         _NAMES_TO_COME.pop(partial, None)
         shutil.rmtree(partial, ignore_errors=True)
@@ -493,14 +484,8 @@ def scratch_folder(document: Path) -> Iterator[Path]:
     """
     _remove_rests(document)
     folder = _part_name(document)
-    try:
+    with _refusing("nothing can be written there", folder.parent):
         folder.mkdir()
-    except OSError as error:
-        raise OutputError(
-            f"nothing can be written there ({error.strerror})",
-            where=path_text(folder.parent),
-            remedy="free some space or choose another folder",
-        ) from error
     try:
         with _locked(folder):
             yield folder

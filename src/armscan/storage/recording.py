@@ -105,7 +105,7 @@ def check_clock(
     if said.session.clock == "separate":
         return [], ["cameras and arm have neither a shared clock nor trigger ids: no pose is known"]
     times = np.array([row.t_ns for row in rows], dtype=np.int64)
-    warnings = _unit_warning(times, arm.t_ns, len({_arrangement(row) for row in rows}), where)
+    warnings = _unit_warning(times, arm.t_ns, len({row.arrangement for row in rows}), where)
     if not _is_within(times, arm.t_ns).any():
         raise FileFormatError(
             f"no exposure ({times[0]} to {times[-1]} ns) is within the arm's times "
@@ -119,11 +119,6 @@ def check_clock(
 
 def _is_within(times: Times, span: Times) -> BoolArray:
     return np.asarray((times >= span[0]) & (times <= span[-1]))
-
-
-def _arrangement(row: ExposureRow) -> str | int:
-    """Rows of one view or one instant saw one arrangement."""
-    return row.t_ns if row.view is None else row.view
 
 
 def _unit_warning(times: IntArray, arm_ns: IntArray, n_arrangements: int, where: str) -> list[str]:
@@ -169,9 +164,7 @@ def _crowd_warning(rows: Sequence[ExposureRow], arm_ns: IntArray, where: str) ->
     times = np.array([row.t_ns for row in rows], dtype=np.int64)
     step = np.searchsorted(arm_ns, times, side="right")
     seen = [
-        (int(k), _arrangement(row))
-        for k, row in zip(step, rows, strict=True)
-        if 0 < k < len(arm_ns)
+        (int(k), row.arrangement) for k, row in zip(step, rows, strict=True) if 0 < k < len(arm_ns)
     ]
     count = Counter(k for k, _ in set(seen))
     if not count or max(count.values()) < CROWD:

@@ -74,7 +74,9 @@ class CsvTable:
         """File and line of a row, for messages."""
         return f"{self.where}, line {self.lines[row]}"
 
-    def refuse_repeats(self, name: str, values: Sequence[Any]) -> None:
+    def refuse_repeats(
+        self, name: str, values: Sequence[Any], remedy: str = "give each line its own"
+    ) -> None:
         """Raise if a value of a column occurs twice.
 
         Raises
@@ -88,7 +90,7 @@ class CsvTable:
                 raise FileFormatError(
                     f"{name} {value} appears again (first in line {self.lines[first[value]]})",
                     where=self.place(row),
-                    remedy="give each line its own",
+                    remedy=remedy,
                 )
 
     def points(self, noun: str) -> FloatArray:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -27,7 +26,7 @@ from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import CLOUD_SUFFIXES, read_cloud
 from armscan.storage.documents import fingerprint
 from armscan.storage.files import Content, is_folder, make_folder, path_text, write_files
-from armscan.storage.image_paths import are_simulated
+from armscan.storage.image_paths import are_simulated, natural_key
 from armscan.storage.parts.recipes import (
     PartResult,
     RecipeFile,
@@ -257,13 +256,7 @@ def _clouds_in(folder: Path) -> list[Path]:
             where=path_text(folder),
             remedy=f"give a folder with files {', '.join(CLOUD_SUFFIXES)}",
         )
-    return sorted(paths, key=_natural)
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """So that part-2 stands before part-10."""
-    words = re.split(r"(\d+)", path.name)
-    return [(int(word), "") if word.isdecimal() else (-1, word) for word in words]
+    return sorted(paths, key=lambda path: natural_key(path.name))
 
 
 def _check_folder(folder: Path, *, is_overwriting: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import tomllib
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
@@ -339,6 +339,17 @@ def sweep(
     sizes = (hand.tilt_deg, hand.tilt_deg, hand.tilt_deg, hand.depth_mm, hand.aside_mm)
     stray = np.stack([size * sway(rng, knots) for size in sizes], axis=1)
     poses = _poses(stroke, head, np.interp(knots, times, way), stray)
+    return _trajectory(head, arm, knots, poses, ticks)
+
+
+def _trajectory(
+    head: Head,
+    arm: ScrewArm,
+    knots: FloatArray,
+    poses: Iterable[Pose[Base, Sensor]],
+    ticks: IntArray,
+) -> Trajectory:
+    """How the arm holds the head at poses, one a knot, with exposures at ticks of the clock."""
     sensor_from_tool = head.tool_from_sensor.inverse()
     joints = [COMFORTABLE_RAD]
     for pose in poses:
@@ -372,17 +383,13 @@ def bounce(
     sizes = _BOUNCE_MM_S * np.sqrt(2.0 / len(rates)) / rates
     away = np.sin(np.outer(knots, rates) + phases) @ sizes
     x, y, tilt_x, tilt_y = (size * sway(rng, knots) for size in (_ASIDE_MM, _ASIDE_MM, 1.5, 1.5))
-    sensor_from_tool = head.tool_from_sensor.inverse()
-    joints = [COMFORTABLE_RAD]
+    poses = []
     for k, depth in enumerate(away):
         held = start.aim.turned(tilt_x[k], tilt_y[k], 0.0, depth)
         spot = spot_mm + start.base_from_face[:, :2] @ [x[k], y[k]]
         middle = aim_point_mm(head, held.depth_mm)
-        pose = sensor_over(start.base_from_face, spot, held, middle)
-        joints.append(reach(arm, pose @ sensor_from_tool, joints[-1]))
-    return Trajectory(
-        t_s=knots, joints_rad=np.array(joints[1:]), exposure_t_ns=CAMERA_CLOCK_NS * ticks
-    )
+        poses.append(sensor_over(start.base_from_face, spot, held, middle))
+    return _trajectory(head, arm, knots, poses, ticks)
 
 
 def _even_ticks(n_exposures: int, duration_s: float) -> IntArray:

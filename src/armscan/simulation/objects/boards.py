@@ -342,8 +342,7 @@ def _lens_knots(camera: RenderCamera) -> tuple[FloatArray, FloatArray, FloatArra
     u = np.arange(first, camera.width_px + 2 * _KNOT_STEP_PX, _KNOT_STEP_PX, dtype=np.float64)
     v = np.arange(first, camera.height_px + 2 * _KNOT_STEP_PX, _KNOT_STEP_PX, dtype=np.float64)
     rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1), _KNOT_TOLERANCE)
-    c = camera
-    lens = [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3, _KNOT_STEP_PX, first, first]
+    lens = [*camera.numbers, _KNOT_STEP_PX, first, first]
     x, y = (np.ascontiguousarray(rays[..., k]) for k in (0, 1))
     return np.array(lens), x, y
 

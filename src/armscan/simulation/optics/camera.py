@@ -5,7 +5,7 @@ its noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import TypeVar
 
 import cv2
@@ -58,6 +58,11 @@ class RenderCamera:
             raise InputError("a camera to render with needs a positive focal length and size")
         if self.blur_sigma_px < 0.0:
             raise InputError(f"blur of {self.blur_sigma_px} px is negative")
+
+    @property
+    def numbers(self) -> FloatArray:
+        """(9,) fx, fy, cx, cy, k1, k2, p1, p2, k3."""
+        return np.array(astuple(self)[:9])
 
     def project(self, points_camera_mm: FloatArray) -> FloatArray:
         """Project (..., 3) points in the camera's frame, mm, to (..., 2) pixels.

@@ -516,7 +516,7 @@ class SceneNumbers:
         n = len(pixels)
         reach, surface, points = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 3))
         own = (self.rows, self.data, self.limbs, self.balls, self.mesh, self.spare)
-        _trace(_own(pixels), lens_of(camera), tolerance, *own, reach, surface, points)
+        _trace(_own(pixels), camera.numbers, tolerance, *own, reach, surface, points)
         return Hits(reach, surface, points)
 
     def room_light(self, hits: Hits) -> FloatArray:
@@ -539,7 +539,7 @@ class SceneNumbers:
         reach, peak = np.full(len(pixels), far_sigmas), np.zeros(len(pixels))
         own, pattern = self._shapes, texture_pattern()
         shone = (light.rows, light.borders, far_sigmas)
-        _shade(_own(pixels), lens_of(camera), tolerance, *own, pattern, *shone, reach, peak)
+        _shade(_own(pixels), camera.numbers, tolerance, *own, pattern, *shone, reach, peak)
         return reach, peak
 
 
@@ -572,12 +572,6 @@ class LightNumbers:
         middle[12] = light.sense
         rows = np.stack([middle, *(_sheet(sheet) for sheet in light.sheets)])
         return LightNumbers(rows, np.array(light.between_rad))
-
-
-def lens_of(camera: RenderCamera) -> Floats:
-    """(9,) fx, fy, cx, cy, k1, k2, p1, p2, k3."""
-    c = camera
-    return np.array([c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3])
 
 
 def _own(values: FloatArray) -> Floats:

@@ -10,8 +10,9 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn, cast, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -326,18 +327,22 @@ def own_cloud(found: CloudColumns, where: str) -> PointCloud:
         )
 
 
-def missing_package(extra: str, kind: str, error: ImportError) -> NoReturn:
-    """Raise for a format whose package is not installed.
+def needed_packages(kind: str, *names: str) -> Any:
+    """The first of the packages, all of the extra ``formats``, that a kind of file needs.
 
     Raises
     ------
     OptionError
-        Always.
+        If one of them is not installed.
     """
-    raise OptionError(
-        f"{kind} files need packages that are not installed ({error.name})",
-        remedy=f"pip install 'armscan[{extra}]'",
-    ) from error
+    try:
+        packages = [import_module(name) for name in names]
+    except ImportError as error:
+        raise OptionError(
+            f"{kind} files need packages that are not installed ({error.name})",
+            remedy="pip install 'armscan[formats]'",
+        ) from error
+    return packages[0]
 
 
 def _joined(columns: Mapping[str, Column], names: Sequence[str]) -> FloatArray:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from armscan.errors import FileFormatError
 from armscan.geometry.arrays import FloatArray
@@ -25,7 +26,7 @@ from armscan.storage.formats.columns import (
     CloudPiece,
     Column,
     cloud_columns,
-    missing_package,
+    needed_packages,
 )
 
 MM_PER_M = 1000.0
@@ -49,7 +50,7 @@ def e57_bytes(piece: CloudPiece) -> bytes:
     OptionError
         If the package is not installed.
     """
-    pye57 = _pye57()
+    pye57 = needed_packages("E57", "pye57")
     found = cloud_columns(piece)
     values = {
         FIELDS.get(name, f"{OWN}:{name}"): np.array(column, np.float64)
@@ -125,7 +126,7 @@ def e57_columns(data: bytes, path: Path) -> CloudColumns:
     where = path_text(path)
     if not data.startswith(b"ASTM-E57"):
         raise FileFormatError("this is not an E57 file", where=where, remedy=DAMAGED)
-    pye57 = _pye57()
+    pye57 = needed_packages("E57", "pye57")
     try:
         file = pye57.E57(str(path))
         try:
@@ -171,7 +172,7 @@ def _scan(file: Any, lib: Any, k: int) -> tuple[dict[str, Column], str]:
         points = np.stack([raw[FIELDS[axis]][is_valid] for axis in POINT], axis=1)
     turn = np.eye(3)
     if header.has_pose():
-        turn = _turn(np.asarray(header.rotation, np.float64))
+        turn = Rotation.from_quat(np.roll(header.rotation, -1)).as_matrix()
         points = points @ turn.T + np.asarray(header.translation, np.float64)
     columns: dict[str, Column] = {axis: MM_PER_M * points[:, j] for j, axis in enumerate(POINT)}
     for name in wanted:
@@ -193,18 +194,6 @@ def _from_spherical(range_m: FloatArray, azimuth: FloatArray, elevation: FloatAr
     )
 
 
-def _turn(quaternion: FloatArray) -> FloatArray:
-    """(3, 3) rotation of a quaternion w, x, y, z."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def _together(scans: list[tuple[dict[str, Column], str]], path: Path) -> CloudColumns:
     """Scans of another program as one cloud: what all of them carry."""
     shared = set.intersection(*(set(columns) for columns, _ in scans))
@@ -218,11 +207,3 @@ def _together(scans: list[tuple[dict[str, Column], str]], path: Path) -> CloudCo
     sources = tuple(f"{path.name} scan {k + 1}" for k in range(len(scans)))
     remark = f"{len(scans)} scans are put together, each in its place and as one exposure"
     return CloudColumns(columns, sources=sources, remarks=(remark,) if len(scans) > 1 else ())
-
-
-def _pye57() -> Any:
-    try:
-        import pye57
-    except ImportError as error:
-        missing_package("formats", "E57", error)
-    return pye57

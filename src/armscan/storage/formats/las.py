@@ -25,7 +25,7 @@ from armscan.storage.formats.columns import (
     CloudPiece,
     Column,
     cloud_columns,
-    missing_package,
+    needed_packages,
 )
 
 FINEST_STEP_MM = 1e-6
@@ -65,7 +65,7 @@ def las_bytes(piece: CloudPiece, *, is_packed: bool) -> bytes:
     OptionError
         If the packages are not installed.
     """
-    laspy = _laspy()
+    laspy = needed_packages("LAS and LAZ", "laspy", "lazrs")
     found, cloud = cloud_columns(piece), piece.cloud
     header = laspy.LasHeader(point_format=6, version="1.4")
     middle = (
@@ -108,7 +108,7 @@ def las_columns(data: bytes, path: Path) -> CloudColumns:
     where = path_text(path)
     if not data.startswith(b"LASF"):
         raise FileFormatError("this is not a LAS or LAZ file", where=where, remedy=DAMAGED)
-    laspy = _laspy()
+    laspy = needed_packages("LAS and LAZ", "laspy", "lazrs")
     try:
         header = laspy.open(io.BytesIO(data)).header
         _refuse_cut(header, data)
@@ -156,12 +156,3 @@ def _refuse_cut(header: Any, data: bytes) -> None:
 
 def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def _laspy() -> Any:
-    try:
-        import laspy
-        import lazrs  # noqa: F401
-    except ImportError as error:
-        missing_package("formats", "LAS and LAZ", error)
-    return laspy

@@ -291,7 +291,9 @@ class TwinBench:
             raise DeviceError(
                 "the simulated operator has shown all placements", remedy="calculate now"
             )
-        grown = GrowingRecording.of(folder, _session(source))
+        grown = GrowingRecording.of(
+            folder, replace(source.session, is_simulated=source.is_simulated)
+        )
         shots = [self._rendered(scene, row) for row in views[k]]
         for row, shot in zip(views[k], shots, strict=True):
             grown.add(source.rows[row], shot)
@@ -370,10 +372,6 @@ class TwinBench:
 
     def close(self) -> None:
         """As of `Bench`."""
-
-
-def _session(source: ScanSource) -> Session:
-    return replace(source.session, is_simulated=source.is_simulated)
 
 
 def _write_touches(

@@ -93,6 +93,11 @@ class Inbox(Generic[T]):
             self._waiting.clear()
             self._changed.notify_all()
 
+    def check_open(self) -> None:
+        """Raise `DeviceError` after `close`."""
+        if self._is_closed:
+            raise DeviceError("it is closed", where=self.name, remedy="open it again")
+
     def _take(self, timeout_s: float, most: int) -> list[T]:
         until_ns = time.monotonic_ns() + round(1e9 * timeout_s)
         with self._changed:
@@ -108,8 +113,7 @@ class Inbox(Generic[T]):
                 self._changed.wait(max(next_ns - now_ns, 0) * 1e-9)
 
     def _check(self) -> None:
-        if self._is_closed:
-            raise DeviceError("it is closed", where=self.name, remedy="open it again")
+        self.check_open()
         if self._fault is not None and not self._waiting:
             raise self._fault
 

@@ -316,7 +316,7 @@ class StreamedArm:
 
     def start(self) -> None:
         """Begin to deliver samples."""
-        self._check_open()
+        self._inbox.check_open()
         if not self._is_started:
             self._inbox.clear()
         self._is_started = True
@@ -327,7 +327,7 @@ class StreamedArm:
 
     def stop(self) -> None:
         """Take no more; what was taken can still be read."""
-        self._check_open()
+        self._inbox.check_open()
         self._is_started = False
 
     def close(self) -> None:
@@ -336,10 +336,6 @@ class StreamedArm:
             self._is_closed = True
             self._thread.join()
             self._inbox.close()
-
-    def _check_open(self) -> None:
-        if self._is_closed:
-            raise DeviceError("it is closed", where=self.name, remedy="open it again")
 
     def _first(self, link: Link) -> ArmSample:
         """Wait for one frame, so that a wrong baud rate or address shows at once."""

@@ -162,7 +162,7 @@ class GenICamCamera:
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Set what is not None, and return what the camera took."""
-        self._check_open()
+        self._inbox.check_open()
         with self._lock:
             running = self._trigger
             is_resized = settings.window is not None or settings.size_px is not None
@@ -177,7 +177,7 @@ class GenICamCamera:
 
     def start(self, trigger: TriggerMode = "free") -> None:
         """Begin to deliver frames; an external trigger comes in by the line of the address."""
-        self._check_open()
+        self._inbox.check_open()
         if trigger == "software":
             raise DeviceError("its software trigger is not used", where=self.name)
         with self._lock:
@@ -193,7 +193,7 @@ class GenICamCamera:
 
     def stop(self) -> None:
         """Take no more; what was taken can still be read."""
-        self._check_open()
+        self._inbox.check_open()
         with self._lock:
             self._halt()
 
@@ -210,10 +210,6 @@ class GenICamCamera:
             self._inbox.close()
             _OPEN.discard(self.name)
             self._camera.close()
-
-    def _check_open(self) -> None:
-        if self._is_closed:
-            raise DeviceError("it is closed", where=self.name, remedy="open it again")
 
     def _call(self, work: Callable[[], Any]) -> Any:
         """Do what a library may answer with any exception."""

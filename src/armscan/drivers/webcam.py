@@ -104,7 +104,7 @@ class Webcam:
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Set the rate; nothing else can be set in units."""
-        self._check_open()
+        self._inbox.check_open()
         if settings.rate_hz is not None:
             with self._lock:
                 if not self._is_file:
@@ -117,7 +117,7 @@ class Webcam:
 
     def start(self, trigger: TriggerMode = "free") -> None:
         """Begin to deliver frames."""
-        self._check_open()
+        self._inbox.check_open()
         if trigger != "free":
             raise DeviceError(
                 "a webcam cannot be triggered",
@@ -136,7 +136,7 @@ class Webcam:
 
     def stop(self) -> None:
         """Take no more; what was taken can still be read."""
-        self._check_open()
+        self._inbox.check_open()
         self._halt()
 
     def close(self) -> None:
@@ -153,10 +153,6 @@ class Webcam:
         if self._thread is not None:
             self._thread.join()
             self._thread = None
-
-    def _check_open(self) -> None:
-        if self._is_closed:
-            raise DeviceError("it is closed", where=self.name, remedy="open it again")
 
     def _made(self, image: Any) -> Any:
         """A frame's image, of the camera's blue-green-red or grey."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from armscan.errors import OptionError
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, bools, ints
-from armscan.geometry.estimate import Estimate, FitFailure
+from armscan.geometry.estimate import FitFailure
 from armscan.geometry.features import Linearised, Shape, fit_shape, linearise, moved
 from armscan.inspection.results import (
     Deviations,
@@ -172,7 +172,8 @@ def inspect_feature(
                 f"{len(chosen)} points on it, {MIN_POINTS} are needed",
                 "check the nominal values, or show where it is with --region or --seed",
             )
-        fit = fit_robustly(selection.points_mm[chosen], shape, _fitter(shape))
+        refit = partial(fit_shape, shape.kind, start=shape)
+        fit = fit_robustly(selection.points_mm[chosen], shape, refit)
         if isinstance(fit, FitFailure):
             return FitFailure(f"there is no {wanted}: {fit.reason}", fit.remedy)
         shape, is_fitted = fit
@@ -206,7 +207,8 @@ def inspect_points(
     first = fit_shape(wanted.kind, points)
     if isinstance(first, FitFailure):
         return first
-    fit = fit_robustly(points, first.value, _fitter(first.value))
+    start = first.value
+    fit = fit_robustly(points, start, partial(fit_shape, start.kind, start=start))
     if isinstance(fit, FitFailure):
         return fit
     shape, is_fitted = fit
@@ -215,14 +217,6 @@ def inspect_points(
     if failure is not None:
         return failure
     return _described(selection, wanted, shape, chosen, is_fitted, rule=rule)
-
-
-def _fitter(start: Shape) -> Callable[[FloatArray], Estimate[Shape] | FitFailure]:
-    return partial(_refit, start)
-
-
-def _refit(start: Shape, points: FloatArray) -> Estimate[Shape] | FitFailure:
-    return fit_shape(start.kind, points, start)
 
 
 def _belonging(

@@ -340,9 +340,12 @@ def cad_page(
     told = cad_quantities(found, part)
     limit = colour_limit_mm(found)
     definitions = tuple((label, meaning) for label, meaning in DEFINITIONS.values())
+    is_judged = found.options.has_tolerance
+    rule = f"A deviation is {RULE}." if is_judged else "No tolerance was given."
+    width = significant(found.spot_width_mm, "mm", 2)
     spot = (
         ("spot", "median deviation of the spot that decides, of those of the worst decision the "
-         f"one that deviates most; of all spots {_width(found)} wide with ten points or more"),
+         f"one that deviates most; of all spots {width} wide with ten points or more"),
         ("U", "expanded uncertainty, k = 2: of the points, what exposures have in common, and the "
          "alignment; of a face's mean how far exposures disagree, where that is more"),
     )  # fmt: skip
@@ -354,7 +357,7 @@ def cad_page(
             Section("Deviations in space", (Legend(_band_legend(found, limit)), Gallery(
                 (deviation_scene(found, part, cloud, limit),), 560))),
             Section("Face by face", (
-                Text(STATEMENT + _rule(found)), verdict_table(found), statistics_table(found))),
+                Text(STATEMENT + rule), verdict_table(found), statistics_table(found))),
             Section("Distribution", (Text(DISTRIBUTION), Gallery((deviation_chart(found),)))),
             Section("Distribution by face", _face_blocks(found)),
             Section("Sections", (Text(_section_text(found, limit, part)), Gallery(
@@ -368,14 +371,6 @@ def cad_page(
         warnings=warnings,
         is_simulated=is_simulated,
     )  # fmt: skip
-
-
-def _rule(found: CadComparison) -> str:
-    return f"A deviation is {RULE}." if found.options.has_tolerance else "No tolerance was given."
-
-
-def _width(found: CadComparison) -> str:
-    return significant(found.spot_width_mm, "mm", 2)
 
 
 def _cards(told: Sequence[Quantity]) -> tuple[Quantity, ...]:

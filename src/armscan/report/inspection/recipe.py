@@ -175,8 +175,9 @@ def recipe_page(title: str, rows: Sequence[PartRow], provenance: Provenance) -> 
         {name: None for name, kind in labels if kind != "feature"},
         key=lambda name: -_nearness(rows, name),
     )
+    links = tuple((f"{quote(row.name)}/part.html", row.name) for row in rows if not row.reason)
     sections = [
-        Section("Parts", (parts_table(rows), Links(_links(rows)))),
+        Section("Parts", (parts_table(rows), Links(links))),
         *_chart_sections(rows, features, faces),
     ]
     if labels:
@@ -196,10 +197,6 @@ def recipe_page(title: str, rows: Sequence[PartRow], provenance: Provenance) -> 
         cards=cards,
         is_simulated=any(row.is_simulated for row in rows),
     )
-
-
-def _links(rows: Sequence[PartRow]) -> tuple[tuple[str, str], ...]:
-    return tuple((f"{quote(row.name)}/part.html", row.name) for row in rows if not row.reason)
 
 
 def _labels(rows: Sequence[PartRow]) -> list[tuple[str, str]]:

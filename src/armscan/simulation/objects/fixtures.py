@@ -82,8 +82,8 @@ class MarkedPlate:
         """The slab and the blocks."""
         slab = Box(np.array(SLAB_MM), _GREY)
         blocks = [
-            Placed(Box(np.array([length, width, height]), _GREY), _at(x, y))
-            for x, y, length, width, height in BLOCKS_MM
+            Placed(Box(np.array(size), _GREY), Pose(np.eye(3), np.array([x, y, 0.0])))
+            for x, y, *size in BLOCKS_MM
         ]
         return (slab, *blocks)
 
@@ -105,10 +105,6 @@ def face_height_mm(place_mm: FloatArray) -> float | None:
 def _is_inside(place: FloatArray, middle: FloatArray, size: FloatArray, wider: float) -> bool:
     beyond: BoolArray = np.abs(place - middle) > 0.5 * size + wider
     return not bool(beyond.any())
-
-
-def _at(x_mm: float, y_mm: float) -> Pose[Any, Any]:
-    return Pose(np.eye(3), np.array([x_mm, y_mm, 0.0]))
 
 
 BALL_DIAMETER_MM = 34.96

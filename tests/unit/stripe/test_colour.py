@@ -6,7 +6,13 @@ import pytest
 
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import StripeOptions, find_laser_colour, split_channels, subtract
+from armscan.vision.stripe.image import (
+    StripeOptions,
+    colour_planes,
+    find_laser_colour,
+    split_channels,
+    subtract,
+)
 from rigs.stripe_image import StripeNoise, StripeScene
 from rigs.stripe_scenes import line
 
@@ -62,6 +68,62 @@ def test_glow_that_fills_the_lasers_own_channel_leaves_the_others() -> None:
     assert len(good) > 290
     assert np.abs(error.mean()) < 0.02
     assert (np.abs(error) < 5.0 * good.sigma_px).all()
+
+
+@pytest.mark.parametrize(
+    ("sigma_px", "share", "n"), [(10, 1, 2), (10, 0.1, 2), (5, 1, 1), (10, 0.01, 1)]
+)
+def test_two_planes_are_looked_at_where_glow_fills_the_channel(
+    sigma_px: float, share: float, n: int
+) -> None:
+    """A halo of 5 px leaves 14 px beside the line dark; a hundredth of it is not worth the time."""
+    y, x = np.mgrid[:240, :640]
+    core = 700.0 * np.exp(-0.5 * ((y - 100.0) / 3.0) ** 2)
+    glow = 900.0 * np.exp(-0.5 * ((y - 100.0) / sigma_px) ** 2)
+    dim = 150.0 * np.exp(-0.5 * ((y - 100.0) / 2.0) ** 2)
+    is_white = x < share * 640
+    light = np.stack(
+        [np.where(is_white, core + glow, dim)] + 2 * [np.where(is_white, core, 0.05 * dim)], axis=2
+    )
+    image = np.clip(light + 8.0, 0.0, 255.0).astype(np.uint8)
+    assert len(colour_planes(Exposure(image, "planes"), None, "red")) == n
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+@pytest.mark.parametrize("peak", [150.0, 450.0])
+def test_a_line_that_glows_in_part_keeps_the_rest(share: float, peak: float) -> None:
+    """What is dim beside an over-exposed part shows in the laser's own channel alone."""
+    rng = np.random.default_rng(9)
+    y, x = np.mgrid[:240, :640]
+    distance = (y - 100.0 - 0.1 * x) / np.hypot(1.0, 0.1)
+    is_white = x < share * 640
+    core = np.where(is_white, 700.0, peak) * np.exp(
+        -0.5 * (distance / np.where(is_white, 3.0, 2.0)) ** 2
+    )
+    glow = np.where(is_white, 900.0, 0.0) * np.exp(-0.5 * (distance / 10.0) ** 2)
+    leak = np.where(is_white, 1.0, 0.08)
+    light = np.stack([core + glow, leak * core, 0.7 * leak * core], axis=2) + 8.0
+    image = np.clip(light + rng.normal(0.0, 1.5, light.shape), 0.0, 255.0).astype(np.uint8)
+    profile = extract_stripes(Exposure(image, "part"), StripeOptions(laser_colour="red"))
+    good = profile.points_px[profile.is_accepted]
+    column, row = good.T
+    assert (column > share * 640).sum() > 0.9 * (1.0 - share) * 640
+    error = (row - 100.0 - 0.1 * column) / np.hypot(1.0, 0.1)
+    assert np.sqrt((error**2).mean()) < SAME_PX
+
+
+def test_white_things_before_a_wall_of_the_lasers_colour_cost_no_line() -> None:
+    rng = np.random.default_rng(10)
+    y, x = np.mgrid[:480, :640]
+    wall = (y < 200)[..., None] * np.array([270.0, 120.0, 110.0])
+    wall[60:70, 200:360] = 250.0
+    line_at = 350.0 + 0.1 * x
+    stripe = 150.0 * np.exp(-0.5 * ((y - line_at) / 2.0) ** 2)
+    light = wall + stripe[..., None] * np.array([1.0, 0.08, 0.05]) + 8.0
+    image = np.clip(light + rng.normal(0.0, 1.5, light.shape), 0.0, 255.0).astype(np.uint8)
+    profile = extract_stripes(Exposure(image, "wall"), StripeOptions(laser_colour="red"))
+    column, row = profile.points_px[profile.is_accepted].T
+    assert (np.abs(row - 350.0 - 0.1 * column) < 1.0).sum() > 620
 
 
 def test_line_of_another_colour_is_left_out() -> None:

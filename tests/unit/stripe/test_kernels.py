@@ -11,6 +11,7 @@ from armscan.kernels.chains import find_other_lines, measure_chains, sum_windows
 from armscan.kernels.stripe.profile_fit import (
     AMPLITUDE,
     CENTRE,
+    FIT_COLUMNS,
     SIGMA,
     VARIANCE,
     average_sides,
@@ -181,7 +182,7 @@ def test_profile_fit_matches_scipy(centre: float) -> None:
     points = np.array([[20.0, 1.0, 1.0, 0.0, 0.0, 1.0]])
     sides = np.full((1, 2), 5.0)
     noise = np.array([0.0, 0.0, 4.0])
-    result = np.zeros((1, 8))
+    result = np.zeros((1, FIT_COLUMNS))
     width = np.full(1, 2.5)
     fit_profiles(
         image,
@@ -217,7 +218,7 @@ def test_profile_fit_on_print_matches_scipy() -> None:
     line = 100.0 * np.exp(-0.5 * ((x - 19.2) / 5.0) ** 2)
     image = np.tile(ground * (5.0 + line), (3, 1)).astype(np.float32)
     image += rng.normal(0.0, 0.3, image.shape).astype(np.float32)
-    result, even = np.zeros((1, 8)), np.zeros((1, 8))
+    result, even = np.zeros((1, FIT_COLUMNS)), np.zeros((1, FIT_COLUMNS))
     for reflectance, out in (
         (np.tile(ground, (3, 1)).astype(np.float32), result),
         (np.ones((1, 1), np.float32), even),
@@ -253,7 +254,7 @@ def test_clipped_pixels_are_left_out() -> None:
     image = gaussian_row(20.3, peak=400.0)
     clipped = (image >= 255.0).astype(np.uint8)
     points = np.array([[20.0, 1.0, 1.0, 0.0, 0.0, 1.0]])
-    result = np.zeros((1, 8))
+    result = np.zeros((1, FIT_COLUMNS))
     arguments = (
         points,
         np.full(1, 2.5),
@@ -281,7 +282,7 @@ def test_known_results_are_where_the_steps_begin() -> None:
         np.zeros(4),
         np.full(1, 2.7),
     )
-    result = np.zeros((1, 8))
+    result = np.zeros((1, FIT_COLUMNS))
     fit_profiles(*arguments, result)
     again = result.copy()
     fit_profiles(*arguments, again)
@@ -318,7 +319,7 @@ def test_section_is_what_the_fit_leaves() -> None:
         np.zeros((1, 1), np.uint8),
         np.full((40, 2), 5.0),
     )
-    start, fits = np.array([0.0, 0.0, 0.02, 0.0]), np.zeros((40, 8))
+    start, fits = np.array([0.0, 0.0, 0.02, 0.0]), np.zeros((40, FIT_COLUMNS))
     images, arguments = (image, none, ground, points), (np.full(40, 2.5), sides, noise)
     reach = np.full(40, 2.7)
     fit_profiles(*images, *arguments, start, reach, fits)
@@ -347,7 +348,7 @@ def test_section_is_what_the_fit_leaves() -> None:
     sigma = np.sqrt(np.diag(np.linalg.inv(40.0 * normal[:2, :2])))
     # 1.6: what a clipped score loses against least squares
     assert np.all(np.abs(start[2:] + common - [c3, c4]) < 4.0 * 1.6 * sigma)
-    true, fits = np.array([0.0, 0.0, c3, c4]), np.zeros((40, 8))
+    true, fits = np.array([0.0, 0.0, c3, c4]), np.zeros((40, FIT_COLUMNS))
     fit_profiles(*images, *arguments, true, reach, fits)
     count = weigh_section(*images, sides, fits, noise, true, 15, said, pixels)
     # the freedom that each fit took is given back
@@ -388,7 +389,7 @@ def test_residuals_are_binned_by_the_lines_own_level() -> None:
 
 def test_clipped_cores_say_nothing_of_the_section() -> None:
     image, points = lopsided_rows(0.0, 0.0)
-    fits, said, pixels = np.zeros((40, 8)), np.zeros((40, 8)), np.zeros((3, 40 * 31))
+    fits, said, pixels = np.zeros((40, FIT_COLUMNS)), np.zeros((40, 8)), np.zeros((3, 40 * 31))
     noise, sides = np.array([0.0, 0.0, 1.0]), np.full((40, 2), 5.0)
     clipped = np.zeros(image.shape, np.uint8)
     clipped[3, 20] = 1  # the peak
@@ -512,7 +513,7 @@ def test_marks_follow_their_definitions() -> None:
     points = np.zeros((n, 6))
     points[:, 2], points[:, 3], points[:, 5] = np.cos(turn), np.sin(turn), is_row
     points[np.arange(n), is_row.astype(int)] = line
-    fits = np.abs(rng.normal(1.0, 0.5, (n, 8))) + 0.2
+    fits = np.abs(rng.normal(1.0, 0.5, (n, FIT_COLUMNS))) + 0.2
     fits[:, 0] = rng.uniform(1.0, 38.0, n)
     fits[:, 4] = rng.normal(0.0, 3.0, n)
     fits[60:90, 4] = 12.0

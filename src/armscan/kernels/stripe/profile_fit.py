@@ -32,14 +32,17 @@ ITERATIONS = 12
 LEAST_PIXELS = 5
 LEAST_HALF_PX = 2.5
 """Of the window, so that it holds as many pixels wherever the centre lies."""
-CENTRE, AMPLITUDE, SIGMA, VARIANCE, SKEW, SKEW_NORM, CLIPPED, BEND_GAIN = range(8)
-FIT_COLUMNS = 8
+CENTRE, AMPLITUDE, SIGMA, VARIANCE, SKEW, SKEW_NORM, CLIPPED, BEND_GAIN, ALIKE = range(9)
+FIT_COLUMNS = 9
 """Columns of a fit result."""
 
 
 WIDTH_WEIGHT = 4.0
 """Of the logarithm of a width over the typical one, which is known beforehand to a half: where
 clipping or a thin line leaves two or three pixels, these tell a centre only beside a width."""
+TYPICAL_WEIGHT = 1.0
+"""Of the typical width itself: told at half height, that of clipped and thin lines is up to twice
+too large, in all neighbours alike."""
 FOOT_SIGMAS = 3.2
 LEAST_REACH_SIGMAS = 1.4
 """The window shrinks beside another line, so that its foot stays outside."""
@@ -290,14 +293,17 @@ def accumulate(pixels: Row, pixel: int, noise: Row, lanes: RowOut) -> None:
 
 
 @compiled(fastmath=True, error_model="numpy")
-def take_steps(is_last: bool, lanes: Row, state: FloatsOut, variance: FloatsOut) -> int:
+def take_steps(
+    is_last: bool, lanes: Row, state: FloatsOut, variance: FloatsOut, alike: FloatsOut
+) -> int:
     """Solve the normal equations of the open lanes and move those that are not done.
 
     What is known beforehand of a width, log(own / sigma) = 0, is one more row of them.
 
     ``lanes``: (18 `LANES`,) of `accumulate`. ``state``: (7 `LANES`,). ``variance``: (`LANES`,)
-    output: the centre's, of lanes that end here; 0 of those that fail or go on. Returns count of
-    lanes that go on.
+    output: the centre's, of lanes that end here; 0 of those that fail or go on. ``alike``:
+    (`LANES`,) output: variance of what neighbours err alike by, for they were given one typical
+    width, over that. Returns count of lanes that go on.
     """
     go_on = 0
     for k in range(LANES):
@@ -328,6 +334,8 @@ def take_steps(is_last: bool, lanes: Row, state: FloatsOut, variance: FloatsOut)
         step2 = (c02 * b0 + c12 * b1 + c22 * b2) * share
         is_end = is_sound & (is_last | (state[IS_DONE * LANES + k] > 0.0))
         variance[k] = c00 * share if is_end else 0.0
+        known = WIDTH_WEIGHT * c02
+        alike[k] = known * known * share / (TYPICAL_WEIGHT * c00) if is_end else 0.0
         is_small = (abs(step0) < 2e-3 * sigma) & (abs(step2) < 0.02)
         state[IS_DONE * LANES + k] = 1.0 if is_small else 0.0
         half = 0.5 * sigma
@@ -448,7 +456,13 @@ def count_clipped(clipped: Mask, point: Floats, first: int, last: int) -> int:
 
 @compiled()
 def keep_lane(
-    lanes: Row, state: Floats, k: int, first: int, variance: float, result: FloatsOut
+    lanes: Row,
+    state: Floats,
+    k: int,
+    first: int,
+    variance: float,
+    alike: float,
+    result: FloatsOut,
 ) -> None:
     """Write one lane's fit as a row of `fit_profiles`."""
     sigma = state[IN_SIGMA * LANES + k]
@@ -459,6 +473,7 @@ def keep_lane(
     result[AMPLITUDE] = state[IN_AMPLITUDE * LANES + k]
     result[SIGMA] = sigma
     result[VARIANCE] = variance
+    result[ALIKE] = alike
     result[SKEW] = lanes[(SUMS + 9) * LANES + k] - h0q / h00 * b0
     result[SKEW_NORM] = max(lanes[(SUMS + 10) * LANES + k] - h0q * h0q / h00, 0.0)
     result[BEND_GAIN] = lanes[(SUMS + 12) * LANES + k] / (h00 * sigma)
@@ -490,11 +505,12 @@ def fit_profiles(
     interpolated linearly across the line.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's section
     as for `accumulate`: of points fitted along columns, then of those along rows. ``reach``: (N,)
-    half width of the fitted window in sigmas. ``result``: (N, 8) input: results for nearly the same
+    half width of the fitted window in sigmas. ``result``: (N, 9) input: results for nearly the same
     noise and section, from which the steps begin, or zeros; output: centre, amplitude, sigma,
     variance of the centre (0: the fit failed), score of a skew beyond the section's, its norm,
-    count of clipped pixels, and by how much a term ``u^3`` in the profile's exponent moves the
-    centre, in sigmas (for the correction on bent lines).
+    count of clipped pixels, by how much a term ``u^3`` in the profile's exponent moves the centre,
+    in sigmas (for the correction on bent lines), and `take_steps`' share of what neighbours err
+    alike by, which smoothing does not lessen.
     """
     height, width = image.shape
     has_clipped = clipped.shape[0] == height and clipped.shape[1] == width
@@ -502,7 +518,7 @@ def fit_profiles(
     lanes = np.zeros(LANE_ROWS * LANES, np.float32)
     state = np.zeros(STATE_ROWS * LANES)
     levels = noise.astype(np.float32)
-    variance = np.zeros(LANES)
+    variance, alike = np.zeros(LANES), np.zeros(LANES)
     first = np.zeros(LANES, np.int64)
     place = np.zeros(3 * LANES, np.int64)
     ground = np.zeros(2 * LANES)
@@ -564,9 +580,10 @@ def fit_profiles(
             result[block + k, VARIANCE] = 0.0
         for round_ in range(ITERATIONS):
             sum_pixels(pixels, capacity, levels, state, lanes)
-            go_on = take_steps(round_ == ITERATIONS - 1, lanes, state, variance)
+            go_on = take_steps(round_ == ITERATIONS - 1, lanes, state, variance, alike)
             for k in range(n_lanes):
                 if variance[k] > 0.0:
-                    keep_lane(lanes, state, k, first[k], variance[k], result[block + k])
+                    own = result[block + k]
+                    keep_lane(lanes, state, k, first[k], variance[k], alike[k], own)
             if go_on == 0:
                 break

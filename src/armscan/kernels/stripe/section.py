@@ -320,7 +320,7 @@ def weigh_section(
     do not take up counts.
 
     ``image``, ``clipped``, ``reflectance``, ``points``, ``sides``, ``noise``, ``section``: As for
-    `fit_profiles`, which gave ``fits`` (N, 8). ``reach``: Pixels looked at on both sides. ``said``:
+    `fit_profiles`, which gave ``fits`` (N, 9). ``reach``: Pixels looked at on both sides. ``said``:
     (N, 8) output: normal matrix of the two terms as 00 01 11, their right-hand side, 1 where no
     pixel beyond the core is clipped, and both for what the reflectance is too large by; (0, 8) if
     not asked for. ``pixels``: (3, >= N (2 reach + 1)) output: the line's own grey level, the same
@@ -522,7 +522,7 @@ def mark_points(
     A step of height d beside a line of amplitude A and sigma s moves every method by about s d / A,
     a third-order part ``c m (u^3 - 3 u)`` beside the Gaussian ``m`` by about 0.6 c s.
 
-    ``points``: (N, 6) ridge points, ordered along chains. ``fits``: (N, 8) of `fit_profiles`.
+    ``points``: (N, 6) ridge points, ordered along chains. ``fits``: (N, 9) of `fit_profiles`.
     ``sides``: (N, 2), ``side_sigma``: (N,) background on both sides and sigma of its difference.
     ``neighbour``: (N, 2) distance to other lines. ``chain``: (N,) numbers. ``saturated``: (H, W) 1
     where the laser's channel is; (1, 1) zero if it is nowhere. ``bits``: (4,) that of a

@@ -460,7 +460,7 @@ def find_pulls(
     pixel d from the centre lies ``n d - k t^2 d^2 / 2`` from the line. To first order this adds the
     term ``k t^2 s / (2 n) u^3`` to the relative profile in ``u = d / s``.
 
-    ``ridge``: (N, 6) ridge points. ``fits``: (N, 8) of `fit_profiles`. ``points``, ``normals``: (N,
+    ``ridge``: (N, 6) ridge points. ``fits``: (N, 9) of `fit_profiles`. ``points``, ``normals``: (N,
     2). ``sigma``: (N,) of the points. ``chain``: (N,) numbers. ``pull``: (N,) output, for a
     curvature of 1. ``matters``: (N,) output, 1 where bends as sharp as there may be move more than
     `LEAST_PULL`. Returns how many of these there are.

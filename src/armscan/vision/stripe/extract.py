@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.kernels.stripe.profile_fit import AMPLITUDE
+from armscan.kernels.stripe.profile_fit import ALIKE, AMPLITUDE
 from armscan.kernels.stripe.section import (
     EDGE_BLUR_PX2,
     MARK_SIGMA,
@@ -34,7 +34,7 @@ from armscan.vision.stripe.image import (
     StripeOptions,
     StripePlane,
     check_background,
-    colour_plane,
+    colour_planes,
     has_laser_colour,
     is_on_known_ground,
     laid_under,
@@ -62,6 +62,9 @@ LEAST_SIGMA_PX = 0.002
 MOST_LEFT = 0.2
 """Of an edge's pull: the blur leaves more of it on lines of sigma below 3.2 px. Edges lie beside
 only a part of such lines, and the points there are better left out."""
+
+NEARLY_ALL = 0.9
+"""Of the points of the plane that shows most: the others' plane is better where both show them."""
 
 
 def extract_stripes(
@@ -107,13 +110,22 @@ def extract_stripes(
         if options.method == "fast" and is_of_bytes(exposure.image):
             level = measure_level(exposure.image, threshold, 1.0 / full_scale, SPARSE)
             return _find_fast(exposure, None, level, options)
+    planes: tuple[StripePlane, ...]
     if exposure.colour == "mono":
-        plane = mono_plane(exposure, background)
+        planes = (mono_plane(exposure, background),)
     else:
-        plane = colour_plane(exposure, background, options.laser_colour)
+        planes = colour_planes(exposure, background, options.laser_colour)
     if background is not None and options.on_print and options.method == "fit":
         ground = relative_reflectance(background, options.laser_colour)
-        plane = replace(plane, reflectance=ground)
+        planes = tuple(replace(plane, reflectance=ground) for plane in planes)
+    profiles = [_find_in(exposure, plane, options, threshold) for plane in planes]
+    most = max(int(profile.is_accepted.sum()) for profile in profiles)
+    return next(p for p in profiles if p.is_accepted.sum() >= NEARLY_ALL * most)
+
+
+def _find_in(
+    exposure: Exposure, plane: StripePlane, options: StripeOptions, threshold: float | None
+) -> Profile:
     level = measure_level(plane.image, threshold)
     if options.method == "fast":
         return _find_fast(exposure, plane, level, options)
@@ -233,6 +245,7 @@ def to_profile(
     # beyond a crossing a chain may follow the other line: nothing is averaged across it
     is_new = (np.diff(chain) != 0) | (np.diff(near) != 0)
     stretch = np.concatenate([[0], np.cumsum(is_new)])
+    alike = sigma**2 * fits.values[:, ALIKE]
     course = straighten(Polyline(points, normals, sigma, stretch, usable), fits)
     smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
@@ -241,6 +254,7 @@ def to_profile(
     binning = exposure.window.binning
     sigma = np.maximum(smoothed.sigma, LEAST_SIGMA_PX)
     noise_length = np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0)
+    sigma = np.hypot(sigma, np.sqrt(alike))
     on_flanks = flags & int(StripeFlag.SATURATED)
     widen_sigmas(fits.ridge.table, fits.section, width, fits.ground, on_flanks, sigma)
     return Profile(

@@ -206,7 +206,7 @@ LEAST_REACH_PX = 6.0
 class ProfileFits:
     """Result of fitting the cross-section at each ridge point.
 
-    ``ridge``: The ridge points, only those whose fit succeeded. ``values``: (N, 8) columns as in
+    ``ridge``: The ridge points, only those whose fit succeeded. ``values``: (N, 9) columns as in
     `armscan.kernels.stripe.profile_fit`. ``sides``: (N, 2) background on the lower and upper side,
     averaged along the line. ``side_sigma``: (N,) standard deviation of the difference of the two
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in

@@ -452,12 +452,10 @@ SATURATED_SHARE = 0.12
 LEAST_CORE_HEIGHT = 8.0
 """A channel shows the core if it rises by this much above its surroundings there."""
 LINE_SHARE = 0.4
-HALF = 127.0
+LEAST_WHITE = 0.03
 FLAT_RISE = 50.0
-LEAST_WHITE = 0.1
-"""Of 255, and of the line's bright pixels. Where the laser's channel rises by less at white cores
-(0 to 47 in 40 photographs of six strangers) the two others alone give up to eighteen times as many
-points, without the pull of its halo; where it rises by more (61 to 200) as often fewer as more."""
+"""White cores are looked at if they cover this share of the line, and their channel is filled if it
+rises by no more of 255: by 0 to 47 in 40 photographs of six strangers, 61 to 200 in 30 others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -507,17 +505,18 @@ def find_laser_colour(images: ColourImages) -> LaserColour:
     return COLOURS[best] if strengths[best] > LEAST_COLOUR_SHARE * grey else "grey"
 
 
-def colour_plane(
+def colour_planes(
     exposure: Exposure, background: Exposure | None, colour: LaserColour
-) -> StripePlane:
-    """The plane of a colour exposure in which the stripe is sought.
+) -> tuple[StripePlane, ...]:
+    """The plane of a colour exposure in which the stripe is sought, or two to choose from.
 
     Of ``auto``, the colour is found in this one image. For a colour, the laser's own channel is
     used; where its core is saturated, the least saturated channel that still shows the core is
     added: it rises where the first has reached its limit, while the halo and dim parts of the line
-    stay with the laser's colour; where it is flat far around the core, the two others stand for it;
-    only ridges with the laser's colour around them count. For a difference, what the channels have
-    in common, the room's light on a printed pattern, cancels.
+    stay with the laser's colour; only ridges with the laser's colour around them count. Where the
+    line's own glow fills its channel, the two others come first: they show what is over-exposed,
+    and nothing of the line where it is dim. For a difference, what the channels have in common, the
+    room's light on a printed pattern, cancels.
     """
     images = split_channels(exposure, background)
     factor = exposure.full_scale / NORMAL_SCALE
@@ -527,23 +526,27 @@ def colour_plane(
         mean = np.asarray(sum(images.channels) / np.float32(3.0), dtype=np.float32)
         found = [mask for mask in images.clipped if mask.size > 1]
         anywhere = np.maximum.reduce(found) if found else NOWHERE
-        return StripePlane(
-            image=mean, clipped=anywhere, saturated=anywhere, grey_levels_per_unit=factor
+        return (
+            StripePlane(
+                image=mean, clipped=anywhere, saturated=anywhere, grey_levels_per_unit=factor
+            ),
         )
     own = CHANNELS.index(colour.partition("-")[0])
-    gate, clipped = None, images.clipped[own]
-    if colour not in CHANNELS:
-        image = _difference(images, colour)
+    gate = colour_excess(images, colour) if colour in CHANNELS else None
+    if gate is None:
+        shown = [(_difference(images, colour), images.clipped[own])]
     else:
-        gate = colour_excess(images, colour)
-        image, clipped = _shown_line(images, gate, own)
-    return StripePlane(
-        image=image,
-        clipped=clipped,
-        saturated=images.clipped[own],
-        grey_levels_per_unit=factor,
-        gate=gate,
-        unknown=_unknown(background, own),
+        shown = _shown_line(images, gate, own)
+    return tuple(
+        StripePlane(
+            image=image,
+            clipped=clipped,
+            saturated=images.clipped[own],
+            grey_levels_per_unit=factor,
+            gate=gate,
+            unknown=_unknown(background, own),
+        )
+        for image, clipped in shown
     )
 
 
@@ -555,27 +558,30 @@ def _difference(images: ColourImages, colour: LaserColour) -> FloatImage:
     return images.channels[CHANNELS.index(first)] - images.channels[CHANNELS.index(second)]
 
 
-def _shown_line(images: ColourImages, excess: FloatImage, own: int) -> tuple[FloatImage, MaskImage]:
-    """(H, W) sum of the channels that show the line, and where it no longer rises."""
+def _shown_line(
+    images: ColourImages, excess: FloatImage, own: int
+) -> list[tuple[FloatImage, MaskImage]]:
+    """(H, W) sums of channels that may show the line, and where they no longer rise."""
     image, clipped = images.channels[own], images.clipped[own]
     s = RIDGE_STEP_PX
     ridge = ridge_height(excess)
     if not ridge.size or clipped.size == 1:
-        return image, clipped
+        return [(image, clipped)]
     least = LINE_SHARE * float(np.quantile(ridge, RIDGE_QUANTILE))
     line, full = ridge > least, clipped[s:-s, s:-s] > 0
+    halo = line & full
+    shown = [(image, clipped)]
+    is_clipped = halo.sum() > SATURATED_SHARE * line.sum()
+    if is_clipped and (core := _core_channel(images, halo, own)) is not None:
+        shown = [(image + images.channels[core], images.clipped[core])]
     first, second = (k for k in range(3) if k != own)
     others = images.channels[first] + images.channels[second]
     # a core that is white has no excess
     white = full & (ridge_height(others) > least)
-    bright = line & (image[s:-s, s:-s] > HALF)
-    if white.sum() > LEAST_WHITE * bright.sum() and _is_flat(image, white):
-        return others, np.minimum(images.clipped[first], images.clipped[second])
-    halo = line & full
-    core = _core_channel(images, halo, own) if halo.sum() > SATURATED_SHARE * line.sum() else None
-    return (
-        (image, clipped) if core is None else (image + images.channels[core], images.clipped[core])
-    )
+    if white.sum() > LEAST_WHITE * line.sum() and _is_flat(image, white):
+        flat = np.minimum(images.clipped[first], images.clipped[second])
+        shown.insert(0, (others, flat))
+    return shown
 
 
 def _is_flat(image: FloatImage, where: BoolArray) -> bool:

@@ -130,6 +130,21 @@ def test_line_thinner_than_its_pixels_is_complete(sigma_px: float, peak: float) 
     assert np.sqrt((error**2).mean()) < NOISE_LIMIT_PX
 
 
+@pytest.mark.parametrize("sigma_px", [0.5, 0.6, 0.8])
+def test_thin_level_line_is_not_pulled_by_its_own_sampling(sigma_px: float) -> None:
+    """All profiles of a level line are sampled alike: what they have in common is no skew of it."""
+    rng = np.random.default_rng(2)
+    row = np.mgrid[:60, :400][0]
+    for centre in 30.0 + np.arange(0.0, 1.0, 0.1):
+        edges = (ndtr((row + side - centre) / sigma_px) for side in (0.5, -0.5))
+        light = 180.0 * np.sqrt(2.0 * np.pi) * sigma_px * np.subtract(*edges)
+        image = np.clip(15.0 + light + rng.normal(0.0, 1.0, light.shape), 0.0, 255.0)
+        profile = extract_stripes(Exposure(image.round().astype(np.uint8), "level"))
+        good = profile.points_px[profile.is_accepted]
+        assert len(good) > 200
+        assert abs(good[:, 1].mean() - centre) < BIAS_LIMIT_PX
+
+
 @pytest.mark.parametrize("slope", [0.002, 0.01])
 def test_what_is_taken_for_a_width_is_not_smoothed_away(slope: float) -> None:
     """Of a level clipped line neighbours err alike by a width that is not the typical one."""

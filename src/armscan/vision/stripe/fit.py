@@ -195,6 +195,9 @@ NOISE_SAMPLE = 1500
 NOISE_ROUNDS = 2
 SECTION_ROUNDS = 2
 """More of them where the section is no Gaussian."""
+LEAST_SECTION_PX = 1.0
+"""Lines of less sigma have five or six pixels, which tell centre, height and width but no skew
+beside them: where a line keeps its place between pixels, that would be its own sampling."""
 SIDE_HALF = 8
 """Neighbours over which the background beside the line is averaged."""
 CLEAR_SIGMAS = 11.0
@@ -278,6 +281,7 @@ def fit_ridge(
         noise = estimate_noise(*fitted.left(noise, section), peak, noise)
         said = fitted.said(noise, section)
         is_usable = (reach[at] >= REACH_SIGMAS) & (said[:, HAS_CORE] > 0.0)
+        is_usable &= fitted.fits[:, SIGMA] >= LEAST_SECTION_PX
         axis = table[at, 5].astype(np.int64)
         section = estimate_section(said, section, is_usable, axis, ridge.chain[at])
         if plane.reflectance.size > 1:

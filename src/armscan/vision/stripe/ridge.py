@@ -309,10 +309,33 @@ def find_line_sigma(image: FloatImage, runs: FloatArray, level: ImageLevel) -> f
     bright &= half_widths < REACH_PX
     if not bright.any():
         return FALLBACK_PX
-    fwhm = 2.0 * float(np.median(half_widths[bright]))
+    return float(_sigmas(np.median(half_widths[bright], keepdims=True))[0])
+
+
+def _sigmas(half_widths: FloatArray) -> FloatArray:
+    """Sigmas (N,) of lines from half their width (N,) at half height, within the limits."""
     blur = STEP_PX**2 / 3.0
-    sigma = np.sqrt(max((fwhm / FWHM_PER_SIGMA) ** 2 - blur, 0.0))
-    return float(np.clip(sigma, *SIGMA_LIMITS_PX))
+    square = (2.0 * half_widths / FWHM_PER_SIGMA) ** 2 - blur
+    return np.asarray(np.clip(np.sqrt(np.maximum(square, 0.0)), *SIGMA_LIMITS_PX))
+
+
+LOCAL_HALF = 8
+"""Neighbours on a chain that tell a line's own width: its median, if more than these tell one."""
+
+
+def local_sigmas(image: FloatImage, ridge: RidgePoints, at: IntArray) -> FloatArray:
+    """(N,) sigma in px of the line itself at some points, ``at`` (N,); NaN where it is not told."""
+    half_widths, heights = _half_widths(_across(image, ridge.table[at]))
+    is_told = (heights > 0.0) & (half_widths < REACH_PX)
+    own = np.where(is_told, _sigmas(half_widths), np.nan)
+    first, stop = chain_bounds(ridge.chain[at])
+    near = np.arange(len(at))[:, None] + np.arange(-LOCAL_HALF, LOCAL_HALF + 1)
+    is_on_chain = (near >= first[:, None]) & (near < stop[:, None])
+    # numbers that are none come last
+    sorted_ = np.sort(np.where(is_on_chain, own[near.clip(0, len(at) - 1)], np.nan), axis=1)
+    count = np.isfinite(sorted_).sum(axis=1)
+    middle = sorted_[np.arange(len(at)), count // 2]
+    return np.where(count > LOCAL_HALF, middle, np.nan)
 
 
 def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:

@@ -145,6 +145,31 @@ def test_thin_level_line_is_not_pulled_by_its_own_sampling(sigma_px: float) -> N
         assert abs(good[:, 1].mean() - centre) < BIAS_LIMIT_PX
 
 
+@pytest.mark.parametrize(
+    ("most_px", "own_px"), [(3.0, 1.1), (3.0, 1.2), (6.0, 2.4), (1.5, 3.75), (2.5, 6.3), (2.5, 7.5)]
+)
+def test_lines_of_other_widths_than_most_are_complete_and_honest(
+    most_px: float, own_px: float
+) -> None:
+    """Three lines of one width tell the typical one; the fourth has its own."""
+    curves = [StraightCurve(300.0, 40.0 + 60.0 * k, 3.0 + k) for k in range(4)]
+    stripes = [SimulatedStripe(c, sigma_px=most_px, peak=300.0) for c in curves[:3]]
+    stripes.append(SimulatedStripe(curves[3], sigma_px=own_px, peak=150.0))
+    scene = StripeScene(tuple(stripes), 600, 300)
+    result = score(scene, range(3))
+    errors, squares = [], []
+    for profile in result.profiles:
+        good = profile.select(profile.is_accepted)
+        distance, which, _ = scene.errors(good.points_px)
+        errors.append(distance[which == 3])
+        squares.append((distance / good.sigma_px)[which == 3] ** 2)
+    error = np.concatenate(errors)
+    assert len(error) > 0.98 * 3 * 600
+    # a fit has some 0.2 grey levels of speckle in each of its pixels: see the bound above
+    assert np.sqrt((error**2).mean()) < 0.015 * max(own_px, 3.0)
+    assert np.sqrt(np.concatenate(squares).mean()) == pytest.approx(1.0, abs=0.2)
+
+
 @pytest.mark.parametrize("slope", [0.002, 0.01])
 def test_what_is_taken_for_a_width_is_not_smoothed_away(slope: float) -> None:
     """Of a level clipped line neighbours err alike by a width that is not the typical one."""

@@ -47,7 +47,8 @@ from armscan.vision.stripe.ridge import (
     RidgePoints,
     chain_bounds,
     chain_extents,
-    local_sigmas,
+    median_along,
+    widths_at,
 )
 
 START_CONTRAST2 = 0.03
@@ -204,6 +205,10 @@ SIDE_HALF = 8
 CLEAR_SIGMAS = 11.0
 """Another line within this many sigmas may light up the background beside a slanted line."""
 LEAST_REACH_PX = 6.0
+WIDTH_HALF = 8
+"""Neighbours of which the median tells a line's own width."""
+OWN_WIDTH_ROUNDS = 2
+"""A window is left at two and a half times its width, so that four times take two."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,7 +301,8 @@ def fit_ridge(
         plane.image, plane.clipped, ground, table, sigma, sides, noise, section, reach, values
     )
     found = {"values": values, "sides": sides, "side_sigma": side_sigma}
-    _fit_narrower(plane, ridge, start, noise=noise, section=section, **found)
+    for _ in range(OWN_WIDTH_ROUNDS):
+        _fit_in_own_width(plane, ridge, start, noise=noise, section=section, **found)
     good = values[:, VARIANCE] > 0.0
     if not good.all():
         ridge, values, sides = ridge.select(good), values[good], sides[good]
@@ -314,13 +320,14 @@ def fit_ridge(
     )
 
 
-HALF_AS_WIDE = 0.5
-NARROW = (0.33, 0.7)
-"""Of the typical sigma: what is fitted again if its own lies between. Of the dots and edges that a
-photograph shows beside its lines, most are narrower still."""
+NARROW, WIDE = 0.7, 1.4
+"""Of the typical sigma, beyond which a line is fitted in windows for its own width."""
+NARROWEST, HALF_AS_WIDE = 0.33, 0.5
+"""Narrower still are most dots and edges that a photograph shows beside its lines; and what was
+fitted in a window that is too wide is good enough to half its width."""
 
 
-def _fit_narrower(
+def _fit_in_own_width(
     plane: StripePlane,
     ridge: RidgePoints,
     start: _Start,
@@ -331,19 +338,24 @@ def _fit_narrower(
     sides: FloatArray,
     side_sigma: FloatArray,
 ) -> None:
-    """Fit again, in windows for their own width, lines that are narrower than the typical one.
+    """Fit again, in windows for their own width, lines that are much narrower or wider than most.
 
     An over-exposed line on a bright surface is two and three times as wide as the same one on a
-    dark surface, where the window made for it holds glow and edges beside the line.
+    dark surface, where the window made for it holds glow and edges beside the line. Of a line that
+    is wider than its window, the flanks pass for background.
 
     ``start``: Of all points. ``values``, ``sides``, ``side_sigma``: Input and output; rows stay
     where the second fit fails, too.
     """
     is_lost = values[:, VARIANCE] == 0.0
-    at = np.flatnonzero(is_lost | (values[:, SIGMA] < HALF_AS_WIDE * start.sigma))
-    own = local_sigmas(plane.image, ridge, at) / start.line_sigma_px
-    is_narrow = (own > NARROW[0]) & (own < NARROW[1])
-    at, own = at[is_narrow], own[is_narrow]
+    own = np.where(is_lost, np.nan, values[:, SIGMA] / start.sigma)
+    lost = np.flatnonzero(is_lost)
+    own[lost] = widths_at(plane.image, ridge.table[lost]) / start.line_sigma_px
+    narrow = np.where(is_lost, NARROW, HALF_AS_WIDE)
+    at = np.flatnonzero((own < narrow) | (own > WIDE))
+    own = median_along(own, ridge.chain, at, WIDTH_HALF)
+    is_other = ((own > NARROWEST) & (own < narrow[at])) | (own > WIDE)
+    at, own = at[is_other], own[is_other]
     if not len(at):
         return
     table = ridge.table[at]

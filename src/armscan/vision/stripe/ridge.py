@@ -250,6 +250,21 @@ def mean_along(values: FloatArray, weights: FloatArray, chain: IntArray, half: i
     return np.asarray(np.where(total > 0.0, mean / np.where(total > 0.0, total, 1.0), 0.0))
 
 
+def median_along(values: FloatArray, chain: IntArray, at: IntArray, half: int) -> FloatArray:
+    """Medians of values (N,) within ``half`` places of some, ``at`` (M,), on the same chain.
+
+    NaN where half of the places or fewer hold a number.
+    """
+    first, stop = (bound[at, None] for bound in chain_bounds(chain))
+    near = at[:, None] + np.arange(-half, half + 1)
+    is_near = (near >= first) & (near < stop)
+    # what is NaN comes last
+    ordered = np.sort(np.where(is_near, values[near.clip(0, len(values) - 1)], np.nan), axis=1)
+    count = np.isfinite(ordered).sum(axis=1)
+    middle = ordered[np.arange(len(at)), count // 2]
+    return np.where(count > half, middle, np.nan)
+
+
 def chain_extents(points: FloatArray, chain: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
     """First index, index after the last, and arc length in px of each point's chain: (N,) each.
 
@@ -319,23 +334,11 @@ def _sigmas(half_widths: FloatArray) -> FloatArray:
     return np.asarray(np.clip(np.sqrt(np.maximum(square, 0.0)), *SIGMA_LIMITS_PX))
 
 
-LOCAL_HALF = 8
-"""Neighbours on a chain that tell a line's own width: its median, if more than these tell one."""
-
-
-def local_sigmas(image: FloatImage, ridge: RidgePoints, at: IntArray) -> FloatArray:
-    """(N,) sigma in px of the line itself at some points, ``at`` (N,); NaN where it is not told."""
-    half_widths, heights = _half_widths(_across(image, ridge.table[at]))
+def widths_at(image: FloatImage, points: FloatArray) -> FloatArray:
+    """(N,) sigma in px of the line at each ridge point (N, 6); NaN where it is not told."""
+    half_widths, heights = _half_widths(_across(image, points))
     is_told = (heights > 0.0) & (half_widths < REACH_PX)
-    own = np.where(is_told, _sigmas(half_widths), np.nan)
-    first, stop = chain_bounds(ridge.chain[at])
-    near = np.arange(len(at))[:, None] + np.arange(-LOCAL_HALF, LOCAL_HALF + 1)
-    is_on_chain = (near >= first[:, None]) & (near < stop[:, None])
-    # numbers that are none come last
-    sorted_ = np.sort(np.where(is_on_chain, own[near.clip(0, len(at) - 1)], np.nan), axis=1)
-    count = np.isfinite(sorted_).sum(axis=1)
-    middle = sorted_[np.arange(len(at)), count // 2]
-    return np.where(count > LOCAL_HALF, middle, np.nan)
+    return np.where(is_told, _sigmas(half_widths), np.nan)
 
 
 def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:

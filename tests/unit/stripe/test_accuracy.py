@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from armscan.records.exposure import Exposure
@@ -187,6 +188,30 @@ def test_what_is_taken_for_a_width_is_not_smoothed_away(slope: float) -> None:
         squares.append(((y - centre[0, 0] - slope * x) / good.sigma_px) ** 2)
     assert len(np.concatenate(squares)) > 2000
     assert np.sqrt(np.concatenate(squares).mean()) < 3.5
+
+
+@pytest.mark.parametrize("sigma_px", [1.5, 4.0])
+@pytest.mark.parametrize("noise", [4.0, 10.0])
+def test_line_of_three_times_the_noise_of_a_pixel_is_found(sigma_px: float, noise: float) -> None:
+    scene = StripeScene(
+        (line(20.0, sigma_px=sigma_px, peak=3.0 * noise),), 320, 240, noise=StripeNoise(read=noise)
+    )
+    result = score(scene, SEEDS, length_px=300.0 / np.cos(np.radians(20.0)))
+    assert result.completeness > 0.99
+    assert result.false == 0
+    assert result.normalised.std() == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize("grain_px", [0.0, 1.0])
+@pytest.mark.parametrize("noise", [0.3, 3.0, 25.0])
+def test_noise_alone_shows_no_line(noise: float, grain_px: float) -> None:
+    for seed in range(4):
+        grain = np.random.default_rng(seed).normal(size=(480, 640))
+        if grain_px > 0.0:
+            grain = gaussian_filter(grain, grain_px)
+        image = np.clip(60.0 + noise / grain.std() * grain, 0.0, 255.0)
+        profile = extract_stripes(Exposure(image.round().astype(np.uint8), "noise"))
+        assert not profile.is_accepted.any()
 
 
 def test_weak_line_is_complete() -> None:

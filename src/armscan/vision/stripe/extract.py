@@ -43,12 +43,14 @@ from armscan.vision.stripe.image import (
     relative_reflectance,
 )
 from armscan.vision.stripe.ridge import (
+    BLUR_PX,
     ImageLevel,
     RidgePoints,
     find_candidates,
     find_line_sigma,
     is_bright,
     is_of_bytes,
+    less_noisy,
     measure_level,
     trace_ridges,
 )
@@ -106,7 +108,9 @@ def extract_stripes(
     threshold = None if options.threshold is None else options.threshold / full_scale
     if exposure.colour == "mono" and background is None:
         if options.method == "fit":
-            return _find(exposure, *lit_plane(exposure, threshold), options, threshold)
+            plane, level = lit_plane(exposure, threshold)
+            if not level.is_noisy:
+                return _find(exposure, plane, level, options, threshold)
         if options.method == "fast" and is_of_bytes(exposure.image):
             level = measure_level(exposure.image, threshold, 1.0 / full_scale, SPARSE)
             return _find_fast(exposure, None, level, options)
@@ -160,8 +164,12 @@ def _find(
     if plane.reflectance.size > 1:
         image = plane.on_even_ground(image, noise)
         level = measure_level(image, threshold)
+    blur = 0.0
+    if level.is_noisy and options.method == "fit":
+        blur = BLUR_PX
+        image, level = less_noisy(image)
     runs = find_candidates(image, level)
-    sigma = options.line_sigma_px or find_line_sigma(image, runs, level)
+    sigma = options.line_sigma_px or find_line_sigma(image, runs, level, blur)
     if _is_too_thin(plane, sigma):
         return _find(exposure, bare, whole, options, threshold)
     if options.method == "fit":

@@ -19,7 +19,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
-from armscan.models.two_views import IntrinsicsUse
+from armscan.models.two_views import IntrinsicsUse, TwoViews
 from rigs.stereo_rig import (
     CONVERGING,
     GRID,
@@ -237,3 +237,34 @@ def test_outliers_are_left_out_and_counted() -> None:
     assert np.flatnonzero(found.is_outlier).tolist() == [4, 50]
     assert any("right camera: 2 points lie too far out" in warning for warning in fit.warnings)
     assert normalised_stereo_error(scene.views, fit) < stats.chi2.ppf(0.9995, 24)
+
+
+def test_a_point_without_a_ray_is_left_out_of_the_epipolar_distances() -> None:
+    """A corner of a wide lens's image lies beyond what its distortion can invert."""
+    wide = replace(LEFT, distortion=np.array([-0.6, 0.0, 0.0, 0.0, 0.0]))
+    scene = StereoScene(views=TwoViews(wide, RIGHT, CONVERGING), distance_mm=230.0)
+    pairs = make_pairs(scene, 0)[0]
+    centre = np.array([wide.cx_px, wide.cy_px])
+    outward = [pair.left.points_px - centre for pair in pairs if pair.left is not None]
+    farthest = [np.hypot(*rays.T).max() for rays in outward]
+    k = int(np.argmax(farthest))
+    left, at = pairs[k].left, np.hypot(*outward[k].T).argmax()
+    assert left is not None
+    points = left.points_px.copy()
+    points[at] = centre + outward[k][at] * (1.02 * fold_px(wide) / farthest[k])
+    assert not wide.undistort(points)[1].all()
+    pairs[k] = replace(pairs[k], left=replace(left, points_px=points))
+    fit = solved(pairs, scene)
+    matched = fit.pairs[k].matched
+    assert matched is not None
+    assert len(matched.depth_mm) == len(points) - 1
+    assert fit.epipolar_rms_px < 0.2
+
+
+def fold_px(camera: CameraModel) -> float:
+    """Radius in the image at which a lens of ``k1`` alone, negative, folds over: its derivative's
+    zero.
+    """
+    k1 = float(camera.distortion[0])
+    radius = (-1.0 / (3.0 * k1)) ** 0.5
+    return camera.fx_px * radius * (1.0 + k1 * radius**2)

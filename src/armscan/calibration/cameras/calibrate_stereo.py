@@ -343,11 +343,14 @@ def _matched(
     _, in_left, in_right = np.intersect1d(left.point_index, right.point_index, return_indices=True)
     left_px, right_px = left.points_px[in_left], right.points_px[in_right]
     apart_left_px, apart_right_px = epipolar_distances_px(views, left_px, right_px)
+    # at the edge of a wide lens a pixel may have no ray
+    has_ray = np.isfinite(apart_left_px) & np.isfinite(apart_right_px)
+    depth_mm = sensor_from_board.apply(left.points_board_mm[in_left])[:, 2]
     return MatchedPoints(
-        left_px=left_px,
-        in_left_px=apart_left_px,
-        in_right_px=apart_right_px,
-        depth_mm=sensor_from_board.apply(left.points_board_mm[in_left])[:, 2],
+        left_px=left_px[has_ray],
+        in_left_px=apart_left_px[has_ray],
+        in_right_px=apart_right_px[has_ray],
+        depth_mm=depth_mm[has_ray],
     )
 
 

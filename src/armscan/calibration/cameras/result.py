@@ -477,12 +477,31 @@ def _about_views(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> list[str
     ]
     warnings += [f"{view.source} cannot be used: {view.reason}" for view in fit.refused_views]
     warnings += _about_repeats(repeats)
-    n_outliers = sum(int(view.is_outlier.sum()) for view in fit.used_views)
-    if n_outliers:
-        warnings.append(f"{n_outliers} points lie too far out and were not used")
+    warnings += _about_outliers(fit)
     if fit.n_views < FEW_VIEWS:
         warnings.append(f"only {fit.n_views} views: take 10 to 20")
     return warnings
+
+
+FEW_OUTLIERS, EDGE_QUANTILE = 5, 0.95
+
+
+def _about_outliers(fit: CameraFit) -> list[str]:
+    is_outlier = np.concatenate([view.is_outlier for view in fit.used_views])
+    n = int(is_outlier.sum())
+    if not n:
+        return []
+    said = f"{n} points lie too far out and were not used"
+    points_px = np.concatenate([view.view.points_px for view in fit.used_views])
+    radius = np.hypot(points_px[:, 0] - fit.camera.cx_px, points_px[:, 1] - fit.camera.cy_px)
+    edge = np.quantile(radius, EDGE_QUANTILE)
+    if n < FEW_OUTLIERS or np.median(radius[is_outlier]) < edge:
+        return [said]
+    return [
+        f"{said}, most of them more than {edge:.0f} px from the image's centre: the lens is wider "
+        "than five coefficients can describe; do not measure farther out, hold-out figures leave "
+        "such points out, too"
+    ]
 
 
 def _about_repeats(repeats: Sequence[tuple[str, str]]) -> list[str]:
@@ -620,7 +639,7 @@ def reasons_to_refuse(fit: CameraFit) -> tuple[str, ...]:
     held_out = fit.cross_validation
     rms_px = fit.rms_px if held_out is None else max(fit.rms_px, held_out.rms_px)
     return (
-        *focal_reasons(fit.camera, float(fit.sigma[0]), float(fit.sigma[1])),
+        *focal_reasons(fit.camera, float(fit.sigma[0]), float(fit.sigma[1]), _n_misfits(fit)),
         *rms_reasons(fit.camera, rms_px),
         *stretch_reasons(fit.stretch, fit.stretch_sigma),
     )
@@ -637,15 +656,25 @@ def stretch_reasons(stretch: float, sigma: float) -> tuple[str, ...]:
     )
 
 
-def focal_reasons(camera: CameraModel, sigma_fx_px: float, sigma_fy_px: float) -> tuple[str, ...]:
-    """Why a camera's focal length is known too badly; empty if it is not."""
+def _n_misfits(fit: CameraFit) -> int:
+    return sum(view.is_misfit for view in fit.used_views)
+
+
+def focal_reasons(
+    camera: CameraModel, sigma_fx_px: float, sigma_fy_px: float, n_misfits: int = 0
+) -> tuple[str, ...]:
+    """Why a camera's focal length is known too badly; empty if it is not.
+
+    ``n_misfits``: Views that were used and fit much worse than the others.
+    """
     known_to = max(sigma_fx_px / camera.fx_px, sigma_fy_px / camera.fy_px)
     if known_to <= LARGEST_FOCAL_SIGMA:
         return ()
+    misfits = f"; of views that fit much worse there are {n_misfits}: try --auto-leave-out"
     return (
         f"the camera's focal length is known to {100.0 * known_to:.1f} % only, "
         f"{100.0 * LARGEST_FOCAL_SIGMA:.0f} % is the limit (boards tilted by some 30 degrees, "
-        "one to the left, one to the right, one up, one down, tell it)",
+        f"one to the left, one to the right, one up, one down, tell it{misfits * (n_misfits > 0)})",
     )
 
 

@@ -67,7 +67,7 @@ class ViewResiduals(ArrayRecord):
 
 
 class MatchedPoints(RowRecord):
-    """Target points that both views of a pair show.
+    """Target points that both views of a pair show, where the lenses' models reach.
 
     Parameters
     ----------

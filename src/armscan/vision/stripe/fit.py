@@ -325,6 +325,9 @@ NARROW, WIDE = 0.7, 1.4
 NARROWEST, HALF_AS_WIDE = 0.33, 0.5
 """Narrower still are most dots and edges that a photograph shows beside its lines; and what was
 fitted in a window that is too wide is good enough to half its width."""
+LEAST_LOST_PX = 50.0
+"""Length of a chain of which points that could not be fitted are tried again: the corners of
+chessboards between their squares are 15 to 40 px long."""
 
 
 def _fit_in_own_width(
@@ -349,7 +352,7 @@ def _fit_in_own_width(
     """
     is_lost = values[:, VARIANCE] == 0.0
     own = np.where(is_lost, np.nan, values[:, SIGMA] / start.sigma)
-    lost = np.flatnonzero(is_lost)
+    lost = np.flatnonzero(is_lost & (start.length >= LEAST_LOST_PX))
     own[lost] = widths_at(plane.image, ridge.table[lost]) / start.line_sigma_px
     narrow = np.where(is_lost, NARROW, HALF_AS_WIDE)
     at = np.flatnonzero((own < narrow) | (own > WIDE))
@@ -451,13 +454,14 @@ def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatAr
 class _Start:
     """Where fits begin: as for `begin_fits`.
 
-    ``line_sigma_px``: Typical sigma of the lines.
+    ``length``: (N,) of each point's chain in px. ``line_sigma_px``: Typical sigma of the lines.
     """
 
     neighbour: FloatArray
     sigma: FloatArray
     reach: FloatArray
     run: IntArray
+    length: FloatArray
     line_sigma_px: float
 
     @property
@@ -473,7 +477,12 @@ def _begin(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> _Sta
     is_line = (length >= SHORTEST_PX).astype(np.int64)
     given = (ridge.table, ridge.chain, first, stop, is_line)
     start = _Start(
-        np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64), line_sigma_px
+        np.zeros((n, 2)),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n, dtype=np.int64),
+        length=length,
+        line_sigma_px=line_sigma_px,
     )
     seen_px = max(start.clear_px, LEAST_REACH_PX)
     find_other_lines(*given, height, width, seen_px, start.neighbour)

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.vision.stripe.extract import extract_stripes
@@ -96,3 +97,19 @@ def test_what_is_dark_need_not_be_copied(bits: int) -> None:
     assert not plane.image[470:, 570:].any()
     bright = every.lit.repeat(64, axis=0).repeat(64, axis=1)[:530, :700] > 0
     assert whole[~bright].max() < every.background.max() + every.rise
+
+
+def test_the_corners_of_a_chessboard_beside_a_thick_line_are_no_narrow_lines() -> None:
+    """Where squares meet they look like a ridge of 15 to 40 px, narrower than the laser's line."""
+    y, x = np.mgrid[:600, :800].astype(np.float64)
+    turned = np.stack([0.8 * x + 0.6 * y, 0.8 * y - 0.6 * x]) / 70.0
+    squares = np.where(np.floor(turned).astype(np.int64).sum(axis=0) % 2 == 0, 100.0, 25.0)
+    for seed in range(3):
+        image = gaussian_filter(squares, 2.0)
+        image += 900.0 * np.exp(-0.5 * ((x - 80.0 - 0.05 * y) / 6.0) ** 2)
+        image += np.random.default_rng(seed).normal(0.0, 2.0, image.shape)
+        profile = extract_stripes(Exposure(np.clip(image, 0, 255).astype(np.uint8), "print"))
+        good = profile.points_px[profile.is_accepted]
+        off = good[:, 0] - 80.0 - 0.05 * good[:, 1]
+        assert (np.abs(off) < 3.0).sum() > 150
+        assert (np.abs(off) > 40.0).sum() == 0

@@ -38,7 +38,7 @@ SHOWN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
     "jobs/sheets": (LASER,),
     "jobs/hand_eye": (HAND_EYE,),
     "jobs/verify": (VERIFY,),
-    "jobs/markers": (("markers",),),
+    "jobs/photographs": (("markers",), ("stripes",)),
     "jobs/register": (("register",),),
     "jobs/probe": (("probe",),),
     "pipeline/register": (("register",),),

@@ -26,8 +26,8 @@ from armscan.cli.live.rig import CONSOLE_EXAMPLE, RECORD_EXAMPLE, console, recor
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
-    *("demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers", "register"),
-    *("clean", "inspect", "verify", "mesh"),
+    *("demo", "simulate", "probe", "calibrate", "reconstruct", "fuse"),
+    *("stripes", "markers", "register", "clean", "inspect", "verify", "mesh"),
     *("record", "console"),
     *("convert", "recover", "info", "devices", "doctor"),
 )
@@ -103,6 +103,7 @@ app.command("reconstruct", epilog=reconstruct_command.RECONSTRUCT_EXAMPLE)(
     reconstruct_command.reconstruct
 )
 app.command("fuse", epilog=reconstruct_command.FUSE_EXAMPLE)(reconstruct_command.fuse)
+app.command("stripes", epilog=points.STRIPES_EXAMPLE)(points.stripes)
 app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
 app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
 app.command("clean", epilog=surface.CLEAN_EXAMPLE)(surface.clean)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan probe``, ``markers`` and ``register``: touches, ring markers, scans joined by them."""
+"""``armscan probe``, ``stripes``, ``markers``, ``register``: touches, and what images show."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from armscan.cli.options import (
     BitsAlign,
     BitsUsed,
     DefaultOf,
+    LaserColourOption,
     Method,
     MethodOption,
     Side,
+    StripeMethodOption,
     given,
     refuse_vain,
 )
@@ -24,6 +26,11 @@ PROBE_EXAMPLE = (
     "\b\nExamples:\n"
     "  armscan probe touches/ -o plate.csv\n"
     "  armscan probe centres.csv --side +x -o plate.csv"
+)
+STRIPES_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan stripes 'photos/*.png'\n"
+    "  armscan stripes scan/ --laser-colour green --stripe-method fast -o lines.csv"
 )
 MARKERS_EXAMPLE = (
     "\b\nExamples:\n"
@@ -65,6 +72,9 @@ Disc = Annotated[
 TouchedPoints = Annotated[
     Path | None,
     typer.Option("-o", "--output", help="Points on the surface, a CSV table.", show_default=False),
+]
+StripeFile = Annotated[
+    Path | None, typer.Option("-o", "--output", help="Table NAME.csv, with a page beside it.")
 ]
 MarkerFile = Annotated[
     Path | None,
@@ -122,6 +132,32 @@ def probe(
     return lambda job: probe_plate(job, touches, probe, options)
 
 
+@job_command(StripeFile, None)
+def stripes(
+    images: Annotated[
+        list[str],
+        typer.Argument(help="Image files, folders, or quoted patterns.", show_default=False),
+    ],
+    *,
+    laser_colour: LaserColourOption = None,
+    stripe_method: StripeMethodOption = None,
+    bits_used: BitsUsed = None,
+    bits_align: BitsAlign = None,
+) -> Work:
+    """Find laser lines in images, without any calibration.
+
+    A first look at photographs: where each line is, how well its centre is known, and why points
+    were flagged. Each image is looked at by itself; `calibrate laser` finds one colour for all.
+    """
+    from armscan.jobs.photographs import find_stripes
+    from armscan.storage.images import ImageOptions
+    from armscan.vision.stripe.image import StripeOptions
+
+    options = given(StripeOptions, laser_colour=laser_colour, method=stripe_method)
+    pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
+    return lambda job: find_stripes(job, images, stripes=options, image_options=pixels)
+
+
 @job_command(MarkerFile, None)
 def markers(
     *,
@@ -162,7 +198,7 @@ def markers(
     With two calibrated cameras, also where they are.
     """
     from armscan.errors import OptionError
-    from armscan.jobs.markers import find_markers, measure_markers
+    from armscan.jobs.photographs import find_markers, measure_markers
     from armscan.markers.candidates import RingMatchOptions, parse_depth
     from armscan.storage.images import ImageOptions
     from armscan.vision.rings import RingOptions

@@ -19,7 +19,7 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.report.drawing import Marks, photo_markup
 from armscan.report.page import Block, Gallery, Legend, Page, Picture, Section, Text, page_of
-from armscan.report.quantity import Table, without_source
+from armscan.report.quantity import Quantity, Table, plural, without_source
 from armscan.vision.targets.target import TargetView
 
 T = TypeVar("T")
@@ -227,6 +227,81 @@ def stripe_gallery(
     if len(shown) < len(counts):
         text += f" {len(shown)} of {len(counts)} images are shown, evenly chosen."
     return Text(text), stripe_legend(sheet_names, statuses, flags), Gallery(pictures, 420)
+
+
+def stripe_page(
+    profiles: Sequence[Profile],
+    exposures: Mapping[str, Exposure],
+    warnings: Sequence[str],
+    provenance: Provenance,
+    *,
+    is_simulated: bool,
+) -> Page:
+    """Page of the stripes of photographs, each found by itself.
+
+    ``exposures``: those that are shown, by source name.
+    """
+    pictures = []
+    for profile in profiles:
+        if profile.source in exposures:
+            status = (~profile.is_accepted).astype(np.int64)
+            caption = f"{(status == 0).sum()} of {len(profile)} points accepted"
+            sheet = np.zeros(len(profile), np.int64)
+            exposure = exposures[profile.source]
+            pictures.append(stripe_picture(exposure, profile, status, sheet, {}, caption=caption))
+    flags = flags_of((profile, (~profile.is_accepted).astype(np.int64)) for profile in profiles)
+    accepted = ((sheet_colour(0), "accepted"),)
+    text = "Every stripe point found, each photograph by itself. Dark ones are brightened here."
+    if len(pictures) < len(profiles):
+        text += f" {len(pictures)} of {len(profiles)} images are shown, evenly chosen."
+    return page_of(
+        provenance,
+        "Laser stripes",
+        plural(len(profiles), "image"),
+        (
+            Section(
+                "Stripes in the images",
+                (Text(text), stripe_legend((), accepted, flags), Gallery(tuple(pictures), 420)),
+            ),
+            Section("Every image", (stripe_table(profiles),)),
+        ),
+        cards=stripe_quantities(profiles),
+        warnings=warnings,
+        is_simulated=is_simulated,
+    )
+
+
+def stripe_quantities(profiles: Sequence[Profile]) -> tuple[Quantity, ...]:
+    """What is told of the stripes of photographs."""
+    good = [profile.select(profile.is_accepted) for profile in profiles]
+    n_points = sum(map(len, good))
+    flagged = plural(sum(map(len, profiles)) - n_points, "flagged point") + " beside them"
+    sigma_px, width_px = (
+        float(np.median(np.concatenate(values))) if n_points else float("nan")
+        for values in ([one.sigma_px for one in good], [one.width_px for one in good])
+    )
+    n_shown = sum(len(one) > 0 for one in good)
+    told = "along its normal, median"
+    return (
+        Quantity("n_images", "Images with a line", n_shown, meaning=f"of {len(profiles)}"),
+        Quantity("n_points", "Points accepted", n_points, meaning=flagged),
+        Quantity("sigma_px", "Sigma of a centre", sigma_px, unit="px", meaning=told),
+        Quantity("width_px", "Sigma of the line", width_px, unit="px", meaning="median"),
+    )
+
+
+def stripe_table(profiles: Sequence[Profile]) -> Table:
+    """Counts of points of each photograph, and what the others were flagged for."""
+    rows = []
+    for profile in profiles:
+        rejected = profile.flags[~profile.is_accepted]
+        said = []
+        for flag, (_, label) in FLAG_COLOURS.items():
+            if n := int(((rejected & int(flag)) != 0).sum()):
+                said.append(f"{n} {label.removeprefix('flagged: ')}")
+        n_good = len(profile) - len(rejected)
+        rows.append((profile.source, str(n_good), str(len(rejected)), ", ".join(said)))
+    return Table(("image", "accepted", "flagged", "flagged for"), tuple(rows), "", (3,))
 
 
 def stripe_picture(

@@ -25,7 +25,7 @@ from armscan.geometry.rotations import (
     vector_from_rotation,
 )
 from armscan.records.points import MarkerSet, ProbedPoints
-from armscan.records.profile import PointProfile
+from armscan.records.profile import PointProfile, Profile, StripeFlag
 from armscan.records.recording import PoseForm
 from armscan.storage.codec import parse_json
 from armscan.storage.files import is_folder, path_text, read_bytes, told_of
@@ -49,6 +49,9 @@ FORM_COLUMNS: Final[dict[PoseForm, tuple[str, ...]]] = {
     "euler": ("a_deg", "b_deg", "c_deg"),
     "joints": (),
 }
+STRIPE_NUMBERS: Final = (
+    *("x_px", "y_px", "sigma_px", "normal_x", "normal_y", "width_px", "intensity"),
+)
 NORM_TOLERANCE = 1e-6
 ORTHONORMAL_TOLERANCE = 1e-5
 """Six decimals of nine numbers leave up to about 3e-6, more than a `Pose` allows; what passes is
@@ -473,6 +476,32 @@ def markers_csv(markers: MarkerSet, *, is_simulated: bool = False) -> bytes:
     columns |= number_columns(COVARIANCES, upper)
     marks = (SIMULATED,) if is_simulated else ()
     return csv_bytes(columns, (f"{FRAME} {markers.frame}", *marks))
+
+
+def stripes_csv(profiles: Sequence[Profile], *, is_simulated: bool = False) -> bytes:
+    """Text of a table of the stripe points of images, rejected ones too.
+
+    Columns ``image``, `STRIPE_NUMBERS`, ``segment``, ``accepted`` and ``flags``: the centre, its
+    standard deviation along the normal, the normal, sigma of the line's section, peak above the
+    background in grey levels, number of the connected segment in its image, 1 for points that
+    count, and the names of all `StripeFlag` of the point.
+    """
+    said = {
+        flags: "+".join(flag.name or "" for flag in StripeFlag(flags))
+        for flags in {int(flags) for profile in profiles for flags in np.unique(profile.flags)}
+    }
+    columns: dict[str, tuple[str, ...]] = {
+        "image": tuple(profile.source for profile in profiles for _ in range(len(profile)))
+    }
+    numbers = [
+        np.column_stack([p.points_px, p.sigma_px, p.normals_px, p.width_px, p.intensity])
+        for p in profiles
+    ]
+    columns |= number_columns(STRIPE_NUMBERS, np.concatenate([*numbers, np.zeros((0, 7))]))
+    columns["segment"] = tuple(str(one) for p in profiles for one in p.segment.tolist())
+    columns["accepted"] = tuple(str(int(one)) for p in profiles for one in p.is_accepted.tolist())
+    columns["flags"] = tuple(said[one] for p in profiles for one in p.flags.tolist())
+    return csv_bytes(columns, (SIMULATED,) if is_simulated else ())
 
 
 def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_MM) -> MarkerList:

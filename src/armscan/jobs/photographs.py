@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From photographs of ring markers to a table of markers, measured or only found, and a page."""
+"""What photographs show by themselves: ring markers, measured or only found, and laser stripes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from armscan.markers.stereo_matching import StereoMatches, match_rings
 from armscan.models.two_views import StereoCalibration, TwoViews
 from armscan.pipeline.progress import Progress, ProgressEvent
 from armscan.records.exposure import Exposure
+from armscan.records.profile import Profile
 from armscan.report.markers import (
     detection_page,
     marker_page,
@@ -23,17 +24,96 @@ from armscan.report.markers import (
     ring_quantities,
     status_table,
 )
+from armscan.report.photographs import (
+    MAX_PICTURES,
+    evenly_chosen,
+    stripe_page,
+    stripe_quantities,
+    stripe_table,
+)
 from armscan.report.quantity import Summary, Table
 from armscan.storage.documents import read_stereo_calibration
 from armscan.storage.image_paths import are_simulated, expand_paths
-from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.points import markers_csv
+from armscan.storage.images import ImageOptions, read_exposure, read_exposures, source_names
+from armscan.storage.points import markers_csv, stripes_csv
 from armscan.thesis.two_cameras import DecodedLine, find_coded_lines, parse_code
 from armscan.vision.rings import RingDetection, RingOptions, detect_rings, perimeter_limits
+from armscan.vision.stripe.extract import extract_stripes, load_stripe_method
+from armscan.vision.stripe.image import StripeOptions
 
 FEW_MARKERS = 4
 LARGE_MISCLOSURE = 2.0
 """Root mean square of epipolar distances over their sigma from which the calibration is doubted."""
+
+
+def find_stripes(
+    job: Job,
+    images: Sequence[str],
+    *,
+    stripes: StripeOptions | None = None,
+    image_options: ImageOptions | None = None,
+) -> Summary:
+    """Find the laser lines in images, each by itself, without any calibration.
+
+    Parameters
+    ----------
+    job
+        Where to write the table ``NAME.csv``, with a page beside it; ``stripes.csv`` in the current
+        folder if nowhere.
+    images
+        Files, folders or patterns.
+    stripes, image_options
+        How lines are found, and how pixels are read.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable or an option is wrong; nothing is written then.
+    """
+    stripes, image_options = stripes or StripeOptions(), image_options or ImageOptions()
+    job = job if job.output else replace(job, output=Path("stripes.csv"))
+    places = job.places(".csv", beside=(".html",))
+    paths = expand_paths(images)
+    names = source_names(paths)
+    load_stripe_method(stripes.method)
+    shown = set(evenly_chosen(names, MAX_PICTURES))
+    exposures: dict[str, Exposure] = {}
+    profiles: list[Profile] = []
+    for k, (path, name) in enumerate(zip(paths, names, strict=True)):
+        exposure = read_exposure(path, image_options, source=name)
+        profiles.append(extract_stripes(exposure, stripes))
+        if name in shown:
+            exposures[name] = exposure
+        job.progress(ProgressEvent("stripes", k + 1, len(paths), name))
+    warnings = _without_line(profiles)
+    provenance = job.provenance(paths, (stripes, image_options), warnings=warnings)
+    is_simulated = are_simulated(paths)
+    page = stripe_page(profiles, exposures, warnings, provenance, is_simulated=is_simulated)
+    table = stripes_csv(profiles, is_simulated=is_simulated)
+    return Summary(
+        title="Laser stripes in simulated images." if is_simulated else "Laser stripes.",
+        quantities=stripe_quantities(profiles),
+        tables=(stripe_table(profiles),) if len(profiles) <= LISTED else (),
+        warnings=warnings,
+        written=job.write({places[0]: table, places[1]: page}),
+        next_step=f"open {places[1]}; `armscan calibrate laser -h` makes points of such stripes",
+        extra={"kind": "stripes", "simulated": is_simulated},
+    )
+
+
+NAMED, LISTED = 5, 40
+"""Images that a warning names, and those that the terminal lists: the page has them all."""
+
+
+def _without_line(profiles: Sequence[Profile]) -> tuple[str, ...]:
+    empty = [profile.source for profile in profiles if not profile.is_accepted.any()]
+    if not empty:
+        return ()
+    more = f" and {len(empty) - NAMED} more" if len(empty) > NAMED else ""
+    return (
+        f"no line was found in {', '.join(empty[:NAMED])}{more}: if there is one, "
+        "`armscan stripes --laser-colour` says in which colours it shows",
+    )
 
 
 def find_markers(
@@ -64,7 +144,7 @@ def find_markers(
     """
     rings, image_options = rings or RingOptions(), image_options or ImageOptions()
     job = job if job.output else replace(job, output=Path("markers.html"))
-    places = job.places(".html", hint="; a table of markers needs --stereo")
+    places = job.places(".html", hint="; a table of markers needs `armscan markers --stereo`")
     known = tuple(parse_code(text) for text in codes)
     paths = expand_paths(images)
     exposures = read_exposures(paths, image_options)
@@ -164,7 +244,7 @@ def measure_markers(
     paths = expand_paths(images)
     if len(paths) != 2:
         raise OptionError(
-            f"{len(paths)} images are given with --stereo",
+            f"{len(paths)} images are given to `armscan markers --stereo`",
             remedy="give the left one, then the right",
         )
     exposures = read_exposures(paths, image_options)
@@ -180,7 +260,7 @@ def measure_markers(
             f"no marker was matched ({len(left)} rings left, {len(right)} right"
             + (f"; {counts})" if counts else ")"),
             remedy="check that the left image comes first, show four markers or more to both "
-            "cameras, and state their --diameter",
+            "cameras, and state their size as in `armscan markers --diameter 6`",
         )
     warnings = _warnings(matches)
     provenance = job.provenance(

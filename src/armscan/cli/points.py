@@ -147,7 +147,7 @@ def stripes(
     """Find laser lines in images, without any calibration.
 
     A first look at photographs: where each line is, how well its centre is known, and why points
-    were flagged. Each image is looked at by itself; `calibrate laser` finds one colour for all.
+    were flagged. Colour images are looked at in the colour that most of them show.
     """
     from armscan.jobs.photographs import find_stripes
     from armscan.storage.images import ImageOptions

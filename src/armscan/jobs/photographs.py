@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from armscan.errors import EstimationError, InputError, OptionError
 from armscan.jobs.job import Job
 from armscan.markers.candidates import RingMatchOptions
 from armscan.markers.stereo_matching import StereoMatches, match_rings
+from armscan.models.calibration import LaserColour
 from armscan.models.two_views import StereoCalibration, TwoViews
 from armscan.pipeline.progress import Progress, ProgressEvent
 from armscan.records.exposure import Exposure
@@ -31,7 +33,7 @@ from armscan.report.photographs import (
     stripe_quantities,
     stripe_table,
 )
-from armscan.report.quantity import Summary, Table
+from armscan.report.quantity import Quantity, Summary, Table
 from armscan.storage.documents import read_stereo_calibration
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposure, read_exposures, source_names
@@ -39,7 +41,7 @@ from armscan.storage.points import markers_csv, stripes_csv
 from armscan.thesis.two_cameras import DecodedLine, find_coded_lines, parse_code
 from armscan.vision.rings import RingDetection, RingOptions, detect_rings, perimeter_limits
 from armscan.vision.stripe.extract import extract_stripes, load_stripe_method
-from armscan.vision.stripe.image import StripeOptions
+from armscan.vision.stripe.image import StripeOptions, find_laser_colour, split_channels
 
 FEW_MARKERS = 4
 LARGE_MISCLOSURE = 2.0
@@ -53,7 +55,9 @@ def find_stripes(
     stripes: StripeOptions | None = None,
     image_options: ImageOptions | None = None,
 ) -> Summary:
-    """Find the laser lines in images, each by itself, without any calibration.
+    """Find the laser lines in images, without any calibration.
+
+    Where most of a sample of colour images show one laser colour, all are looked at in it.
 
     Parameters
     ----------
@@ -76,6 +80,8 @@ def find_stripes(
     paths = expand_paths(images)
     names = source_names(paths)
     load_stripe_method(stripes.method)
+    if stripes.laser_colour == "auto":
+        stripes = replace(stripes, laser_colour=_common_colour(paths, image_options))
     shown = set(evenly_chosen(names, MAX_PICTURES))
     exposures: dict[str, Exposure] = {}
     profiles: list[Profile] = []
@@ -92,13 +98,33 @@ def find_stripes(
     table = stripes_csv(profiles, is_simulated=is_simulated)
     return Summary(
         title="Laser stripes in simulated images." if is_simulated else "Laser stripes.",
-        quantities=stripe_quantities(profiles),
+        quantities=(
+            *stripe_quantities(profiles),
+            Quantity(
+                "laser_colour", "Laser colour", stripes.laser_colour, meaning="of colour images"
+            ),
+        ),
         tables=(stripe_table(profiles),) if len(profiles) <= LISTED else (),
         warnings=warnings,
         written=job.write({places[0]: table, places[1]: page}),
         next_step=f"open {places[1]}; `armscan calibrate laser -h` makes points of such stripes",
         extra={"kind": "stripes", "simulated": is_simulated},
     )
+
+
+VOTERS, MAJORITY = 12, 2.0 / 3.0
+"""Images that are asked for the laser's colour, and the part of them that decides for all."""
+
+
+def _common_colour(paths: Sequence[Path], options: ImageOptions) -> LaserColour:
+    """The colour that most of a sample of images show; ``auto``, each its own, if none is."""
+    votes: Counter[LaserColour] = Counter()
+    for path in evenly_chosen(paths, VOTERS):
+        exposure = read_exposure(path, options)
+        if exposure.colour != "mono":
+            votes[find_laser_colour(split_channels(exposure, None))] += 1
+    colour, n = (votes or Counter({"auto": 1})).most_common(1)[0]
+    return colour if n >= MAJORITY * votes.total() else "auto"
 
 
 NAMED, LISTED = 5, 40

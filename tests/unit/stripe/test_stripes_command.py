@@ -76,3 +76,20 @@ def test_wrong_options_are_named(
 ) -> None:
     assert main(["stripes", str(photographs), *words]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_one_colour_is_taken_for_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two of three photographs show a red line; in the third a blue pattern stands out more."""
+    folder = tmp_path / "colours"
+    folder.mkdir()
+    for k in range(3):
+        image = SCENE.expose_red(k).image.copy()
+        if k == 2:
+            image[:, 20:300:40, 2] = 255
+            image[:, 21:300:40, 2] = 255
+        cv2.imwrite(str(folder / f"{k}.png"), image[:, :, ::-1])
+    assert main(["stripes", str(folder), "-o", str(tmp_path / "lines.csv"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["laser_colour"] == "red"
+    alone = ["stripes", str(folder / "2.png"), "-o", str(tmp_path / "alone.csv"), "--json"]
+    assert main(alone) == 0
+    assert json.loads(capsys.readouterr().out)["laser_colour"] == "blue"

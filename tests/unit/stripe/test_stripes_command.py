@@ -83,7 +83,7 @@ def test_one_colour_is_taken_for_all(tmp_path: Path, capsys: pytest.CaptureFixtu
     folder = tmp_path / "colours"
     folder.mkdir()
     for k in range(3):
-        image = SCENE.expose_red(k).image.copy()
+        image = SCENE.expose_red(k, 1.0).image.copy()
         if k == 2:
             image[:, 20:300:40, 2] = 255
             image[:, 21:300:40, 2] = 255

@@ -214,6 +214,41 @@ def test_noise_alone_shows_no_line(noise: float, grain_px: float) -> None:
         assert not profile.is_accepted.any()
 
 
+@pytest.mark.parametrize("period_px", [0.0, 8.0, 16.0, 32.0, 60.0])
+@pytest.mark.parametrize("height", [2.0, 4.0])
+def test_rows_that_a_lamp_or_the_sensor_brightens_are_no_lines(
+    period_px: float, height: float
+) -> None:
+    """Beside noise of 4: of each row by itself (period 0), or in waves down the image."""
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        rows = rng.normal(0.0, height, 480)
+        if period_px > 0.0:
+            rows = height * np.sin(2.0 * np.pi * np.arange(480) / period_px)
+        image = 60.0 + rng.normal(0.0, 4.0, (480, 640)) + rows[:, None]
+        profile = extract_stripes(Exposure(image.round().astype(np.uint8), "rows"))
+        assert not profile.is_accepted.any()
+
+
+@pytest.mark.parametrize(("most_px", "own_px", "apart_px"), [(2.5, 7.0, 36.0), (3.0, 6.0, 36.0)])
+def test_a_wide_line_does_not_take_its_neighbour_for_background(
+    most_px: float, own_px: float, apart_px: float
+) -> None:
+    curves = [StraightCurve(320.0, y, 1.5) for y in (40.0, 90.0, 150.0)]
+    stripes = [SimulatedStripe(curve, sigma_px=most_px, peak=150.0) for curve in curves]
+    wide = StraightCurve(320.0, 150.0 + apart_px, 1.5)
+    stripes.append(SimulatedStripe(wide, sigma_px=own_px, peak=150.0))
+    scene = StripeScene(tuple(stripes), 640, 260)
+    result = score(scene, range(2))
+    squares = []
+    for profile in result.profiles:
+        good = profile.select(profile.is_accepted)
+        distance, which, _ = scene.errors(good.points_px)
+        squares.append((distance / good.sigma_px)[which == 3] ** 2)
+    assert len(np.concatenate(squares)) > 1200
+    assert np.sqrt(np.concatenate(squares).mean()) < 1.5
+
+
 def test_weak_line_is_complete() -> None:
     scene = StripeScene((line(20.0, peak=15.0),), 320, 240)
     result = score(scene, SEEDS, length_px=300.0 / np.cos(np.radians(20.0)))

@@ -8,7 +8,6 @@ from scipy.special import erf
 
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.chessboard import MAX_SCATTER, off_lattice
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.saddle import fit_saddles
 from armscan.vision.targets.target import Charuco, Chessboard, TargetView
@@ -195,19 +194,3 @@ def test_bright_corners_of_skewed_edges_are_good_whatever_their_parity(
     points, _, is_good = fit_saddles(image, np.rint(true_px)[None], steps[0], steps[1])
     assert is_good.all()
     np.testing.assert_allclose(points[0], true_px, atol=0.05)
-
-
-def test_a_board_that_fills_the_view_of_a_wide_lens_is_a_lattice() -> None:
-    """The lens maps angles to radii (f theta), 52 degrees to each side; one corner is 3 px off."""
-    board = np.stack(np.meshgrid(np.arange(15.0), np.arange(9.0)), axis=-1).reshape(-1, 2)
-    tangents = (board - board.mean(axis=0)) / 7.0 * 1.3
-    radius = np.hypot(*tangents.T)
-    ratio = np.arctan(radius) / np.maximum(radius, 1e-9)
-    points = 320.0 * tangents * ratio[:, None]
-    points += np.random.default_rng(0).normal(0.0, 0.05, points.shape)
-    points[40] += (2.5, 1.5)
-    step_px = float(np.median(np.diff(points[:15, 0])))
-    is_off, scatter_px = off_lattice(board, points, np.full(len(board), 0.02), 0.02 * step_px)
-    # beside it, corners of the board that the others tell least of
-    assert is_off[40] and is_off.sum() <= 5
-    assert scatter_px < MAX_SCATTER * step_px

@@ -494,13 +494,13 @@ def _about_outliers(fit: CameraFit) -> list[str]:
     said = f"{n} points lie too far out and were not used"
     points_px = np.concatenate([view.view.points_px for view in fit.used_views])
     radius = np.hypot(points_px[:, 0] - fit.camera.cx_px, points_px[:, 1] - fit.camera.cy_px)
-    edge = np.quantile(radius, EDGE_QUANTILE)
+    edge = np.quantile(radius[~is_outlier], EDGE_QUANTILE)
     if n < FEW_OUTLIERS or np.median(radius[is_outlier]) < edge:
         return [said]
     return [
-        f"{said}, most of them more than {edge:.0f} px from the image's centre: the lens is wider "
-        "than five coefficients can describe; do not measure farther out, hold-out figures leave "
-        "such points out, too"
+        f"{said}, most of them more than {edge:.0f} px from the principal point: there the lens "
+        "seems wider than five coefficients can describe; do not measure farther out, hold-out "
+        "figures leave such points out, too"
     ]
 
 
@@ -670,11 +670,13 @@ def focal_reasons(
     known_to = max(sigma_fx_px / camera.fx_px, sigma_fy_px / camera.fy_px)
     if known_to <= LARGEST_FOCAL_SIGMA:
         return ()
-    misfits = f"; of views that fit much worse there are {n_misfits}: try --auto-leave-out"
+    misfits = ""
+    if n_misfits:
+        misfits = f"; of views that fit much worse there are {n_misfits}: try --auto-leave-out"
     return (
         f"the camera's focal length is known to {100.0 * known_to:.1f} % only, "
         f"{100.0 * LARGEST_FOCAL_SIGMA:.0f} % is the limit (boards tilted by some 30 degrees, "
-        f"one to the left, one to the right, one up, one down, tell it{misfits * (n_misfits > 0)})",
+        f"one to the left, one to the right, one up, one down, tell it{misfits})",
     )
 
 

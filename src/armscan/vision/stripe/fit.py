@@ -17,7 +17,9 @@ from armscan.kernels.stripe.profile_fit import (
     AMPLITUDE,
     CENTRE,
     FIT_COLUMNS,
+    FOOT_SIGMAS,
     REACH_SIGMAS,
+    SIDE_FAR,
     SIDE_SPAN,
     SIGMA,
     VARIANCE,
@@ -323,11 +325,12 @@ def fit_ridge(
 NARROW, WIDE = 0.7, 1.4
 """Of the typical sigma, beyond which a line is fitted in windows for its own width."""
 NARROWEST, HALF_AS_WIDE = 0.33, 0.5
-"""Narrower still are most dots and edges that a photograph shows beside its lines; and what was
-fitted in a window that is too wide is good enough to half its width."""
-LEAST_LOST_PX = 50.0
-"""Length of a chain of which points that could not be fitted are tried again: the corners of
-chessboards between their squares are 15 to 40 px long."""
+"""Narrower still are most dots and edges that a photograph shows beside its lines; and what could
+be fitted in a window that is too wide is good enough to half its width."""
+LEAST_OWN_PX = 50.0
+"""Length of chains that are fitted again: corners of print between squares are 15 to 40 px long."""
+LARGEST_STEP = 0.05
+"""Of the background, over the line's height, with which a wider window is still better."""
 
 
 def _fit_in_own_width(
@@ -350,14 +353,16 @@ def _fit_in_own_width(
     ``start``: Of all points. ``values``, ``sides``, ``side_sigma``: Input and output; rows stay
     where the second fit fails, too.
     """
+    is_long = start.length >= LEAST_OWN_PX
     is_lost = values[:, VARIANCE] == 0.0
     own = np.where(is_lost, np.nan, values[:, SIGMA] / start.sigma)
-    lost = np.flatnonzero(is_lost & (start.length >= LEAST_LOST_PX))
+    lost = np.flatnonzero(is_lost & is_long)
     own[lost] = widths_at(plane.image, ridge.table[lost]) / start.line_sigma_px
     narrow = np.where(is_lost, NARROW, HALF_AS_WIDE)
-    at = np.flatnonzero((own < narrow) | (own > WIDE))
+    at = np.flatnonzero(is_long & ((own < narrow) | (own > WIDE)))
     own = median_along(own, ridge.chain, at, WIDTH_HALF)
-    is_other = ((own > NARROWEST) & (own < narrow[at])) | (own > WIDE)
+    is_narrow = (own > NARROWEST) & (own < narrow[at])
+    is_other = is_narrow | _has_room(plane, ridge, at, own, start.line_sigma_px)
     at, own = at[is_other], own[is_other]
     if not len(at):
         return
@@ -368,14 +373,32 @@ def _fit_in_own_width(
         sigma=start.sigma[at] * own,
         reach=start.reach[at],
         run=start.run[at],
+        length=start.length[at],
     )
     beside, beside_sigma = _sides(plane, table, again)
     fits = np.zeros((len(at), FIT_COLUMNS))
     images = (plane.image, plane.clipped, plane.reflectance)
     fit_profiles(*images, table, again.sigma, beside, noise, section, again.reach, fits)
-    good = fits[:, VARIANCE] > 0.0
+    step = np.abs(beside[:, 1] - beside[:, 0])
+    is_stepped = (own > WIDE) & (step > LARGEST_STEP * fits[:, AMPLITUDE])
+    good = (fits[:, VARIANCE] > 0.0) & ~is_stepped
     at = at[good]
     values[at], sides[at], side_sigma[at] = fits[good], beside[good], beside_sigma[good]
+
+
+def _has_room(
+    plane: StripePlane, ridge: RidgePoints, at: IntArray, own: FloatArray, line_sigma_px: float
+) -> BoolArray:
+    """(M,) True for wider lines, ``own`` (M,) typical sigmas, that no other line's foot reaches.
+
+    The background beside them is read farther out than where other lines were looked for.
+    """
+    is_wide = own > WIDE
+    if is_wide.any():
+        needed_px = (SIDE_FAR * own + FOOT_SIGMAS) * line_sigma_px
+        away = _other_lines(plane, ridge, float(needed_px[is_wide].max()))[at].min(axis=1)
+        is_wide &= away > needed_px
+    return is_wide
 
 
 def _nearly_largest(values: FloatArray) -> float:
@@ -471,24 +494,30 @@ class _Start:
 
 
 def _begin(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> _Start:
-    height, width = plane.image.shape
-    first, stop, length = chain_extents(ridge.table, ridge.chain)
     n = len(ridge)
-    is_line = (length >= SHORTEST_PX).astype(np.int64)
-    given = (ridge.table, ridge.chain, first, stop, is_line)
+    reach_px = max(CLEAR_SIGMAS * line_sigma_px, LEAST_REACH_PX)
     start = _Start(
-        np.zeros((n, 2)),
+        _other_lines(plane, ridge, reach_px),
         np.zeros(n),
         np.zeros(n),
         np.zeros(n, dtype=np.int64),
-        length=length,
+        length=chain_extents(ridge.table, ridge.chain)[2],
         line_sigma_px=line_sigma_px,
     )
-    seen_px = max(start.clear_px, LEAST_REACH_PX)
-    find_other_lines(*given, height, width, seen_px, start.neighbour)
     found = (start.neighbour, line_sigma_px, start.sigma, start.reach, start.run)
     begin_fits(ridge.table, ridge.chain, *found)
     return start
+
+
+def _other_lines(plane: StripePlane, ridge: RidgePoints, reach_px: float) -> FloatArray:
+    """(N, 2) distance to other lines of `find_other_lines`."""
+    height, width = plane.image.shape
+    first, stop, length = chain_extents(ridge.table, ridge.chain)
+    is_line = (length >= SHORTEST_PX).astype(np.int64)
+    found = np.zeros((len(ridge), 2))
+    given = (ridge.table, ridge.chain, first, stop, is_line)
+    find_other_lines(*given, height, width, reach_px, found)
+    return found
 
 
 def _sides(plane: StripePlane, points: FloatArray, start: _Start) -> tuple[FloatArray, FloatArray]:

@@ -51,8 +51,11 @@ PEAK_QUANTILE = 0.999
 NOISY_SHARE = 0.25
 """Of the brightest lines' height. In 40 photographs of ten strangers the threshold that the noise
 of single pixels sets is 0.01 to 0.11 of it, in those of an eleventh 0.41 to 0.57."""
+NOISY = 3.0
+"""Least noise of 255 levels: smaller is that of dark frames and of cameras that need no help."""
 BLUR_PX, BLURRED_SIGMAS = 1.5, 5.0
 """A blurred image has a thirtieth as many places that could be bright by chance."""
+BLURRED_LAGS_PX = (8, 12, 18)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,20 +81,14 @@ class ImageLevel:
 
 
 def measure_level(
-    image: FloatImage | ImageArray,
-    threshold: float | None,
-    scale: float = 1.0,
-    sparse: int = 1,
-    *,
-    sigmas: float = THRESHOLD_SIGMAS,
+    image: FloatImage | ImageArray, threshold: float | None, scale: float = 1.0, sparse: int = 1
 ) -> ImageLevel:
     """Estimate background and noise from a sample of the pixels.
 
     ``image``: (H, W) float32, or as the camera delivered it. ``threshold``: Least height of a line
     above the background, or None to set it from the noise. ``scale``: What ``image`` is to be
     multiplied by; level and threshold are then of that. ``sparse``: By which the distances between
-    sampled rows and columns of bytes are multiplied; 1, 2 or 4. ``sigmas``: Of the clutter, by
-    which the threshold is set.
+    sampled rows and columns of bytes are multiplied; 1, 2 or 4.
     """
     factor = np.float32(scale)
     background = np.asarray(_cell_quantiles(image, sparse) * factor, dtype=np.float32)
@@ -101,8 +98,8 @@ def measure_level(
     is_noisy = False
     if threshold is None:
         peak = _brightest(image, peaks, factor, sparse) - float(np.median(background))
-        threshold = max(sigmas * clutter, LEAST_PEAK_SHARE * peak)
-        is_noisy = sigmas * noise > NOISY_SHARE * peak
+        threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
+        is_noisy = noise > NOISY and THRESHOLD_SIGMAS * noise > NOISY_SHARE * peak
     # between cells the background is linear: never below the least of them
     least = minimum_filter(background, 3, mode="nearest") + (threshold - ROUNDING)
     lit = np.asarray(peaks * factor > least).astype(np.uint8)
@@ -111,9 +108,18 @@ def measure_level(
 
 
 def less_noisy(image: FloatImage) -> tuple[FloatImage, ImageLevel]:
-    """A noisy image (H, W) blurred, and its level: what lines are sought in, not measured in."""
+    """A noisy image (H, W) blurred, and its level: what lines are sought in, not measured in.
+
+    Texture, and rows that a lamp or the sensor's read-out makes brighter, are left by the blur: the
+    threshold follows whatever differs most along rows and down columns.
+    """
     blurred = np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR_PX), np.float32)
-    return blurred, measure_level(blurred, None, sigmas=BLURRED_SIGMAS)
+    one, turned = np.float32(1.0), np.ascontiguousarray(blurred.T)
+    left = max(_noise(way, lag, one, 1) for way in (blurred, turned) for lag in BLURRED_LAGS_PX)
+    level = measure_level(blurred, None)
+    peak = level.brightest - float(np.median(level.background))
+    rise = max(BLURRED_SIGMAS * left, LEAST_PEAK_SHARE * peak)
+    return blurred, measure_level(blurred, rise)
 
 
 BAND_PX, BAND_SIGMAS = 40, 8.0
@@ -275,9 +281,10 @@ def mean_along(values: FloatArray, weights: FloatArray, chain: IntArray, half: i
 
 
 def median_along(values: FloatArray, chain: IntArray, at: IntArray, half: int) -> FloatArray:
-    """Medians of values (N,) within ``half`` places of some, ``at`` (M,), on the same chain.
+    """Medians (M,) of values (N,) within ``half`` places of some, ``at`` (M,), on the same chain.
 
-    NaN where half of the places or fewer hold a number.
+    Of an even count, the upper of the two in the middle. NaN where ``half`` places or fewer hold a
+    number.
     """
     first, stop = (bound[at, None] for bound in chain_bounds(chain))
     near = at[:, None] + np.arange(-half, half + 1)

@@ -255,8 +255,6 @@ _TRUSTED = 0.1
 """Least weight with which a point helps to fix the homography."""
 _POINTS_PER_TERM = 3.0
 """Fewest points per term of the polynomial; fewer let it follow a single corner."""
-_CUBIC, _QUINTIC = 10, 21
-"""Terms of polynomials of two variables."""
 
 
 def off_lattice(
@@ -271,24 +269,6 @@ def off_lattice(
     Returns ``is_off``: (N,) True for corners to leave out. ``scatter_px``: Robust standard
     deviation, per axis, of the rest; infinite if there is no homography.
     """
-    is_off, scatter_px = _off_lattice_of(_CUBIC, board, points_px, least_sigma_px, tolerance_px)
-    # what fills the view of a wide lens is bent more than a cubic
-    if (
-        scatter_px > MAX_SCATTER / PRINT_ERROR * tolerance_px
-        and len(board) >= _POINTS_PER_TERM * _QUINTIC
-    ):
-        return _off_lattice_of(_QUINTIC, board, points_px, least_sigma_px, tolerance_px)
-    return is_off, scatter_px
-
-
-def _off_lattice_of(
-    n_terms: int,
-    board: FloatArray,
-    points_px: FloatArray,
-    least_sigma_px: FloatArray,
-    tolerance_px: float,
-) -> tuple[BoolArray, float]:
-    """The same, of a lattice bent by at most so many terms."""
     weights = np.ones(len(board))
     size = scatter = np.full(len(board), np.inf)
     for _ in range(_HOMOGRAPHIES):
@@ -299,7 +279,7 @@ def _off_lattice_of(
         if homography is None:
             break
         mapped = apply_homography(np.asarray(homography), board)
-        field = _terms(mapped, n_terms)
+        field = _terms(mapped)
         for _ in range(_ROUNDS):
             size = np.hypot(*_without_itself(field, points_px - mapped, weights).T)
             # The median length of a two-dimensional normal is 1.18 sigma.
@@ -318,13 +298,13 @@ def _without_itself(field: FloatArray, residual: FloatArray, weights: FloatArray
     return np.asarray((residual - smooth) / np.maximum(1.0 - leverage, 0.05)[:, None])
 
 
-def _terms(image: FloatArray, most: int) -> FloatArray:
-    """Polynomial terms (N, P) over the image, as many as the points can bear, and ``most``."""
+def _terms(image: FloatArray) -> FloatArray:
+    """Polynomial terms (N, P) over the image, as many as the points can bear."""
     middle = 0.5 * (image.min(axis=0) + image.max(axis=0))
     x, y = ((image - middle) / np.maximum(0.5 * np.ptp(image, axis=0), 1e-9)).T
-    terms = [x ** (degree - k) * y**k for degree in range(6) for k in range(degree + 1)]
-    for count in (_QUINTIC, _CUBIC, 6, 3):
-        if count <= most and len(image) >= _POINTS_PER_TERM * count:
+    terms = [np.ones_like(x), x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
+    for count in (10, 6, 3):
+        if len(image) >= _POINTS_PER_TERM * count:
             return np.stack(terms[:count], axis=-1)
     return np.stack(terms[:1], axis=-1)
 

@@ -53,6 +53,18 @@ def test_wide_lines_have_a_wide_band() -> None:
     np.testing.assert_array_equal(extract_stripes(part).flags, found.flags)
 
 
+def test_an_image_whose_noise_hides_its_lines_is_kept_whole() -> None:
+    """Lines are sought in it blurred: what lies beside them belongs to it."""
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:300, : SIZE[1]].astype(float)
+    light = 40.0 * np.exp(-0.5 * ((y - 150.0 - 0.1 * x) / 2.0) ** 2)
+    image = np.clip(light + 60.0 + rng.normal(0.0, 12.0, y.shape), 0, 255).astype(np.uint8)
+    assert extract_stripes(Exposure(image, "noisy")).is_accepted.sum() > 0.9 * SIZE[1]
+    assert near_lines(image.astype(np.float32)).all()
+    faint = np.clip(light + 60.0 + rng.normal(0.0, 1.0, y.shape), 0, 255).astype(np.float32)
+    assert near_lines(faint).mean() < 0.6
+
+
 def row(k: int, lasers: tuple[str, ...] = ("A",), view: str | None = None) -> ExposureRow:
     return ExposureRow(k, k * 10**7, 0, f"images/{k}.png", lasers, view=view)
 

@@ -210,7 +210,7 @@ LEAST_REACH_PX = 6.0
 WIDTH_HALF = 8
 """Neighbours of which the median tells a line's own width."""
 OWN_WIDTH_ROUNDS = 2
-"""A window is left at two and a half times its width, so that four times take two."""
+"""A fit ends at two and a half times the width that its window is made for; two reach farther."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -322,11 +322,11 @@ def fit_ridge(
     )
 
 
-NARROW, WIDE = 0.7, 1.4
-"""Of the typical sigma, beyond which a line is fitted in windows for its own width."""
-NARROWEST, HALF_AS_WIDE = 0.33, 0.5
-"""Narrower still are most dots and edges that a photograph shows beside its lines; and what could
-be fitted in a window that is too wide is good enough to half its width."""
+NARROW, HALF_AS_WIDE, WIDE = 0.7, 0.5, 1.4
+"""Typical sigmas below which a line that could not be fitted, and one that could, is fitted again
+in windows for its own width, and above which any is."""
+NARROWEST = 0.33
+"""Narrower still are most dots and edges that a photograph shows beside its lines."""
 LEAST_OWN_PX = 50.0
 """Length of chains that are fitted again: corners of print between squares are 15 to 40 px long."""
 LARGEST_STEP = 0.05

@@ -50,7 +50,7 @@ def test_help_lists_the_commands_as_the_chain(capsys: pytest.CaptureFixture[str]
     assert main(["-h"]) == 0
     listed = capsys.readouterr().out.split("\nCommands:\n")[1].split("\n\n")[0]
     names = [line.split()[0] for line in listed.splitlines() if line[2:3].strip()]
-    chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers"]
+    chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "stripes", "markers"]
     looks = ["clean", "inspect", "verify", "mesh", "record", "console", "convert", "recover"]
     assert names == [*chain, "register", *looks, "info", "devices", "doctor"]
 

@@ -60,7 +60,7 @@ def test_wrong_input_is_said(folder: Path, tmp_path: Path, fails: Callable[..., 
     out = tmp_path / "m.csv"
     assert "1 images" in fails("markers", left, *stereo, "-o", out, writes=tmp_path)
     assert "end it in .csv" in fails("markers", left, right, *stereo, "-o", tmp_path / "m.html")
-    assert "needs --stereo" in fails("markers", left, "-o", out, writes=tmp_path)
+    assert "needs `armscan markers --stereo`" in fails("markers", left, "-o", out, writes=tmp_path)
     # The right image in the left one's place: every point would lie behind the cameras.
     swapped = fails("markers", right, left, *stereo, "-o", out, writes=tmp_path)
     assert "the left image comes first" in swapped

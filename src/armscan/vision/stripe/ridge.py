@@ -51,7 +51,7 @@ PEAK_QUANTILE = 0.999
 NOISY_SHARE = 0.25
 """Of the brightest lines' height. In 40 photographs of ten strangers the threshold that the noise
 of single pixels sets is 0.01 to 0.11 of it, in those of an eleventh 0.41 to 0.57."""
-NOISY = 3.0
+NOISY = 3.3
 """Least noise of 255 levels: smaller is that of dark frames and of cameras that need no help."""
 BLUR_PX, BLURRED_SIGMAS = 1.5, 5.0
 """A blurred image has a thirtieth as many places that could be bright by chance."""

@@ -495,7 +495,8 @@ def _about_outliers(fit: CameraFit) -> list[str]:
     points_px = np.concatenate([view.view.points_px for view in fit.used_views])
     radius = np.hypot(points_px[:, 0] - fit.camera.cx_px, points_px[:, 1] - fit.camera.cy_px)
     edge = np.quantile(radius[~is_outlier], EDGE_QUANTILE)
-    if n < FEW_OUTLIERS or np.median(radius[is_outlier]) < edge:
+    is_at_edge = n >= FEW_OUTLIERS and np.median(radius[is_outlier]) >= edge
+    if not is_at_edge or not len(fit.camera.folded_border()):
         return [said]
     return [
         f"{said}, most of them more than {edge:.0f} px from the principal point: there the lens "

@@ -147,7 +147,7 @@ def stripes(
     """Find laser lines in images, without any calibration.
 
     A first look at photographs: where each line is, how well its centre is known, and why points
-    were flagged. Colour images are looked at in the colour that most of them show.
+    were flagged. Colour images are all looked at in the colour of their strongest lines.
     """
     from armscan.jobs.photographs import find_stripes
     from armscan.storage.images import ImageOptions

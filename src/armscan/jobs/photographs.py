@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +40,13 @@ from armscan.storage.points import markers_csv, stripes_csv
 from armscan.thesis.two_cameras import DecodedLine, find_coded_lines, parse_code
 from armscan.vision.rings import RingDetection, RingOptions, detect_rings, perimeter_limits
 from armscan.vision.stripe.extract import extract_stripes, load_stripe_method
-from armscan.vision.stripe.image import StripeOptions, find_laser_colour, split_channels
+from armscan.vision.stripe.image import (
+    COLOURS,
+    StripeOptions,
+    find_laser_colour,
+    line_strengths,
+    split_channels,
+)
 
 FEW_MARKERS = 4
 LARGE_MISCLOSURE = 2.0
@@ -57,7 +62,7 @@ def find_stripes(
 ) -> Summary:
     """Find the laser lines in images, without any calibration.
 
-    Where most of a sample of colour images show one laser colour, all are looked at in it.
+    Colour images are all looked at in the colour of the strongest lines of a sample of them.
 
     Parameters
     ----------
@@ -112,19 +117,25 @@ def find_stripes(
     )
 
 
-VOTERS, MAJORITY = 12, 2.0 / 3.0
-"""Images that are asked for the laser's colour, and the part of them that decides for all."""
+VOTERS = 12
+"""Images that are asked for the laser's colour."""
 
 
 def _common_colour(paths: Sequence[Path], options: ImageOptions) -> LaserColour:
-    """The colour that most of a sample of images show; ``auto``, each its own, if none is."""
-    votes: Counter[LaserColour] = Counter()
+    """The colour of the strongest lines of a sample of images; ``auto`` if none has that colour.
+
+    Squared heights are summed: images without the laser, of weak lines, hardly count.
+    """
+    found: set[LaserColour] = set()
+    total = np.zeros(len(COLOURS))
     for path in evenly_chosen(paths, VOTERS):
         exposure = read_exposure(path, options)
         if exposure.colour != "mono":
-            votes[find_laser_colour(split_channels(exposure, None))] += 1
-    colour, n = (votes or Counter({"auto": 1})).most_common(1)[0]
-    return colour if n >= MAJORITY * votes.total() else "auto"
+            channels = split_channels(exposure, None)
+            found.add(find_laser_colour(channels))
+            total += np.square(line_strengths(channels))
+    strongest = COLOURS[int(np.argmax(total))]
+    return strongest if strongest in found else "auto"
 
 
 NAMED, LISTED = 5, 40

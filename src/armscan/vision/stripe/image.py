@@ -497,9 +497,14 @@ def _strength(image: FloatImage) -> float:
     return float(np.quantile(ridge, RIDGE_QUANTILE)) if ridge.size else 0.0
 
 
+def line_strengths(images: ColourImages) -> list[float]:
+    """Height in grey levels of the strongest thin lines that red, green and blue excess form."""
+    return [_strength(colour_excess(images, colour)) for colour in COLOURS]
+
+
 def find_laser_colour(images: ColourImages) -> LaserColour:
     """Colour whose excess forms the strongest thin lines; grey if none stands out."""
-    strengths = [_strength(colour_excess(images, colour)) for colour in COLOURS]
+    strengths = line_strengths(images)
     grey = _strength(np.asarray(sum(images.channels) / np.float32(3.0)))
     best = int(np.argmax(strengths))
     return COLOURS[best] if strengths[best] > LEAST_COLOUR_SHARE * grey else "grey"

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError, InputError
+from armscan.models.camera import CameraModel
 from armscan.storage.documents import read_foreign_camera
 from armscan.storage.foreign import camera_info_yaml
 from rigs.plain_scanner import plain_camera
 
 CAMERA = plain_camera(
     (1430.123456789, 1425.5), (478.25, 642.1), (960, 1280), [-0.2, 0.08, 6e-4, -1e-17, 0.01]
+)
+FISHEYE = CameraModel.from_parameters(
+    [230.0, 229.5, 472.0, 305.0, 0.02, -0.004, 0.0, 0.0, 0.001], 960, 600, "fisheye"
 )
 ROS = """image_width: 640
 image_height: 480
@@ -84,6 +88,16 @@ def test_ros_export_reads_back_exactly(tmp_path: Path) -> None:
         camera_info_yaml(CAMERA, "two words")
 
 
+def test_a_fisheye_reads_back_exactly(tmp_path: Path) -> None:
+    path = tmp_path / "wide.yaml"
+    path.write_text(camera_info_yaml(FISHEYE))
+    assert "distortion_model: equidistant" in path.read_text()
+    assert "data: [0.02, -0.004, 0.001, 0.0]" in path.read_text()
+    found = read_foreign_camera(path).camera
+    assert found.lens == "fisheye"
+    assert np.array_equal(found.parameters, FISHEYE.parameters)
+
+
 BAD = {
     "empty": ("", "empty|not a camera calibration"),
     "text": ("hello", "not a camera calibration"),
@@ -91,7 +105,12 @@ BAD = {
     "no matrix": (ROS.replace("camera_matrix", "something"), "no camera_matrix"),
     "no distortion": (ROS.replace("distortion_coefficients", "x"), "no distortion_coefficients"),
     "no size": (ROS.replace("image_width", "x"), "image size"),
-    "other lens": (ROS.replace("plumb_bob", "equidistant"), "equidistant"),
+    "other lens": (ROS.replace("plumb_bob", "division"), "division"),
+    "fisheye of five": (ROS.replace("plumb_bob", "equidistant"), "expected k1 k2 k3 k4"),
+    "fourth term of a fisheye": (
+        ROS.replace("plumb_bob", "equidistant").replace("0.000505, 0.000000]", "0.000505]"),
+        "k4 = 0.000505",
+    ),
     "nan": (ROS.replace("438.783367", ".Nan"), "not finite|not a"),
     "negative": (ROS.replace("438.783367", "-438.7"), "positive"),
     "skew": (ROS.replace("[438.783367, 0.000000", "[438.783367, 2.5"), "skew"),

@@ -491,9 +491,11 @@ def _camera(calibration: CameraCalibration, what: str) -> dict[str, Any]:
     values = {
         name: with_sigma(value, spread if calibration.has_covariance else 0.0)
         for name, value, spread in zip(PARAMETER_NAMES, camera.parameters, sigma, strict=True)
+        if name in camera.parameter_names
     }
     return {
         "what": f"{what}, {camera.width_px} x {camera.height_px} px",
+        **({} if camera.lens == "pinhole" else {"lens": camera.lens}),
         **values,
         **_evidence(calibration),
     }

@@ -39,6 +39,7 @@ MapOut: TypeAlias = NDArray[np.int32]
 TableOut: TypeAlias = NDArray[np.float64]
 FloatsOut: TypeAlias = NDArray[np.float64]
 IntsOut: TypeAlias = NDArray[np.int64]
+Two: TypeAlias = tuple[float, float]
 Three: TypeAlias = tuple[float, float, float]
 Four: TypeAlias = tuple[float, float, float, float]
 
@@ -64,6 +65,7 @@ _TYPES: dict[str, Any] = {
     "None": types.void,
     "bool": types.boolean,
     "tuple[int, int]": types.UniTuple(types.int64, 2),  # type: ignore[no-untyped-call]
+    "Two": types.UniTuple(types.float64, 2),  # type: ignore[no-untyped-call]
     "Three": types.UniTuple(types.float64, 3),  # type: ignore[no-untyped-call]
     "Four": types.UniTuple(types.float64, 4),  # type: ignore[no-untyped-call]
 }

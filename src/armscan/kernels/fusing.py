@@ -25,7 +25,7 @@ from armscan.kernels.placing import (
     turn_sums,
     write_turned,
 )
-from armscan.kernels.rays import distort, height_of
+from armscan.kernels.rays import distort, height_of, radial_base
 
 N_SECOND, N_SENSOR = 15, 32
 """Parameters that a second camera adds, and all that a point of one sheet depends on."""
@@ -35,7 +35,7 @@ N_PARAMETERS = 41
 first: of the left camera, the same across it, of the second camera, of the sheet."""
 LEAST_SHAPE_MM = 1e-6
 """A sheet is taken for no truer than this."""
-OF_GAIN, OF_DISTANCES = 3, 27
+OF_GAIN, OF_DISTANCES = 3, SUMS + 6
 """Rows of `LANES` numbers of points that are placed together: their place, the 12 numbers of their
 gain, sums where `turn_sums` looks for them, and the derivatives of their distances."""
 N_ROWS = OF_DISTANCES + N_PARAMETERS
@@ -229,6 +229,7 @@ def fuse_stripes(
         distort(x, y, camera, lens)
         height_of(points[i, 0], points[i, 1], z, sheets[sheet[i]], surface)
         r2 = x * x + y * y
+        scale, q = radial_base(r2, camera[10] != 0.0)
         u, v = left[i, 0], left[i, 1]
         for k in range(2):
             across_x = (-v if k == 0 else u) * camera[0]
@@ -244,12 +245,12 @@ def fuse_stripes(
             own[first + 1] = across_y / camera[1] * lens[1]
             own[first + 2] = across_x / camera[0]
             own[first + 3] = across_y / camera[1]
-            radial = across_x * x + across_y * y
-            own[first + 4] = radial * r2
-            own[first + 5] = radial * r2 * r2
+            radial = (across_x * x + across_y * y) * scale
+            own[first + 4] = radial * q
+            own[first + 5] = radial * q * q
             own[first + 6] = across_x * 2.0 * x * y + across_y * (r2 + 2.0 * y * y)
             own[first + 7] = across_x * (r2 + 2.0 * x * x) + across_y * 2.0 * x * y
-            own[first + 8] = radial * r2 * r2 * r2
+            own[first + 8] = radial * q * q * q
         for c in range(N_SHEET):
             own[SHEET + c] = -surface[4 + c]
         size = size_mm[sheet[i]]

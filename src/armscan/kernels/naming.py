@@ -20,7 +20,7 @@ from armscan.kernels.arrays import (
     compiled,
 )
 from armscan.kernels.chains import best_states
-from armscan.kernels.rays import distort, height_of, undistort
+from armscan.kernels.rays import distort, height_of, radial_base, undistort
 
 N_CAMERA, N_SHEET, N_SECOND, N_DRIFT = 9, 8, 15, 3
 SECOND = N_CAMERA + N_SHEET
@@ -364,6 +364,7 @@ def cross_stripes(
             by_point[count, a] = g[a]
         # by the left camera and the sheet
         r2 = x * x + y * y
+        scale, q = radial_base(r2, camera[10] != 0.0)
         by_lens[0, 2], by_lens[1, 2] = -ixx / fx, -ixy / fx
         by_lens[0, 3], by_lens[1, 3] = -ixy / fy, -iyy / fy
         for c in range(5):
@@ -372,7 +373,7 @@ def cross_stripes(
             elif c == 3:
                 kx, ky = r2 + 2.0 * x * x, 2.0 * x * y
             else:
-                power = r2 if c == 0 else (r2 * r2 if c == 1 else r2 * r2 * r2)
+                power = scale * (q if c == 0 else (q * q if c == 1 else q * q * q))
                 kx, ky = x * power, y * power
             by_lens[0, 4 + c] = -(ixx * kx + ixy * ky)
             by_lens[1, 4 + c] = -(ixy * kx + iyy * ky)
@@ -388,13 +389,14 @@ def cross_stripes(
         # by the second camera and its pose
         f0, f1 = n0 * second[0], n1 * second[1]
         r2 = rx * rx + ry * ry
-        radial = f0 * rx + f1 * ry
+        scale, q = radial_base(r2, second[10] != 0.0)
+        radial = (f0 * rx + f1 * ry) * scale
         row[SECOND], row[SECOND + 1] = n0 * there[0], n1 * there[1]
         row[SECOND + 2], row[SECOND + 3] = n0, n1
-        row[SECOND + 4], row[SECOND + 5] = radial * r2, radial * r2 * r2
+        row[SECOND + 4], row[SECOND + 5] = radial * q, radial * q * q
         row[SECOND + 6] = f0 * 2.0 * rx * ry + f1 * (r2 + 2.0 * ry * ry)
         row[SECOND + 7] = f0 * (r2 + 2.0 * rx * rx) + f1 * 2.0 * rx * ry
-        row[SECOND + 8] = radial * r2 * r2 * r2
+        row[SECOND + 8] = radial * q * q * q
         for a in range(3):
             g[a] = n0 * by_right[0, a] + n1 * by_right[1, a]
             row[SECOND + 12 + a] = g[a]

@@ -12,6 +12,7 @@ from armscan.kernels.rays import (
     NEAREST_SOURCE,
     bow_and_slopes,
     lens_slopes,
+    radial_base,
 )
 
 LANES = 64
@@ -20,13 +21,14 @@ N_CAMERA, N_SHEET = 9, 8
 """Parameters of a camera and of a sheet."""
 (
     POINT_X, POINT_Y, POINT_Z, RAY_X, RAY_Y, DISTORTED_X, DISTORTED_Y, SQUARE,
-    BY_XX, BY_XY, BY_YY, DEPTH_X, DEPTH_Y,
-) = range(13)  # fmt: skip
+    BASE, BASE_SQUARE, BY_XX, BY_XY, BY_YY, DEPTH_X, DEPTH_Y,
+) = range(15)  # fmt: skip
 """Rows of what is known of each point before its covariance: its place in Sensor, its ray, that ray
-distorted, the square of its radius, the derivative of the lens's inverse with its sign turned, and
-that of the depth by the ray. The sheet's derivatives and the sums follow."""
-OF_SHEET, SUMS = 13, 21
-N_ROWS = 27
+distorted, the square of its radius, what `radial_base` gives of it, the derivative of the lens's
+inverse with its sign turned, and that of the depth by the ray. The sheet's derivatives and the sums
+follow."""
+OF_SHEET, SUMS = 15, 23
+N_ROWS = 29
 
 
 @compiled(error_model="numpy", fastmath=FUSED)
@@ -46,6 +48,25 @@ def spread_stripe(
     ``camera``, ``sheet``: As for `meet_sheets`. ``size_mm``: Sigma of the sheet's shape.
     ``noise``, ``shape``: (3 N,) output.
     """
+    # a constant leaves a loop without a branch, which is vectorised
+    if camera[10] == 0.0:
+        _spread_behind(points, normals, sigma, camera, sheet, size_mm, noise, shape, False)
+    else:
+        _spread_behind(points, normals, sigma, camera, sheet, size_mm, noise, shape, True)
+
+
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def _spread_behind(
+    points: Floats,
+    normals: Floats,
+    sigma: Floats,
+    camera: Floats,
+    sheet: Floats,
+    size_mm: float,
+    noise: FloatsOut,
+    shape: FloatsOut,
+    is_fisheye: bool,
+) -> None:
     lens = camera.copy()
     bow = sheet.copy()
     scale = 1.0 / bow[12]
@@ -66,7 +87,7 @@ def spread_stripe(
         gradient_y = bow[10] - slope_u * uy - slope_v * vy
         gradient_z = bow[11] - slope_u * uz - slope_v * vz
         per_mm = 1.0 / (x * gradient_x + y * gradient_y + gradient_z)
-        xx, xy, yy, _ = lens_slopes(x, y, lens)
+        xx, xy, yy, _ = lens_slopes(x, y, lens, is_fisheye)
         det = 1.0 / (xx * yy - xy * xy)
         across_x = normals[2 * i] * sigma[i] * fx
         across_y = normals[2 * i + 1] * sigma[i] * fy
@@ -84,6 +105,16 @@ def spread_stripe(
 @compiled(error_model="numpy", fastmath=FUSED)
 def _know_points(points: Floats, camera: Floats, sheet: Floats, rows: FloatsOut) -> None:
     """What the covariance of a few points depends on, into rows of `LANES` numbers each."""
+    if camera[10] == 0.0:
+        _know_behind(points, camera, sheet, rows, False)
+    else:
+        _know_behind(points, camera, sheet, rows, True)
+
+
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def _know_behind(
+    points: Floats, camera: Floats, sheet: Floats, rows: FloatsOut, is_fisheye: bool
+) -> None:
     lens = camera.copy()
     bow = sheet.copy()
     scale = 1.0 / bow[12]
@@ -105,7 +136,7 @@ def _know_points(points: Floats, camera: Floats, sheet: Floats, rows: FloatsOut)
         gradient_y = bow[10] - slope_u * uy - slope_v * vy
         gradient_z = bow[11] - slope_u * uz - slope_v * vz
         per_mm = 1.0 / (x * gradient_x + y * gradient_y + gradient_z)
-        xx, xy, yy, radial = lens_slopes(x, y, lens)
+        xx, xy, yy, radial = lens_slopes(x, y, lens, is_fisheye)
         det = -1.0 / (xx * yy - xy * xy)
         r2 = x * x + y * y
         rows[POINT_X * LANES + i] = points[3 * i]
@@ -116,6 +147,9 @@ def _know_points(points: Floats, camera: Floats, sheet: Floats, rows: FloatsOut)
         rows[DISTORTED_X * LANES + i] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
         rows[DISTORTED_Y * LANES + i] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
         rows[SQUARE * LANES + i] = r2
+        scale, q = radial_base(r2, is_fisheye)
+        rows[BASE * LANES + i] = scale
+        rows[BASE_SQUARE * LANES + i] = q
         rows[BY_XX * LANES + i] = yy * det
         rows[BY_XY * LANES + i] = -xy * det
         rows[BY_YY * LANES + i] = xx * det
@@ -192,7 +226,8 @@ def _spread_points(camera: Floats, factor: Table, rows: FloatsOut) -> None:
                 py = rows[POINT_Y * LANES + i]
                 pz = rows[POINT_Z * LANES + i]
                 r2 = rows[SQUARE * LANES + i]
-                radial = r2 * (f4 + r2 * (f5 + r2 * f8))
+                q = rows[BASE_SQUARE * LANES + i]
+                radial = rows[BASE * LANES + i] * q * (f4 + q * (f5 + q * f8))
                 u = rows[DISTORTED_X * LANES + i] * f0 + f2 + x * radial
                 v = rows[DISTORTED_Y * LANES + i] * f1 + f3 + y * radial
                 u += 2.0 * x * y * f6 + (r2 + 2.0 * x * x) * f7

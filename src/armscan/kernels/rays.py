@@ -17,6 +17,7 @@ from armscan.kernels.arrays import (
     Table,
     TableOut,
     Three,
+    Two,
     compiled,
 )
 
@@ -31,15 +32,43 @@ LEAST_SLOPE = 1e-6
 """Of a ray to a sheet, below which it is left to the careful search."""
 NEAREST_SOURCE = 0.2
 """As in the models of the camera and the light sheet."""
+NEAR_AXIS = 1e-12
+"""As in the model of the camera."""
+
+
+@compiled(error_model="numpy", is_inlined=True)
+def radial_base(r2: float, is_fisheye: bool) -> Two:
+    """Factor of the radius, and the square that a lens's radial terms are powers of."""
+    if not is_fisheye or r2 < NEAR_AXIS:
+        return 1.0, r2
+    r = math.sqrt(r2)
+    theta = math.atan(r)
+    return theta / r, theta * theta
+
+
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def radial_slope(r2: float, radial: float, camera: Floats, is_fisheye: bool) -> float:
+    """Derivative of a lens's radial factor by the radius, over the radius."""
+    k1, k2, k3 = camera[4], camera[5], camera[8]
+    slope: float = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))
+    if is_fisheye:
+        slope = 2.0 * (k1 - 1.0 / 3.0)
+        if r2 >= NEAR_AXIS:
+            _, q = radial_base(r2, True)
+            growth = 1.0 + q * (3.0 * k1 + q * (5.0 * k2 + q * 7.0 * k3))
+            slope = (growth / (1.0 + r2) - radial) / r2
+    return slope
 
 
 @compiled(error_model="numpy")
 def distort(x: float, y: float, camera: Floats, out: FloatsOut) -> None:
     """Distorted x and y, and their derivatives xx, xy = yx, yy, into ``out`` (5,)."""
     k1, k2, p1, p2, k3 = camera[4], camera[5], camera[6], camera[7], camera[8]
+    is_fisheye = camera[10] != 0.0
     r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))
+    scale, q = radial_base(r2, is_fisheye)
+    radial = scale * (1.0 + q * (k1 + q * (k2 + q * k3)))
+    slope = radial_slope(r2, radial, camera, is_fisheye)
     xy2 = 2.0 * x * y
     out[0] = x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x)
     out[1] = y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy2
@@ -161,12 +190,13 @@ def bow_and_slopes(u: float, v: float, sheet: Floats) -> Three:
 
 
 @compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
-def lens_slopes(x: float, y: float, camera: Floats) -> Four:
+def lens_slopes(x: float, y: float, camera: Floats, is_fisheye: bool) -> Four:
     """What `distort` gives: the derivatives xx, xy, yy of the lens, and its radial factor."""
     k1, k2, p1, p2, k3 = camera[4], camera[5], camera[6], camera[7], camera[8]
     r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))
+    scale, q = radial_base(r2, is_fisheye)
+    radial = scale * (1.0 + q * (k1 + q * (k2 + q * k3)))
+    slope = radial_slope(r2, radial, camera, is_fisheye)
     xx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
     xy = x * y * slope + 2.0 * (p1 * x + p2 * y)
     yy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
@@ -175,12 +205,12 @@ def lens_slopes(x: float, y: float, camera: Floats) -> Four:
 
 @compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
 def _lens_step(x: float, y: float, u: float, v: float, camera: Floats, safe: float) -> Four:
-    """One of Newton's steps to the inverse of `distort`.
+    """One of Newton's steps to the inverse of `distort` for a pinhole.
 
     The new place, the step's size, and the least of ``safe`` and what it divides by.
     """
     p1, p2 = camera[6], camera[7]
-    xx, xy, yy, radial = lens_slopes(x, y, camera)
+    xx, xy, yy, radial = lens_slopes(x, y, camera, False)
     r2 = x * x + y * y
     ex = x * radial + p1 * 2.0 * x * y + p2 * (r2 + 2.0 * x * x) - u
     ey = y * radial + p1 * (r2 + 2.0 * y * y) + p2 * 2.0 * x * y - v
@@ -196,7 +226,7 @@ def _lens_step(x: float, y: float, u: float, v: float, camera: Floats, safe: flo
 def _meet_run(
     pixels: Floats, camera: Floats, sheet: Floats, turn: Floats, points: FloatsOut, is_met: IntsOut
 ) -> None:
-    """Points of pixels on one sheet, by a fixed count of steps without a branch.
+    """Points of a pinhole's pixels on one sheet, by a fixed count of steps without a branch.
 
     That count is enough for usual lenses and sheets. ``is_met`` is 0 for a point for which it was
     not, or for which anything is doubtful: `meet_sheets` asks again.
@@ -254,8 +284,8 @@ def meet_sheets(
 
     Consecutive pixels on one sheet are done together.
 
-    ``pixels``: (2 N,). ``sheet``: (N,) row of ``sheets``, -1 for none. ``camera``: (10,) its
-    parameters and the radius at which the model folds over. ``sheets``: (S, 20) origin, axes,
+    ``pixels``: (2 N,). ``sheet``: (N,) row of ``sheets``, -1 for none. ``camera``: (11,)
+    `CameraModel.numbers`. ``sheets``: (S, 20) origin, axes,
     scale, bow, fan. ``turn``: (12,) rows of rotation and shift from Sensor to the points' frame.
     ``points``: (3 N,) output, zero where nothing is met. ``is_met``: (N,) zeros, 1 where met.
     """
@@ -268,7 +298,7 @@ def meet_sheets(
         last = first + 1
         while last < n and sheet[last] == number:
             last += 1
-        if number >= 0:
+        if number >= 0 and camera[10] == 0.0:
             _meet_run(
                 pixels[2 * first : 2 * last],
                 camera,
@@ -320,6 +350,7 @@ def differentiate_sheets(
         ixy = -lens[3] / det
         iyy = lens[2] / det
         r2 = x * x + y * y
+        scale, q = radial_base(r2, camera[10] != 0.0)
         for c in range(5):
             if c == 2:
                 kx = 2.0 * x * y
@@ -328,7 +359,7 @@ def differentiate_sheets(
                 kx = r2 + 2.0 * x * x
                 ky = 2.0 * x * y
             else:
-                power = r2 if c == 0 else (r2 * r2 if c == 1 else r2 * r2 * r2)
+                power = scale * (q if c == 0 else (q * q if c == 1 else q * q * q))
                 kx = x * power
                 ky = y * power
             by_camera[0, 4 + c] = -(ixx * kx + ixy * ky)

@@ -249,10 +249,7 @@ class CameraCalibration(ArrayRecord):
 
     def updated(self, step: FloatArray, covariance: FloatArray) -> CameraCalibration:
         """The camera with its parameters moved by a step (9,), known to another covariance."""
-        model = self.camera
-        moved = CameraModel.from_parameters(
-            model.parameters + step, model.width_px, model.height_px
-        )
+        moved = self.camera.moved_to(self.camera.parameters + step)
         return replace(self, camera=moved, covariance=covariance)
 
 

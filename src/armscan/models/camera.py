@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pinhole camera with radial and tangential distortion (eqs. 2.11 to 2.18).
+"""Pinhole camera with radial and tangential distortion (eqs. 2.11 to 2.18), and fisheye lenses.
 
 Coefficients are ordered ``k1 k2 p1 p2 k3`` as in OpenCV and in the thesis's printed vectors.
 """
 
 from __future__ import annotations
+
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,13 +26,26 @@ NEWTON_TOLERANCE = 1e-9
 """Step at which the iteration ends; it converges quadratically, so that less error is left."""
 
 
-def distorted_xy(xy: FloatArray, coefficients: FloatArray) -> FloatArray:
+Lens = Literal["pinhole", "fisheye"]
+"""A radius r = tan(theta) in ideal coordinates is seen at
+``r (1 + k1 r^2 + k2 r^4 + k3 r^6)`` by a pinhole with distortion, and at
+``theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6)`` by a fisheye, which has no p1, p2: the first
+three terms of Kannala and Brandt (2006), as OpenCV's fisheye model with k4 = 0."""
+WIDEST_RAD = np.deg2rad(88.0)
+"""Angle from the axis beyond which a ray has no use as X/Z, Y/Z."""
+NEAR_AXIS = 1e-12
+"""Square of a radius below which a fisheye's terms are those of its series."""
+
+
+def distorted_xy(xy: FloatArray, coefficients: FloatArray, lens: Lens = "pinhole") -> FloatArray:
     """Distort (N, 2) ideal normalised coordinates, without derivatives (see `distort`)."""
-    x, y = _forward(xy[:, 0], xy[:, 1], coefficients)[:2]
+    x, y = _forward(xy[:, 0], xy[:, 1], coefficients, lens)[:2]
     return np.stack([x, y], axis=1)
 
 
-def distort(xy: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def distort(
+    xy: FloatArray, coefficients: FloatArray, lens: Lens = "pinhole"
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Distort ideal normalised image coordinates (eqs. 2.16 and 2.17).
 
     Parameters
@@ -39,6 +54,8 @@ def distort(xy: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, Float
         (N, 2) ideal coordinates ``X/Z, Y/Z``.
     coefficients
         (5,) ``k1 k2 p1 p2 k3``.
+    lens
+        What the radial terms are powers of, see `Lens`.
 
     Returns
     -------
@@ -47,19 +64,20 @@ def distort(xy: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, Float
     dd_dxy
         (N, 2, 2) derivative by the ideal coordinates.
     dd_dcoefficients
-        (N, 2, 5) derivative by the coefficients.
+        (N, 2, 5) derivative by the coefficients; a fisheye's p1, p2 are held, theirs has no use.
     """
     x, y = xy[:, 0], xy[:, 1]
     r2 = x * x + y * y
     distorted = np.zeros((len(xy), 2))
     dd_dxy = np.zeros((len(xy), 2, 2))
     distorted[:, 0], distorted[:, 1], dd_dxy[:, 0, 0], cross, dd_dxy[:, 1, 1] = _forward(
-        x, y, coefficients
+        x, y, coefficients, lens
     )
     dd_dxy[:, 0, 1] = cross
     dd_dxy[:, 1, 0] = cross
     dd_dcoefficients = np.zeros((len(xy), 2, 5))
-    powers = np.stack([r2, r2 * r2, r2 * r2 * r2], axis=1)
+    scale, q = _radial_base(r2, lens)
+    powers = np.stack([scale * q, scale * q * q, scale * q * q * q], axis=1)
     dd_dcoefficients[:, :, [0, 1, 4]] = xy[:, :, None] * powers[:, None, :]
     dd_dcoefficients[:, 0, 2] = dd_dcoefficients[:, 1, 3] = 2.0 * x * y
     dd_dcoefficients[:, 0, 3] = r2 + 2.0 * x * x
@@ -67,14 +85,30 @@ def distort(xy: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, Float
     return distorted, dd_dxy, dd_dcoefficients
 
 
+def _radial_base(r2: FloatArray, lens: Lens) -> tuple[FloatArray, FloatArray]:
+    """Factor of the radius, and the square that a lens's radial terms are powers of."""
+    if lens == "pinhole":
+        return np.ones_like(r2), r2
+    r = np.sqrt(np.maximum(r2, NEAR_AXIS))
+    theta = np.arctan(r)
+    return np.where(r2 < NEAR_AXIS, 1.0, theta / r), np.where(r2 < NEAR_AXIS, r2, theta * theta)
+
+
 def _forward(
-    x: FloatArray, y: FloatArray, coefficients: FloatArray
+    x: FloatArray, y: FloatArray, coefficients: FloatArray, lens: Lens
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Distorted x and y, and the derivatives xx, xy = yx, yy: the Jacobian is symmetric."""
     k1, k2, p1, p2, k3 = coefficients
     r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))
+    scale, q = _radial_base(r2, lens)
+    radial = scale * (1.0 + q * (k1 + q * (k2 + q * k3)))
+    if lens == "pinhole":
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))
+    else:
+        growth = (1.0 + q * (3.0 * k1 + q * (5.0 * k2 + q * 7.0 * k3))) / (1.0 + r2)
+        slope = np.where(
+            r2 < NEAR_AXIS, 2.0 * (k1 - 1.0 / 3.0), (growth - radial) / np.maximum(r2, NEAR_AXIS)
+        )
     xy2 = 2.0 * x * y
     return (
         x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x),
@@ -85,27 +119,30 @@ def _forward(
     )
 
 
-def fold_radius(coefficients: FloatArray) -> float:
+def fold_radius(coefficients: FloatArray, lens: Lens = "pinhole") -> float:
     """Ideal radius X/Z at which radial distortion stops growing; infinite if it always grows.
 
     Beyond it the model maps two directions to one pixel (it folds over): neither projection nor
-    its inverse mean anything there.
+    its inverse mean anything there. A fisheye's is finite: rays end at `WIDEST_RAD`.
     """
     k1, k2, _, _, k3 = coefficients
     roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
     squares = roots.real[(np.abs(roots.imag) < 1e-12 * np.abs(roots)) & (roots.real > 0.0)]
-    return float(np.sqrt(squares.min())) if len(squares) else float("inf")
+    largest = float(np.sqrt(squares.min())) if len(squares) else float("inf")
+    return largest if lens == "pinhole" else float(np.tan(min(largest, WIDEST_RAD)))
 
 
-def undistort(distorted: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, BoolArray]:
+def undistort(
+    distorted: FloatArray, coefficients: FloatArray, lens: Lens = "pinhole"
+) -> tuple[FloatArray, BoolArray]:
     """Invert eq. 2.17 by Newton's method.
 
     Parameters
     ----------
     distorted
         (N, 2) distorted normalised coordinates.
-    coefficients
-        (5,) ``k1 k2 p1 p2 k3``.
+    coefficients, lens
+        As for `distort`.
 
     Returns
     -------
@@ -116,11 +153,11 @@ def undistort(distorted: FloatArray, coefficients: FloatArray) -> tuple[FloatArr
     """
     u, v = distorted[:, 0], distorted[:, 1]
     x, y = u.copy(), v.copy()
-    limit = fold_radius(coefficients)
+    limit = fold_radius(coefficients, lens)
     is_valid = np.isfinite(u) & np.isfinite(v)
     size = np.zeros(len(x))
     for _ in range(NEWTON_STEPS):
-        px, py, xx, xy, yy = _forward(x, y, coefficients)
+        px, py, xx, xy, yy = _forward(x, y, coefficients, lens)
         det = xx * yy - xy * xy
         is_valid &= (det > 0.0) & (xx > 0.0)
         scale = np.where(is_valid, 1.0 / np.where(is_valid, det, 1.0), 0.0)
@@ -149,6 +186,8 @@ class CameraModel(ArrayRecord):
         (5,) ``k1 k2 p1 p2 k3``.
     width_px, height_px
         Size of the full sensor.
+    lens
+        Whether the distortion is that of a pinhole or of a fisheye, see `Lens`.
     """
 
     fx_px: float
@@ -158,6 +197,7 @@ class CameraModel(ArrayRecord):
     distortion: FloatArray = floats(5)
     width_px: int
     height_px: int
+    lens: Lens = "pinhole"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,9 +208,15 @@ class CameraModel(ArrayRecord):
             raise InputError("camera needs positive, finite focal lengths and a finite centre")
         if self.width_px < 1 or self.height_px < 1:
             raise InputError(f"camera size {self.width_px} x {self.height_px} px is not an image")
+        if self.lens not in get_args(Lens):
+            raise InputError(f"{self.lens!r} is no kind of lens: {', '.join(get_args(Lens))}")
+        if self.lens == "fisheye" and np.any(self.distortion[2:4] != 0.0):
+            raise InputError("a fisheye lens has no tangential distortion here: p1 and p2 are 0")
 
     @staticmethod
-    def from_parameters(parameters: ArrayLike, width_px: int, height_px: int) -> CameraModel:
+    def from_parameters(
+        parameters: ArrayLike, width_px: int, height_px: int, lens: Lens = "pinhole"
+    ) -> CameraModel:
         """Build a camera from (9,) parameters in the order of `PARAMETER_NAMES`."""
         p = frozen_floats(parameters, (9,), "camera parameters")
         return CameraModel(
@@ -181,12 +227,29 @@ class CameraModel(ArrayRecord):
             distortion=p[4:],
             width_px=width_px,
             height_px=height_px,
+            lens=lens,
         )
+
+    def moved_to(self, parameters: ArrayLike) -> CameraModel:
+        """The same kind of camera with other (9,) parameters."""
+        return self.from_parameters(parameters, self.width_px, self.height_px, self.lens)
 
     @property
     def parameters(self) -> FloatArray:
         """(9,) parameters in the order of `PARAMETER_NAMES`."""
         return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion])
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Those of `PARAMETER_NAMES` that its lens has: a fisheye has no p1, p2."""
+        absent = ("p1", "p2") if self.lens == "fisheye" else ()
+        return tuple(name for name in PARAMETER_NAMES if name not in absent)
+
+    @property
+    def numbers(self) -> FloatArray:
+        """(11,) parameters, `fold_radius`, and 1 for a fisheye: what kernels ask for."""
+        fold = fold_radius(self.distortion, self.lens)
+        return np.append(self.parameters, [fold, float(self.lens == "fisheye")])
 
     @property
     def matrix(self) -> FloatArray:
@@ -199,7 +262,7 @@ class CameraModel(ArrayRecord):
         """Project (N, 3) points in the camera's frame to (N, 2) pixels; NaN behind the camera."""
         points = np.asarray(points_sensor_mm, dtype=np.float64)
         z = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-        distorted = distorted_xy(points[:, :2] / z[:, None], self.distortion)
+        distorted = distorted_xy(points[:, :2] / z[:, None], self.distortion, self.lens)
         return np.asarray(distorted * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px])
 
     def project_with_jacobian(
@@ -224,7 +287,7 @@ class CameraModel(ArrayRecord):
         points = np.asarray(points_sensor_mm, dtype=np.float64)
         z = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
         xy = points[:, :2] / z[:, None]
-        distorted, dd_dxy, dd_dk = distort(xy, self.distortion)
+        distorted, dd_dxy, dd_dk = distort(xy, self.distortion, self.lens)
         focal = np.array([self.fx_px, self.fy_px])
         q = distorted * focal + [self.cx_px, self.cy_px]
         dxy_dpoint = np.zeros((len(points), 2, 3))
@@ -255,7 +318,7 @@ class CameraModel(ArrayRecord):
         """
         q = np.asarray(q_px, dtype=np.float64)
         distorted = (q - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
-        return undistort(distorted, self.distortion)
+        return undistort(distorted, self.distortion, self.lens)
 
     def folded_border(self, n_steps: int = 24) -> FloatArray:
         """(K, 2) pixels on the image's border for which the distortion has no inverse.

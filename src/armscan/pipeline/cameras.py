@@ -186,6 +186,8 @@ def _with_settled_centres(
 
 def _model_of(fit: CameraFit) -> DistortionModel:
     """The distortion model whose coefficients were free."""
+    if fit.camera.lens == "fisheye":
+        return "fisheye"
     free = set(fit.free_parameters)
     return max(
         (name for name, terms in DISTORTION_PARAMETERS.items() if free.issuperset(terms)),

@@ -24,7 +24,6 @@ from armscan.kernels.naming import (
     sum_moments,
 )
 from armscan.models.calibration import SensorCalibration
-from armscan.models.camera import fold_radius
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.triangulate import (
     DepthRange,
@@ -92,12 +91,12 @@ def possible_sheets(
 
 @lru_cache(maxsize=8)
 def _second_numbers(sensor: SensorCalibration) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The right camera as kernels read it (10,), its pose (12,), and half of its image (2,)."""
+    """The right camera as kernels read it (11,), its pose (12,), and half of its image (2,)."""
     views = TwoViews.of_sensor(sensor)
     camera, pose = views.right, views.right_from_left
-    lens = np.append(camera.parameters, fold_radius(camera.distortion))
     turn = np.column_stack([pose.rotation, pose.translation_mm]).ravel()
-    return lens, turn, 0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64)
+    half_px = 0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64)
+    return camera.numbers, turn, half_px
 
 
 def project_on_sheets(

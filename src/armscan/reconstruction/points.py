@@ -20,7 +20,6 @@ from armscan.geometry.rotations import skew
 from armscan.kernels.fusing import N_PARAMETERS, N_SENSOR, fuse_stripes
 from armscan.kernels.naming import mark_beside
 from armscan.models.calibration import SensorCalibration
-from armscan.models.camera import fold_radius
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.epipolar import (
     N_DRIFT,
@@ -482,5 +481,4 @@ def _right_numbers(sensor: SensorCalibration) -> tuple[FloatArray, FloatArray]:
         raise InputError("the sensor has one camera")
     pose, camera = sensor.second.right_from_sensor, sensor.second.camera.camera
     sheets = [one.sheet.in_frame(pose.rotation, pose.translation_mm) for one in sensor.sheets]
-    lens = np.append(camera.parameters, fold_radius(camera.distortion))
-    return lens, np.stack([one.numbers for one in sheets])
+    return camera.numbers, np.stack([one.numbers for one in sheets])

@@ -21,7 +21,6 @@ from armscan.models.calibration import (
     SensorCalibration,
     SheetCalibration,
 )
-from armscan.models.camera import fold_radius
 from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.records.profile import PointProfile, Profile
 
@@ -130,9 +129,8 @@ def meet(
 
 @lru_cache(maxsize=8)
 def lens_numbers(sensor: SensorCalibration) -> FloatArray:
-    """(10,) the left camera or the only one, as the kernels read it."""
-    camera = sensor.camera.camera
-    return np.append(camera.parameters, fold_radius(camera.distortion))
+    """(11,) the left camera or the only one, as the kernels read it."""
+    return sensor.camera.camera.numbers
 
 
 def differentiated(

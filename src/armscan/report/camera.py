@@ -13,7 +13,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from armscan.calibration.cameras.result import BoardWarp, CameraFit, ViewFit
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import Provenance
-from armscan.models.camera import PARAMETER_NAMES
+from armscan.models.camera import PARAMETER_NAMES, Lens
 from armscan.records.exposure import Exposure
 from armscan.report.charts import (
     Bars,
@@ -68,6 +68,8 @@ MEANINGS = {
     "p2": "tangential distortion",
     "k3": "radial distortion, r⁶",
 }
+FISHEYE_TERMS = {"k1": "θ³", "k2": "θ⁵", "k3": "θ⁷"}
+"""Of the angle from the axis."""
 RMS_MEANING = (
     "An rms here is the root of the mean, over points, of the squared length of the residual "
     "vector (x and y together), as OpenCV defines it."
@@ -97,9 +99,18 @@ def camera_quantities(fit: CameraFit, n_images: int) -> tuple[Quantity, ...]:
         Quantity("covered_fraction", "", fit.coverage.fraction),
         *_stretch_quantities(fit),
         hold_out_quantity(held_out, "images"),
+        *lens_quantities(fit.camera.lens),
         *parameter_quantities(fit),
         *(bow_quantities(fit.warp.bow_mm) if fit.warp is not None else ()),
     )
+
+
+def lens_quantities(lens: Lens) -> tuple[Quantity, ...]:
+    """Said of a lens that is no pinhole."""
+    if lens == "pinhole":
+        return ()
+    meaning = "a point's distance from the principal point follows its angle from the axis"
+    return (Quantity("lens", "Lens", lens, meaning=meaning),)
 
 
 def _stretch_quantities(fit: CameraFit) -> tuple[Quantity, ...]:
@@ -122,6 +133,13 @@ def bow_quantities(bow_mm: Sequence[float] | FloatArray) -> tuple[Quantity, ...]
     return (Quantity("board.bow_mm", "Bow of the board", value, shown=shown, meaning=words),)
 
 
+def meaning_of(name: str, lens: Lens) -> str:
+    """What a parameter of a camera is."""
+    if lens == "fisheye" and name in FISHEYE_TERMS:
+        return f"fisheye, {FISHEYE_TERMS[name]} of the angle from the axis"
+    return MEANINGS[name]
+
+
 def parameter_quantities(fit: CameraFit) -> tuple[Quantity, ...]:
     """Each parameter with its sigma; one that was held says so."""
     return tuple(
@@ -131,12 +149,13 @@ def parameter_quantities(fit: CameraFit) -> tuple[Quantity, ...]:
             float(value),
             float(sigma),
             unit_of(name),
-            MEANINGS[name],
+            meaning_of(name, fit.camera.lens),
             "" if name in fit.free_parameters else f"{value:g} (held)",
         )
         for name, value, sigma in zip(
             PARAMETER_NAMES, fit.camera.parameters, fit.sigma, strict=True
         )
+        if name in fit.camera.parameter_names
     )
 
 

@@ -21,10 +21,10 @@ from armscan.models.calibration import Provenance
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.records.exposure import Exposure
 from armscan.report.camera import (
-    MEANINGS,
     NO_TARGET,
     bow_quantities,
     hold_out_quantity,
+    meaning_of,
     noise_text,
     rms_texts,
     target_text,
@@ -389,7 +389,7 @@ def _two_cameras_section(fit: StereoFit) -> Section:
             is_free = name in fit.sides[side].single.free_parameters
             text = with_sigma(value, sigma, unit_of(name))
             cells.append(text if is_free or sigma > 0.0 else f"{value:g} (held)")
-        rows.append((name.removesuffix("_px"), *cells, MEANINGS[name]))
+        rows.append((name.removesuffix("_px"), *cells, meaning_of(name, fit.views.left.lens)))
     heads = ("parameter", "left ± 1 sigma", "right ± 1 sigma", "meaning")
     reasons = f"Left: {sentence(fit.left.single.reason)} Right: {sentence(fit.right.single.reason)}"
     return Section("The two cameras", (Table(heads, tuple(rows), "", (3,)), Text(reasons)))

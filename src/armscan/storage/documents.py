@@ -45,7 +45,7 @@ from armscan.models.calibration import (
     SheetCalibration,
     SheetDiagnostics,
 )
-from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.camera import PARAMETER_NAMES, CameraModel, Lens
 from armscan.models.light_sheet import BOW_TERMS, LightSheet
 from armscan.models.two_views import (
     STEREO_PARAMETER_NAMES,
@@ -228,14 +228,26 @@ def _fault_of_colour(sensor: SensorCalibration) -> str:
     return "" if sensor.laser_colour in colours else f"has a laser_colour not of {colours}"
 
 
+LENS_TEXTS: Mapping[Lens, str] = {
+    "pinhole": "pinhole k1 k2 p1 p2 k3",
+    "fisheye": "fisheye k1 k2 k3",
+}
+
+
+def _lens(text: Any, key: str) -> Lens:
+    named = {shown: lens for lens, shown in LENS_TEXTS.items()}
+    if not isinstance(text, str) or text not in named:
+        raise MismatchError(key, f"is none of {', '.join(map(repr, named))}")
+    return named[text]
+
+
 EVIDENCE = Layout(is_evidence=True)
 LAYOUTS: Mapping[type, Layout] = {
     CameraModel: Layout(
+        keys={"lens": "model"},
+        codecs={"lens": FieldCodec(LENS_TEXTS.__getitem__, _lens)},
         spread={"distortion": PARAMETER_NAMES[4:]},
-        constants={
-            "model": "pinhole k1 k2 p1 p2 k3",
-            "pixel_origin": "centre of the top-left pixel",
-        },
+        constants={"pixel_origin": "centre of the top-left pixel"},
     ),
     CameraCalibration: Layout(
         keys={"camera": "intrinsics", "covered_px": "valid_region"},

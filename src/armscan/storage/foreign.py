@@ -14,7 +14,7 @@ import numpy as np
 
 from armscan.errors import FileFormatError, InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.models.camera import CameraModel
+from armscan.models.camera import CameraModel, Lens
 from armscan.storage.codec import LARGEST_SIZE_PX as MOST_PX
 from armscan.storage.codec import is_json, parse_json
 
@@ -32,6 +32,8 @@ HEIGHT_KEYS = ("image_height", "image_Height", "height")
 SIZE_KEYS = ("image_size", "imageSize", "img_size")
 RMS_KEYS = ("avg_reprojection_error", "rms", "reprojection_error")
 PLUMB_BOB = ("", "plumb_bob")
+EQUIDISTANT = ("equidistant", "fisheye")
+"""OpenCV's fisheye model in ROS and in other programs: k1 k2 k3 k4."""
 KEYS = (
     *(MATRIX_KEYS + DISTORTION_KEYS + WIDTH_KEYS + HEIGHT_KEYS + SIZE_KEYS + RMS_KEYS),
     *("distortion_model", "fisheye_model"),
@@ -49,7 +51,8 @@ def parse_foreign_camera(data: bytes, where: str) -> tuple[CameraModel, float]:
     Returns
     -------
     camera
-        Coefficients beyond ``k1 k2 p1 p2 k3`` are accepted when they are zero.
+        Coefficients beyond ``k1 k2 p1 p2 k3``, of a fisheye beyond ``k1 k2 k3``, are accepted when
+        they are zero.
     rms_px
         Reprojection error that the file states; NaN for none.
 
@@ -62,16 +65,17 @@ def parse_foreign_camera(data: bytes, where: str) -> tuple[CameraModel, float]:
     tree = _read_tree(data, where)
     matrix = _matrix(tree, where)
     width, height = _size(tree, where)
-    _check_model(tree, where)
+    lens = _lens(tree, where)
     try:
         camera = CameraModel(
             fx_px=matrix[0, 0],
             fy_px=matrix[1, 1],
             cx_px=matrix[0, 2],
             cy_px=matrix[1, 2],
-            distortion=_distortion(tree, where),
+            distortion=_distortion(tree, where, lens),
             width_px=width,
             height_px=height,
+            lens=lens,
         )
     except InputError as error:
         raise FileFormatError(error.what, where=where, remedy=error.remedy) from error
@@ -170,7 +174,7 @@ def _matrix(tree: Mapping[str, Any], where: str) -> FloatArray:
     return np.asarray(matrix)
 
 
-def _distortion(tree: Mapping[str, Any], where: str) -> FloatArray:
+def _distortion(tree: Mapping[str, Any], where: str, lens: Lens) -> FloatArray:
     value = _first(tree, DISTORTION_KEYS)
     if value is None:
         raise FileFormatError(
@@ -179,6 +183,8 @@ def _distortion(tree: Mapping[str, Any], where: str) -> FloatArray:
             remedy="give five zeros for a lens without distortion",
         )
     numbers = _numbers(value, "distortion_coefficients", where)
+    if lens == "fisheye":
+        return _of_fisheye(numbers, where)
     if numbers.size > N_COEFFICIENTS and np.any(numbers[N_COEFFICIENTS:] != 0.0):
         raise FileFormatError(
             f"the lens is described by {numbers.size} distortion coefficients",
@@ -196,6 +202,23 @@ def _distortion(tree: Mapping[str, Any], where: str) -> FloatArray:
     return coefficients
 
 
+def _of_fisheye(numbers: FloatArray, where: str) -> FloatArray:
+    if numbers.size != 4:
+        raise FileFormatError(
+            f"a fisheye lens with {numbers.size} distortion coefficients, expected k1 k2 k3 k4",
+            where=where,
+            remedy="calibrate with OpenCV's fisheye model, or with `armscan calibrate camera`",
+        )
+    if numbers[3] != 0.0:
+        raise FileFormatError(
+            f"the fisheye lens has k4 = {numbers[3]:g}, and only k1 k2 k3 are used here",
+            where=where,
+            remedy="calibrate with `armscan calibrate camera --distortion fisheye`, or in OpenCV "
+            "with fisheye.CALIB_FIX_K4",
+        )
+    return np.array([numbers[0], numbers[1], 0.0, 0.0, numbers[2]])
+
+
 def _size(tree: Mapping[str, Any], where: str) -> tuple[int, int]:
     pair = _first(tree, SIZE_KEYS)
     found = pair if pair is not None else [_first(tree, WIDTH_KEYS), _first(tree, HEIGHT_KEYS)]
@@ -209,25 +232,24 @@ def _size(tree: Mapping[str, Any], where: str) -> tuple[int, int]:
     return int(found[0]), int(found[1])
 
 
-def _check_model(tree: Mapping[str, Any], where: str) -> None:
-    """ROS names its lens model; OpenCV's fisheye files do so in free text at most."""
+def _lens(tree: Mapping[str, Any], where: str) -> Lens:
+    """ROS names its lens model; OpenCV's fisheye files have a flag, or free text at most."""
     model = tree.get("distortion_model", "")
+    if model in EQUIDISTANT or tree.get("fisheye_model") not in (None, 0, 0.0, False):
+        return "fisheye"
     if model not in PLUMB_BOB:
         raise FileFormatError(
-            f"the lens model is {model!r}, only plumb_bob is read",
+            f"the lens model is {model!r}, only plumb_bob and equidistant are read",
             where=where,
             remedy="calibrate with k1 k2 p1 p2 k3",
         )
-    if tree.get("fisheye_model") not in (None, 0, 0.0, False):
-        raise FileFormatError(
-            "the lens model is fisheye", where=where, remedy="calibrate with the pinhole model"
-        )
+    return "pinhole"
 
 
 def camera_info_yaml(
     camera: CameraModel, name: str = "camera", *, comments: Iterable[str] = ()
 ) -> str:
-    """Text of a ``camera_info`` file with the model ``plumb_bob``.
+    """Text of a ``camera_info`` file with the model ``plumb_bob``, of a fisheye ``equidistant``.
 
     Rectification is the identity and the projection matrix repeats the intrinsics: a single
     camera. Numbers are written so that reading them back gives the same floats.
@@ -251,14 +273,17 @@ def camera_info_yaml(
             f"camera name {name!r} cannot be written", remedy="use letters, digits, _ / and -"
         )
     matrix = camera.matrix
+    model, coefficients = "plumb_bob", camera.distortion.tolist()
+    if camera.lens == "fisheye":
+        model, coefficients = "equidistant", [*camera.distortion[[0, 1, 4]].tolist(), 0.0]
     lines = [
         *(f"# forced: {' '.join(comment.split())}" for comment in comments),
         f"image_width: {camera.width_px}",
         f"image_height: {camera.height_px}",
         f"camera_name: {name}",
         *_foreign_ros_matrix("camera_matrix", 3, 3, matrix.ravel().tolist()),
-        "distortion_model: plumb_bob",
-        *_foreign_ros_matrix("distortion_coefficients", 1, 5, camera.distortion.tolist()),
+        f"distortion_model: {model}",
+        *_foreign_ros_matrix("distortion_coefficients", 1, len(coefficients), coefficients),
         *_foreign_ros_matrix(
             "rectification_matrix", 3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
         ),

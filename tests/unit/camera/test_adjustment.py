@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 
 from armscan.calibration.cameras.adjustment import (
@@ -25,7 +27,7 @@ BASIS, _ = free_basis("k1k2p1p2k3", CameraOptions(), with_board_warp=True)
 def problem(seed: int = 1) -> tuple[Observations, State]:
     views, poses = make_views(SCENE, seed)
     shared = np.append(CAMERA.parameters, SCENE.bow_mm)
-    return gather(views), State.from_poses(shared, poses)
+    return gather(views, "pinhole"), State.from_poses(shared, poses)
 
 
 def dense_jacobian(observations: Observations, state: State) -> tuple[np.ndarray, np.ndarray]:
@@ -92,22 +94,14 @@ def test_step_and_covariance_are_those_of_the_dense_system() -> None:
 
 def test_weights_leave_points_out_exactly() -> None:
     views, poses = make_views(SCENE, 3)
-    observations = gather(views)
+    observations = gather(views, "pinhole")
     start = State.from_poses(np.append(CAMERA.parameters, np.zeros(2)), poses)
     weights = np.ones(len(observations.points_px))
     weights[::7] = 0.0
     with_zeros = adjust(observations, start, BASIS, weights)
     spoiled = observations.points_px.copy()
     spoiled[::7] += 100.0
-    other = type(observations)(
-        spoiled,
-        observations.whitening,
-        observations.board_mm,
-        observations.board_warp_shape,
-        observations.starts,
-        observations.width_px,
-        observations.height_px,
-    )
+    other = replace(observations, points_px=spoiled)
     spoiled_fit = adjust(other, start, BASIS, weights)
     assert not isinstance(with_zeros, FitFailure)
     assert not isinstance(spoiled_fit, FitFailure)
@@ -117,7 +111,7 @@ def test_weights_leave_points_out_exactly() -> None:
 def test_noise_free_views_give_the_truth_back_from_a_poor_start() -> None:
     scene = Scene(noise_px=0.0)
     views, poses = make_views(scene, 4)
-    observations = gather(views)
+    observations = gather(views, "pinhole")
     poor = np.append(CAMERA.parameters * [1.05, 0.96, 1.02, 0.98, 0.5, 0, 0, 0, 0], np.zeros(2))
     basis, names = free_basis("k1k2p1p2k3", CameraOptions(), with_board_warp=False)
     result = adjust(observations, State.from_poses(poor, poses), basis)

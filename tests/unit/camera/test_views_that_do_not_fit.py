@@ -170,8 +170,8 @@ def test_wrong_requests_are_refused() -> None:
         calibrate_camera(views, CameraOptions(leave_out=("nosuch.png",)))
     with pytest.raises(InputError, match=r"share a name: view00\.png"):
         calibrate_camera([views[0], *views])
-    with pytest.raises(OptionError, match="fisheye"):
-        CameraOptions(distortion="fisheye")  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="rational"):
+        CameraOptions(distortion="rational")  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="n_folds"):
         CameraOptions(n_folds=1)
 

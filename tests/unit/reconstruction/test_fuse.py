@@ -14,6 +14,7 @@ from armscan.geometry.rotations import rotation_from_vector
 from armscan.kernels.fusing import N_PARAMETERS, carry_fused
 from armscan.kernels.placing import propagate_points
 from armscan.models.calibration import SensorCalibration
+from armscan.models.camera import Lens
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
 from armscan.reconstruction.points import fuse_points, triangulate_right
@@ -27,6 +28,7 @@ from armscan.reconstruction.triangulate import (
     shape_mm,
     sheet_numbers,
 )
+from rigs.fisheye import fisheye_sensor
 from rigs.sheet_rig import make_profile
 from rigs.stereo_head import StereoHead
 
@@ -290,9 +292,11 @@ def test_fusing_solves_the_weighted_equations_with_the_place_along_the_stripe_he
         assert np.all(np.abs(found.by_sensor[i] - expected) <= 1e-7 * size + 1e-12)
 
 
-def test_a_point_without_a_right_stripe_is_that_of_the_left_camera_alone() -> None:
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_a_point_without_a_right_stripe_is_that_of_the_left_camera_alone(lens: Lens) -> None:
     """One kernel for both: against the derivatives of a point on its sheet."""
     sensor = head().drawn_calibration(np.random.default_rng(3))
+    sensor = fisheye_sensor(sensor) if lens == "fisheye" else sensor
     left, normals, right = pixels()
     n, sigma = len(left), np.array([0.05, 0.07, 0.09, 0.11])
     there = project_on_sheets(left, np.full(n, SHEET), sensor)

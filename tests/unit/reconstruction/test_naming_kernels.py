@@ -17,6 +17,7 @@ from armscan.kernels.naming import (
     predict_residuals,
     take_every,
 )
+from armscan.models.camera import Lens
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.epipolar import (
     RightStripes,
@@ -31,6 +32,7 @@ from armscan.reconstruction.triangulate import (
     lens_numbers,
     sheet_numbers,
 )
+from rigs.fisheye import fisheye_sensor
 from rigs.stereo_head import StereoHead
 from rigs.stereo_scenes import Noise, draw_surfaces, expose
 
@@ -201,11 +203,13 @@ def test_possible_sheets_are_those_whose_planes_are_met_in_depth() -> None:
     assert 300 < len(point) < 300 * len(sensor.sheets)
 
 
-def test_crossings_and_their_derivatives_are_those_of_the_models() -> None:
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_crossings_and_their_derivatives_are_those_of_the_models(lens: Lens) -> None:
     """Right pixel and its derivatives by `TwoViews`, the rest by matrix products."""
     rng = np.random.default_rng(8)
     head = StereoHead.thesis()
     sensor = head.drawn_calibration(rng)
+    sensor = fisheye_sensor(sensor) if lens == "fisheye" else sensor
     left, right = expose(head, draw_surfaces("ball", rng), Noise(), rng)
     rows = np.flatnonzero((left.sheet >= 0) & left.profile.is_accepted)[::7]
     pixels, sheet = left.profile.points_px[rows], left.sheet[rows]

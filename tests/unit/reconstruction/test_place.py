@@ -13,8 +13,8 @@ from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Points, Pose
 from armscan.geometry.rotations import rotation_from_vector, skew
 from armscan.kernels.placing import propagate_points
-from armscan.models.calibration import ArmNoise
-from armscan.models.camera import CameraModel
+from armscan.models.calibration import ArmNoise, ScannerCalibration
+from armscan.models.camera import CameraModel, Lens
 from armscan.reconstruction import place
 from armscan.reconstruction.place import (
     BaseTransform,
@@ -33,6 +33,7 @@ from armscan.reconstruction.triangulate import (
 )
 from armscan.records.profile import PointProfile
 from rigs import placing_rig as rig
+from rigs.fisheye import fisheye_sensor
 from rigs.sheet_rig import thesis_rig
 
 PLACES_PX = np.array([[1400.0, 600.0], [700.0, 820.0], [1000.0, 700.0]])
@@ -66,19 +67,24 @@ def test_derivatives_by_point_and_hand_eye() -> None:
         )
 
 
-def moves_by_differences() -> tuple[FloatArray, FloatArray, FloatArray]:
+def scanner_before(lens: Lens) -> ScannerCalibration:
+    scanner = rig.scanner()
+    assert scanner.sensor is not None
+    return replace(scanner, sensor=fisheye_sensor(scanner.sensor)) if lens == "fisheye" else scanner
+
+
+def moves_by_differences(scanner: ScannerCalibration) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(3, 3, K), (3, 3, 6), (3, 3) of three points by sensor, hand-eye and noise, as defined.
 
     Sensor errors move the points AND, coupled, the hand-eye.
     """
-    scanner = rig.scanner()
     assert scanner.sensor is not None
-    camera, pair = thesis_rig().camera, rig.sheets()
+    camera, pair = scanner.sensor.camera.camera, rig.sheets()
     joint = scanner.sensor.covariance
     sigma = np.sqrt(np.diag(joint))
 
     def at(sensor_step: FloatArray, hand_eye_step: FloatArray, shift_px: FloatArray) -> FloatArray:
-        other = CameraModel.from_parameters(camera.parameters + sensor_step[:9], 2048, 1536)
+        other = camera.moved_to(camera.parameters + sensor_step[:9])
         moved = (pair[0].updated(sensor_step[9:17]), pair[1].updated(sensor_step[17:]))
         points, _ = intersect_sheets(PLACES_PX + shift_px, SHEET_OF, rig.sensor_of(other, moved))
         hand_eye = rig.stepped(rig.TOOL_FROM_SENSOR, hand_eye_step + rig.coupling() @ sensor_step)
@@ -87,7 +93,7 @@ def moves_by_differences() -> tuple[FloatArray, FloatArray, FloatArray]:
     none, still, here = np.zeros(25), np.zeros(6), np.zeros(2)
     by_sensor = np.stack(
         [(at(s, still, here) - at(-s, still, here)) for s in np.diag(1e-3 * sigma)], axis=2
-    ) / (2e-3 * sigma)
+    ) / (2e-3 * np.where(sigma > 0.0, sigma, np.inf))
     by_hand_eye = (
         np.stack([(at(none, s, here) - at(none, -s, here)) for s in 1e-5 * np.eye(6)], axis=2)
         / 2e-5
@@ -97,10 +103,9 @@ def moves_by_differences() -> tuple[FloatArray, FloatArray, FloatArray]:
     return by_sensor, by_hand_eye, noise
 
 
-def covariance_by_differences() -> FloatArray:
+def covariance_by_differences(scanner: ScannerCalibration) -> FloatArray:
     """(3, 3, 3) of the same points."""
-    by_sensor, by_hand_eye, noise = moves_by_differences()
-    scanner = rig.scanner()
+    by_sensor, by_hand_eye, noise = moves_by_differences(scanner)
     assert scanner.sensor is not None
     joint = scanner.sensor.covariance
     own = by_hand_eye @ scanner.hand_eye.covariance @ by_hand_eye.transpose(0, 2, 1)
@@ -108,9 +113,10 @@ def covariance_by_differences() -> FloatArray:
     return np.asarray(own + follow + noise[:, :, None] * noise[:, None, :])
 
 
-def test_covariance_term_by_term_on_two_sheets() -> None:
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_covariance_term_by_term_on_two_sheets(lens: Lens) -> None:
     """Each point takes the camera, its own sheet and the hand-eye, with the coupling's sign."""
-    placing = BaseTransform.of(rig.scanner())
+    placing = BaseTransform.of(scanner_before(lens))
     assert placing.scanner.sensor is not None
     profile = rig.profile_at(PLACES_PX)
     stripe = triangulate_stripe(profile, SHEET_OF, placing.scanner.sensor)
@@ -126,7 +132,7 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
     cloud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, quiet)
     # The coupling reaches the other sheet's parameters, which move this point through the
     # hand-eye alone: they belong to the joint covariance too.
-    expected = covariance_by_differences()
+    expected = covariance_by_differences(placing.scanner)
     size = np.abs(expected).max(axis=(1, 2), keepdims=True)
     np.testing.assert_allclose(cloud.covariance_mm2 / size, expected / size, atol=1e-5)
     loud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing)
@@ -153,7 +159,7 @@ def test_what_a_calibration_errs_is_alike_in_points_of_two_sheets(
     monkeypatch.setattr(place, "LEAST_MODE", left_out)
     scanner = rig.scanner()
     assert scanner.sensor is not None
-    by_sensor, by_hand_eye, _ = moves_by_differences()
+    by_sensor, by_hand_eye, _ = moves_by_differences(scanner)
     root = np.linalg.cholesky(scanner.hand_eye.covariance)
     sensor_root = np.linalg.cholesky(scanner.sensor.covariance)
     expected = np.concatenate([by_hand_eye @ root, by_sensor @ sensor_root], axis=2).reshape(9, -1)

@@ -9,7 +9,7 @@ import pytest
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
-from armscan.models.camera import CameraModel
+from armscan.models.camera import CameraModel, Lens
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.place import merge_clouds
 from armscan.reconstruction.triangulate import (
@@ -20,6 +20,7 @@ from armscan.reconstruction.triangulate import (
     triangulate,
 )
 from armscan.records.profile import Profile
+from rigs.fisheye import TANGENTIAL, as_fisheye, fisheye_sensor
 from rigs.sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
 from rigs.stereo_head import StereoHead
 
@@ -174,7 +175,8 @@ def test_covariance_is_that_of_repeats_with_all_errors() -> None:
     assert abs(np.mean(squares) - 3.0) < 4.0 * np.sqrt(6.0 / 1000)
 
 
-def test_covariance_by_differences_of_every_parameter_on_two_sheets() -> None:
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_covariance_by_differences_of_every_parameter_on_two_sheets(lens: Lens) -> None:
     """Each point takes the camera and its own sheet, with their signed correlation.
 
     Compared term by term: camera and sheet errors that cancel in truth must cancel here.
@@ -185,6 +187,9 @@ def test_covariance_by_differences_of_every_parameter_on_two_sheets() -> None:
     mixing = np.linalg.qr(np.random.default_rng(8).normal(size=(25, 25)))[0]
     correlation = mixing @ np.diag(np.linspace(0.05, 1.95, 25)) @ mixing.T
     joint = correlation * np.outer(sigma, sigma)
+    if lens == "fisheye":
+        camera = as_fisheye(camera)
+        joint[TANGENTIAL] = joint[:, TANGENTIAL] = sigma[TANGENTIAL] = 0.0
     place = np.array([[1400.0, 600.0], [1400.0, 600.0]])
     cloud = triangulate(
         profile_at(place), np.array([0, 1]), sensor(camera, *sheets, covariance=joint)
@@ -192,7 +197,7 @@ def test_covariance_by_differences_of_every_parameter_on_two_sheets() -> None:
 
     def moved(step: FloatArray, sign: float) -> FloatArray:
         step = sign * step
-        other = CameraModel.from_parameters(camera.parameters + step[:9], 2048, 1536)
+        other = camera.moved_to(camera.parameters + step[:9])
         turned = (sheets[0].updated(step[9:17]), sheets[1].updated(step[17:]))
         return intersect_sheets(place, np.array([0, 1]), sensor(other, *turned))[0]
 
@@ -247,7 +252,8 @@ def test_merged_clouds_keep_order_and_exposures() -> None:
         merge_clouds([clouds[0], replace(clouds[1], frame="Base")])
 
 
-def test_rays_meet_sheets_as_in_the_models_of_camera_and_sheet() -> None:
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_rays_meet_sheets_as_in_the_models_of_camera_and_sheet(lens: Lens) -> None:
     """Each pixel on every sheet in turn, on none, and at places that no ray reaches.
 
     On sheet 0, which stands behind the camera, nothing is met: what is kept from one sheet to the
@@ -266,6 +272,7 @@ def test_rays_meet_sheets_as_in_the_models_of_camera_and_sheet() -> None:
         bent[0], sheet=replace(bent[0].sheet, origin_mm=bent[0].sheet.origin_mm - [0.0, 0.0, 900.0])
     )
     head = replace(head, sheets=(behind, *bent[1:]))
+    head = fisheye_sensor(head) if lens == "fisheye" else head
     camera, n_sheets = head.camera.camera, len(head.sheets)
     size = [camera.width_px, camera.height_px]
     pixels = np.concatenate([rng.uniform(-0.2, 1.2, (300, 2)) * size, [[np.nan, 5.0], [1e7, 1e7]]])

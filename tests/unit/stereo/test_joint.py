@@ -18,7 +18,7 @@ from armscan.calibration.cameras.joint import (
 from rigs.stereo_rig import CONVERGING, LEFT, RIGHT, StereoScene, make_pairs
 
 PAIRS, POSES = make_pairs(StereoScene(n_pairs=2), 0)
-OBSERVATIONS = stack_pair_observations(PAIRS)
+OBSERVATIONS = stack_pair_observations(PAIRS, ("pinhole", "pinhole"))
 STATE = StereoState(
     np.concatenate([LEFT.parameters, RIGHT.parameters]),
     CONVERGING,

@@ -23,7 +23,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import Minimum, minimise
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, skew
-from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.camera import PARAMETER_NAMES, CameraModel, Lens
 from armscan.vision.targets.target import TargetView
 
 WARP_NAMES = ("bow_x_mm", "bow_y_mm")
@@ -49,6 +49,8 @@ class Observations:
         (V + 1,) first row of each view, and N.
     width_px, height_px
         Size of the image.
+    lens
+        Kind of lens that is supposed.
     """
 
     points_px: FloatArray
@@ -58,6 +60,11 @@ class Observations:
     starts: tuple[int, ...]
     width_px: int
     height_px: int
+    lens: Lens
+
+    def camera(self, parameters: FloatArray) -> CameraModel:
+        """The camera of (9,) parameters."""
+        return CameraModel.from_parameters(parameters, self.width_px, self.height_px, self.lens)
 
     @property
     def n_views(self) -> int:
@@ -92,10 +99,6 @@ class State:
     rotations: FloatArray
     translations_mm: FloatArray
 
-    def camera(self, width_px: int, height_px: int) -> CameraModel:
-        """The camera of this state."""
-        return CameraModel.from_parameters(self.shared[:9], width_px, height_px)
-
     def pose(self, view: int) -> Pose[Sensor, Board]:
         """``sensor_from_board`` of one view."""
         return Pose(self.rotations[view], self.translations_mm[view])
@@ -110,8 +113,8 @@ class State:
         )
 
 
-def gather(views: Sequence[TargetView]) -> Observations:
-    """Collect the points of views, which must show images of one size.
+def gather(views: Sequence[TargetView], lens: Lens) -> Observations:
+    """Collect the points of views, which must show images of one size, before a kind of lens.
 
     Raises
     ------
@@ -138,6 +141,7 @@ def gather(views: Sequence[TargetView]) -> Observations:
         tuple(int(n) for n in np.cumsum([0] + [len(view) for view in views])),
         views[0].width_px,
         views[0].height_px,
+        lens,
     )
 
 
@@ -228,9 +232,7 @@ def predict(
     """
     if not np.isfinite(state.shared).all() or min(state.shared[:2]) <= 0.0:
         return None
-    camera = CameraModel.from_parameters(
-        state.shared[:9], observations.width_px, observations.height_px
-    )
+    camera = observations.camera(state.shared[:9])
     board = observations.board_mm.copy()
     board[:, 2] += observations.board_warp_shape @ state.shared[9:]
     turned = np.concatenate(

@@ -20,6 +20,7 @@ from armscan.calibration.cameras.adjustment import (
 from armscan.calibration.cameras.distortion import (
     ChosenModel,
     chance_of_coefficients,
+    choose_lens,
     choose_model,
     coefficients_left_at_zero,
     cross_validate,
@@ -112,7 +113,7 @@ def prepare_views(
     OptionError
         If a view to leave out does not exist.
     """
-    gather(views)
+    gather(views, "pinhole")
     sources = [view.source for view in views]
     twice = sorted({source for source in sources if sources.count(source) > 1})
     if twice:
@@ -209,7 +210,7 @@ def assemble(
     if refusal is not None:
         return refusal
     warp = None if bow_test is None else board_warp(solution, bow_test, covariance)
-    camera = solution.state.camera(observations.width_px, observations.height_px)
+    camera = observations.camera(solution.state.shared[:N_CAMERA])
     fits, refused = _view_fits(
         views, prepared, solution, covariance=covariance, is_misfit=is_misfit, camera=camera
     )
@@ -262,7 +263,8 @@ def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | N
 
 def _noise_scale(used: Sequence[TargetView], solution: Solution) -> float:
     kept = solution.weights > 0.0
-    chi2 = float(chi2_of_points(gather(used), solution.state)[kept].sum())
+    claimed = gather(used, solution.observations.lens)
+    chi2 = float(chi2_of_points(claimed, solution.state)[kept].sum())
     return float(np.sqrt(chi2 / max(solution.degrees_of_freedom, 1)))
 
 
@@ -478,12 +480,13 @@ def _solve_model(
 ) -> ChosenModel | FitFailure:
     """Solve with the wanted model, or with the one that the rule chooses."""
     used = [views[index] for index in prepared.used]
-    observations = gather(used)
+    observations = gather(used, "pinhole")
     sources = tuple(view.source for view in used)
 
     @cache
     def solve(model: DistortionModel) -> Solution | FitFailure:
-        return _solve(used, observations, prepared, model, options)
+        seen = replace(observations, lens="fisheye") if model == "fisheye" else observations
+        return _solve(used, seen, prepared, model, options)
 
     @cache
     def bowed(model: DistortionModel) -> Solution | FitFailure:
@@ -495,7 +498,7 @@ def _solve_model(
         return cross_validate(on_points, sources, options.n_folds)
 
     def folds(solution: Solution) -> bool:
-        camera = solution.state.camera(observations.width_px, observations.height_px)
+        camera = solution.observations.camera(solution.state.shared[:N_CAMERA])
         return len(camera.folded_border()) > 0
 
     def choose(
@@ -503,7 +506,7 @@ def _solve_model(
     ) -> ChosenModel | FitFailure:
         return choose_model(solving, validate, folds, chance_of_coefficients)
 
-    if options.distortion == "auto" and options.n_folds:
+    def choose_pinhole() -> ChosenModel | FitFailure:
         chosen = choose(solve)
         if isinstance(chosen, FitFailure) or not _is_bowed(chosen.solution, options):
             return chosen
@@ -515,6 +518,9 @@ def _solve_model(
         if predicts_better(bowed(chosen.model), again, validate):
             return chosen
         return replace(again, solution=flat) if _is_bowed(flat, options) else chosen
+
+    if options.distortion == "auto" and options.n_folds:
+        return choose_lens(choose_pinhole(), solve, validate)
     model: DistortionModel = options.distortion
     reason = f"{model} was asked for"
     if model == "auto":

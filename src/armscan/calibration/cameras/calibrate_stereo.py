@@ -436,7 +436,9 @@ def _solve(
     options: StereoOptions,
     given: Given | None,
 ) -> JointSolution | FitFailure:
-    observations = stack_pair_observations(boards.seen_by)
+    observations = stack_pair_observations(
+        boards.seen_by, (cameras[0].camera.lens, cameras[1].camera.lens)
+    )
     bow = common_bow(cameras)
     problem = JointProblem(
         observations if bow is None else on_bowed_board(observations, bow.bow_mm),

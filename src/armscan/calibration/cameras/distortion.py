@@ -41,6 +41,7 @@ from armscan.calibration.cameras.robust import (
 )
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.models.camera import PARAMETER_NAMES
 
 NO_SHARED = np.zeros((11, 0))
 
@@ -118,14 +119,13 @@ def subset(
     """The observations of some views, in order, with their weights."""
     rows = np.isin(observations.view_of_point, views)
     counts = np.diff(observations.starts)[views]
-    part = Observations(
-        observations.points_px[rows],
-        observations.whitening[rows],
-        observations.board_mm[rows],
-        observations.board_warp_shape[rows],
-        (0, *(int(n) for n in np.cumsum(counts))),
-        observations.width_px,
-        observations.height_px,
+    part = replace(
+        observations,
+        points_px=observations.points_px[rows],
+        whitening=observations.whitening[rows],
+        board_mm=observations.board_mm[rows],
+        board_warp_shape=observations.board_warp_shape[rows],
+        starts=(0, *(int(n) for n in np.cumsum(counts))),
     )
     return part, weights[rows]
 
@@ -226,6 +226,43 @@ def choose_model(
     return ChosenModel(chosen.model, chosen.solution, validation, reason, untested)
 
 
+WIDE = 0.6
+"""Ideal radius X/Z up to which a fisheye's terms do what a pinhole's do."""
+LENS_SIGMAS = 3.0
+"""A fisheye takes a pinhole's place if the logarithms of unseen views' residuals fall by so many of
+their standard errors: one view that a pinhole cannot describe would hide in its own scatter."""
+
+
+def choose_lens(
+    pinhole: ChosenModel | FitFailure,
+    solve: Callable[[DistortionModel], Solution | FitFailure],
+    validate: Callable[[Solution, Solution], CrossValidation | None],
+) -> ChosenModel | FitFailure:
+    """The pinhole, or a fisheye where points reach far from the axis and it predicts them better.
+
+    Parameters
+    ----------
+    pinhole
+        The best of its models, or why none has a solution.
+    solve, validate
+        As for `choose_model`.
+    """
+    if not isinstance(pinhole, FitFailure) and not _is_wide(pinhole.solution):
+        return pinhole
+    fisheye = solve("fisheye")
+    if isinstance(fisheye, FitFailure) or not fisheye.is_converged or not _is_wide(fisheye):
+        return pinhole
+    if isinstance(pinhole, FitFailure):
+        reason = "fisheye: no pinhole with five coefficients explains the views"
+        return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason)
+    both = replace(fisheye, weights=fisheye.weights * pinhole.solution.weights)
+    gain = _fall_sigmas(validate(pinhole.solution, both), validate(both, both))
+    if gain < LENS_SIGMAS:
+        return pinhole
+    reason = "fisheye: unseen views are predicted better than by a pinhole with five coefficients"
+    return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason)
+
+
 def _further(model: DistortionModel, larger: DistortionModel) -> tuple[str, ...]:
     has = DISTORTION_PARAMETERS[model]
     return tuple(name for name in DISTORTION_PARAMETERS[larger] if name not in has)
@@ -257,6 +294,21 @@ def predicts_better(
     smaller = validate(chosen.solution, before)
     gain = _gain_sigmas(smaller, validate(before, before))
     return gain is not None and gain >= GAIN_SIGMAS
+
+
+def _is_wide(solution: Solution) -> bool:
+    seen, kept = solution.observations, solution.weights > 0.0
+    camera = seen.camera(solution.state.shared[: len(PARAMETER_NAMES)])
+    xy, is_valid = camera.undistort(seen.points_px[kept])
+    return bool(np.any(np.sum(xy[is_valid] ** 2, axis=1) > WIDE**2))
+
+
+def _fall_sigmas(pinhole: CrossValidation | None, fisheye: CrossValidation | None) -> float:
+    """Mean over views of the fall of held-out residuals' logarithms, over its standard error."""
+    if pinhole is None or fisheye is None:
+        return 0.0
+    fall = np.log(pinhole.view_rms_px) - np.log(fisheye.view_rms_px)
+    return float(np.mean(fall) / max(np.std(fall, ddof=1) / np.sqrt(len(fall)), 1e-300))
 
 
 def _unfolded(

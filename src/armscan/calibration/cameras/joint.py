@@ -40,7 +40,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import Minimum
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, skew
-from armscan.models.camera import CameraModel
+from armscan.models.camera import Lens
 from armscan.models.two_views import N_CAMERA, N_SECOND, TwoViews
 from armscan.vision.targets.target import TargetView
 
@@ -108,13 +108,9 @@ class StereoState:
 
     def views(self, observations: JointObservations) -> TwoViews:
         """The two cameras of this state."""
-        left, right = observations.left, observations.right
+        left, right = self.intrinsics[:N_CAMERA], self.intrinsics[N_CAMERA:]
         return TwoViews(
-            CameraModel.from_parameters(self.intrinsics[:N_CAMERA], left.width_px, left.height_px),
-            CameraModel.from_parameters(
-                self.intrinsics[N_CAMERA:], right.width_px, right.height_px
-            ),
-            self.right_from_left,
+            observations.left.camera(left), observations.right.camera(right), self.right_from_left
         )
 
     def pose(self, board: int) -> Pose[Sensor, Board]:
@@ -363,7 +359,9 @@ def both_residuals_px(
     )
 
 
-def stack_pair_observations(boards: Sequence[StereoPair]) -> JointObservations:
+def stack_pair_observations(
+    boards: Sequence[StereoPair], lenses: tuple[Lens, Lens]
+) -> JointObservations:
     """Points of both cameras, board by board.
 
     Raises
@@ -374,7 +372,8 @@ def stack_pair_observations(boards: Sequence[StereoPair]) -> JointObservations:
     sides = []
     for side in (0, 1):
         blank = _without_points(views_of(boards, side)[0])
-        sides.append(gather([view or blank for view in (board.views[side] for board in boards)]))
+        seen = [view or blank for view in (board.views[side] for board in boards)]
+        sides.append(gather(seen, lenses[side]))
     return JointObservations(sides[0], sides[1])
 
 

@@ -279,9 +279,11 @@ def _solved(fit: CameraFit, options: StereoOptions) -> SingleCamera:
     free, reason = fit.free_parameters, fit.model_reason
     if options.camera.distortion == "auto":
         # A coefficient held at zero because one camera says little of it would bend the pair.
-        coefficients = DISTORTION_PARAMETERS["k1k2p1p2k3"]
+        is_fisheye = fit.camera.lens == "fisheye"
+        coefficients = DISTORTION_PARAMETERS["fisheye" if is_fisheye else "k1k2p1p2k3"]
         free = (*(name for name in free if name not in coefficients), *coefficients)
-        reason = "all five coefficients: what the pairs say little of, the sigmas tell"
+        named = "all three of a fisheye" if is_fisheye else "all five coefficients"
+        reason = f"{named}: what the pairs say little of, the sigmas tell"
     basis = basis_of(free, is_aspect_fixed=options.camera.is_aspect_fixed)
     return SingleCamera(
         fit.camera,

@@ -75,7 +75,7 @@ def board_near(
 ) -> BoardSeen | FitFailure:
     """The pose of a board by one view alone, from a pose that is nearly right."""
     shared = np.append(camera.parameters, np.zeros(2))
-    result = adjust(gather([view]), State.from_poses(shared, [near]), NO_SHARED)
+    result = adjust(gather([view], camera.lens), State.from_poses(shared, [near]), NO_SHARED)
     if isinstance(result, FitFailure):
         return result
     if not condition_number(result.system.pose[0]) < SINGULAR_CONDITION:

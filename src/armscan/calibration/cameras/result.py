@@ -26,7 +26,7 @@ from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import TargetView
 
-DistortionModel = Literal["auto", "none", "k1", "k1k2", "k1k2p1p2", "k1k2p1p2k3"]
+DistortionModel = Literal["auto", "none", "k1", "k1k2", "k1k2p1p2", "k1k2p1p2k3", "fisheye"]
 
 DISTORTION_PARAMETERS: dict[DistortionModel, tuple[str, ...]] = {
     "none": (),
@@ -34,8 +34,10 @@ DISTORTION_PARAMETERS: dict[DistortionModel, tuple[str, ...]] = {
     "k1k2": ("k1", "k2"),
     "k1k2p1p2": ("k1", "k2", "p1", "p2"),
     "k1k2p1p2k3": ("k1", "k2", "p1", "p2", "k3"),
+    "fisheye": ("k1", "k2", "k3"),
 }
-"""Free coefficients of each distortion model; those not named are zero."""
+"""Free coefficients of each distortion model; those not named are zero. All but the last are of a
+pinhole, see `armscan.models.camera.Lens`."""
 
 MIN_VIEWS = 3
 MIN_VIEW_POINTS = 6
@@ -498,10 +500,11 @@ def _about_outliers(fit: CameraFit) -> list[str]:
     is_at_edge = n >= FEW_OUTLIERS and np.median(radius[is_outlier]) >= edge
     if not is_at_edge or not len(fit.camera.folded_border()):
         return [said]
+    way_out = "" if fit.camera.lens == "fisheye" else "try --distortion fisheye, or "
     return [
         f"{said}, most of them more than {edge:.0f} px from the principal point: there the lens "
-        "seems wider than five coefficients can describe; do not measure farther out, hold-out "
-        "figures leave such points out, too"
+        f"seems wider than its coefficients can describe; {way_out}do not measure farther out, "
+        "hold-out figures leave such points out, too"
     ]
 
 

@@ -399,6 +399,8 @@ def starting_state(
 
     or why there are none.
     """
+    if model == "fisheye":
+        return _fisheye_start(views, observations)
     width, height = observations.width_px, observations.height_px
     rms = np.array([homography_rms_px(v, h) for v, h in zip(views, homographies, strict=True)])
     trusted = np.asarray(rms <= max(SUSPECT_HOMOGRAPHY * float(np.median(rms)), 1e-6))
@@ -411,6 +413,37 @@ def starting_state(
     shared[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     state = State.from_poses(shared, [pose_from_homography(h, matrix) for h in homographies])
     return _with_distortion(state, observations, trusted, model), trusted
+
+
+FISHEYE_FOCALS = np.geomspace(0.15, 1.5, 16)
+"""Of the image's longer side."""
+
+
+def _fisheye_start(
+    views: Sequence[TargetView], observations: Observations
+) -> tuple[State, BoolArray] | FitFailure:
+    """Poses before a fisheye without distortion, of the focal length at which boards fit best."""
+    best, least, size = None, np.inf, np.array([observations.width_px, observations.height_px])
+    for focal in FISHEYE_FOCALS * size.max():
+        shared = np.array([focal, focal, *(0.5 * (size - 1.0)), *np.zeros(7)])
+        camera = observations.camera(shared[:9])
+        poses, rms = zip(*(_flat_pose(view, camera) for view in views), strict=True)
+        if (middle := float(np.median(rms))) < least:
+            trusted = np.asarray(np.array(rms) <= SUSPECT_HOMOGRAPHY * middle)
+            best, least = (State.from_poses(shared, poses), trusted), middle
+    return best or FitFailure("the points do not fit a flat target before a fisheye lens")
+
+
+def _flat_pose(view: TargetView, camera: CameraModel) -> tuple[Pose[Sensor, Board], float]:
+    """A board's pose from its homography, and how far it misses, px rms; infinite for none."""
+    xy, is_valid = camera.undistort(view.points_px)
+    homography = estimate_homography(view.points_board_mm[is_valid, :2], xy[is_valid])
+    if isinstance(homography, FitFailure) or not is_valid.all():
+        return Pose(np.eye(3), np.array([0.0, 0.0, 1.0])), np.inf
+    pose = pose_from_homography(homography, np.eye(3))
+    seen = camera.project(view.points_board_mm @ pose.rotation.T + pose.translation_mm)
+    rms = np.sqrt(np.mean((seen - view.points_px) ** 2))
+    return pose, float(np.nan_to_num(rms, nan=np.inf))
 
 
 def _held(matrix: FloatArray, width: int, height: int, options: CameraOptions) -> FloatArray:
@@ -512,7 +545,7 @@ def board_pose_candidates(
     homography = estimate_homography(view.points_board_mm[is_valid, :2], xy[is_valid])
     if isinstance(homography, FitFailure):
         return homography
-    observations = gather([view])
+    observations = gather([view], camera.lens)
     shared = _shared(camera, bow_mm)
     centre = view.points_board_mm.mean(axis=0)
     first = _refined(observations, shared, pose_from_homography(homography, np.eye(3)))
@@ -603,7 +636,7 @@ def estimate_board_poses(
     factor = best.chi2 / max(degrees, 1)
     if degrees < SCALED_FROM_DEGREES_OF_FREEDOM:
         factor = max(factor, 1.0)
-    observations = gather([view])
+    observations = gather([view], camera.lens)
     found = []
     for candidate in candidates:
         if candidate.chi2 - best.chi2 >= AMBIGUOUS_CHI2 * factor and candidate is not best:
@@ -634,7 +667,7 @@ def _with_excess(
 ) -> TargetView:
     """The view with the variance that explains its residuals, see `calibration.camera.noise`."""
     state = State.from_poses(_shared(camera, bow_mm), [best.sensor_from_board])
-    residuals = residuals_px(gather([view]), state)
+    residuals = residuals_px(gather([view], camera.lens), state)
     excess = excess_variance_px2(residuals, view.covariance_px2, best.chi2, 2 * len(view) - 6)
     if excess <= 0.0:
         return view

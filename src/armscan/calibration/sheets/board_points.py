@@ -478,5 +478,5 @@ def _held_camera(views: Sequence[TargetView], model: CameraModel) -> Solution | 
     start = State.from_poses(np.append(model.parameters, np.zeros(2)), known)
     trusted = np.ones(len(views), dtype=np.bool_)
     held = np.zeros((N_CAMERA + 2, 0))
-    flat = solve_robustly(gather(views), start, held, trusted, MAX_STEPS)
+    flat = solve_robustly(gather(views, model.lens), start, held, trusted, MAX_STEPS)
     return None if isinstance(flat, FitFailure) else flat

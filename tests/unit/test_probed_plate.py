@@ -91,6 +91,20 @@ def test_points_on_the_surface_are_left_where_they_are() -> None:
     assert plate.tip_diameter_mm == 0.0
 
 
+def test_a_tool_in_the_plates_plane_tells_no_side() -> None:
+    """Of tip centres, half a diameter rests on it; of points on the surface, nothing does."""
+    beside = FRAME.translation_mm + 400.0 * FRAME.rotation[:, 0] + 0.4 * NORMAL
+    on_surface = touches(tip_mm=0.0)
+    plate = fit_probed_plate(ProbedPoints(points_mm=on_surface, tip_diameter_mm=0.0), beside)
+    assert isinstance(plate, ProbedPlate)
+    np.testing.assert_allclose(plate.reference.plane.normal, NORMAL, atol=1e-12)
+    assert "taken for granted" in plate.side_from
+    refused = fit_probed_plate(tip_points(), beside + 0.5 * TIP_MM * NORMAL)
+    assert isinstance(refused, FitFailure)
+    assert "lies in the plate's plane" in refused.reason
+    assert "--side" in refused.remedy
+
+
 def test_the_users_word_wins_over_the_tool() -> None:
     below = FRAME.translation_mm - 150.0 * NORMAL
     plate = fit_probed_plate(tip_points(), below, ProbingOptions(side="+z"))

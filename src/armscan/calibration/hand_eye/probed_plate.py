@@ -47,8 +47,8 @@ def face_towards(
     side
         The user's word, which wins; None to follow the tool, or `DEFAULT_SIDE` without it.
     is_sign_only
-        Nothing but the normal's sign depends on the side: where nobody says it and `DEFAULT_SIDE`
-        is not clear, the axis that the plate faces most will do.
+        Nothing but the normal's sign depends on the side: where nobody says it, the tool lies in
+        the plane or `DEFAULT_SIDE` is not clear, the axis that the plate faces most will do.
 
     Returns
     -------
@@ -58,12 +58,13 @@ def face_towards(
     if side is None and towards_mm is not None:
         heights = plane.distance_mm(np.atleast_2d(np.asarray(towards_mm, dtype=np.float64)))
         above = float(np.median(heights))
-        if abs(above) < LEAST_HEIGHT_MM:
+        if abs(above) >= LEAST_HEIGHT_MM:
+            return _facing(plane, above), "where the tool was"
+        if not is_sign_only:
             return FitFailure(
                 "the tool lies in the plate's plane: the side of the probe is not clear",
                 "say it with --side",
             )
-        return _facing(plane, above), "where the tool was"
     how = "as asked for" if side else TAKEN_FOR_GRANTED
     if side is None and is_sign_only and abs(plane.normal[2]) < CLEAR_SIDE:
         axis = int(np.argmax(np.abs(plane.normal)))

@@ -15,26 +15,42 @@ a coefficient that the lens has, frees one that it has not. *inside* the truth o
 lies in the stated joint 95 % region; *chi2/4* mean of the normalised squared error. *free in* and
 the next: the same for ``--distortion k1k2p1p2k3``; *width* median of the four sigmas over theirs.
 *px*, *free px* median over draws of the rms error over the whole image, a turn aside.
+
+``--lenses`` draws wide lenses instead: pinholes with all five coefficients and half a field of
+view of 30 to 48 degrees, and fisheyes (`cv2.fisheye`, k4 = 0) of 35 to 80 degrees to each side.
+*right* the kind of lens; *inside*, *chi2/4* as above, of those; *px* the rms of points of ten more
+views, without noise, whose board's pose is fitted to them, and *pinhole px* with
+``--distortion k1k2p1p2k3``; *no pinhole* how many of these were refused.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import cv2
 import numpy as np
 from scipy import stats
 
 from armscan.calibration.cameras.calibrate import calibrate_camera
-from armscan.calibration.cameras.result import DISTORTION_PARAMETERS, CameraFit, CameraOptions
+from armscan.calibration.cameras.result import (
+    DISTORTION_PARAMETERS,
+    CameraFit,
+    CameraOptions,
+    DistortionModel,
+)
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.arrays import FloatArray
-from armscan.models.camera import CameraModel
+from armscan.geometry.estimate import FitFailure
+from armscan.models.camera import CameraModel, Lens
 from armscan.vision.targets.target import Chessboard, TargetView
 from rigs.camera_scene import Scene, make_views, normalised_error
+from rigs.fisheye import fisheye_views
 from rigs.plain_scanner import plain_camera
 
-MODELS = ("k1", "k1k2", "k1k2p1p2", "k1k2p1p2k3")
+MODELS: tuple[DistortionModel, ...] = ("k1", "k1k2", "k1k2p1p2", "k1k2p1p2k3")
 ROWS = [
     (model, covers, alike)
     for alike in (False, True)
@@ -49,7 +65,7 @@ class Draw:
     camera: CameraModel
 
 
-def draw_camera(model: str, rng: np.random.Generator) -> CameraModel:
+def draw_camera(model: DistortionModel, rng: np.random.Generator) -> CameraModel:
     width, height = [(640, 480), (1280, 1024), (2048, 1536), (3072, 2048)][rng.integers(4)]
     half_field = np.deg2rad(rng.uniform(4.0, 35.0))
     f = 0.5 * width / np.tan(half_field)
@@ -74,7 +90,7 @@ def draw_camera(model: str, rng: np.random.Generator) -> CameraModel:
     )
 
 
-def draw(model: str, covers: str, *, alike: bool, bow: float, seed: int) -> Draw:
+def draw(model: DistortionModel, covers: str, *, alike: bool, bow: float, seed: int) -> Draw:
     rng = np.random.default_rng([seed, MODELS.index(model)])
     camera = draw_camera(model, rng)
     while len(camera.folded_border()):
@@ -135,7 +151,7 @@ def chi2_of(fit: CameraFit, truth: CameraModel) -> float:
     return normalised_error(truth.parameters[:4], fit.camera.parameters[:4], fit.covariance[:4, :4])
 
 
-def row(model: str, covers: str, *, alike: bool, bow: float, seeds: range) -> str:
+def row(model: DistortionModel, covers: str, *, alike: bool, bow: float, seeds: range) -> str:
     limit = stats.chi2.ppf(0.95, 4)
     counts = {"right": 0, "less": 0, "more": 0}
     auto, free, width, off = [], [], [], []
@@ -166,17 +182,102 @@ def row(model: str, covers: str, *, alike: bool, bow: float, seeds: range) -> st
     )
 
 
+def draw_wide(lens: Lens, seed: int) -> tuple[CameraModel, list[TargetView], list[TargetView]]:
+    """A wide lens, its views, and ten more without noise."""
+    rng = np.random.default_rng([seed, 7 if lens == "fisheye" else 8])
+    width, height = [(640, 480), (960, 600), (1280, 960), (1920, 1080)][rng.integers(4)]
+    noise, n_views = 10.0 ** rng.uniform(-1.7, -0.5), int(rng.integers(8, 20))
+    board, ten = Chessboard(9, 6, 25.0), 10
+    centre = [0.5 * width * rng.uniform(0.97, 1.03), 0.5 * height * rng.uniform(0.97, 1.03)]
+    if lens == "fisheye":
+        half_field = np.deg2rad(rng.uniform(35.0, 80.0))
+        terms = rng.normal(0.0, [0.05, 0.02, 0.005]) / half_field ** np.array([2, 4, 6])
+        f = 0.5 * width / (half_field * (1.0 + terms @ half_field ** np.array([2, 4, 6])))
+        parameters = np.array(
+            [f, f * rng.uniform(0.998, 1.002), *centre, terms[0], terms[1], 0.0, 0.0, terms[2]]
+        )
+        truth = CameraModel.from_parameters(parameters, width, height, "fisheye")
+        size = (width, height)
+        views = fisheye_views(parameters, size, board, n_views=n_views, noise_px=noise, seed=seed)
+        more = fisheye_views(parameters, size, board, n_views=ten, noise_px=1e-6, seed=seed + 10**6)
+        return truth, views, more
+    half_field = np.deg2rad(rng.uniform(30.0, 48.0))
+    f = 0.5 * width / np.tan(half_field)
+    square = 0.25 * (width**2 + height**2) / f**2
+    while True:
+        first = rng.uniform(-0.35, 0.05)
+        second = first * rng.uniform(-0.6, 0.0)
+        third = second * rng.uniform(-0.6, 0.6)
+        tangential = rng.normal(0.0, 7e-4, 2)
+        k = [first / square, second / square**2, *tangential, third / square**3]
+        truth = plain_camera((f, f), (centre[0], centre[1]), (width, height), np.array(k))
+        if not len(truth.folded_border()):
+            break
+    near_mm = 200.0 * f / (0.6 * width)
+    scene = Scene(truth, board, n_views, noise, near_mm, max_tilt_deg=40.0, reach=0.35)
+    still = replace(scene, n_views=ten, noise_px=1e-6)
+    return truth, make_views(scene, seed)[0], make_views(still, seed + 10**6)[0]
+
+
+def unseen_px(fit: CameraFit, views: list[TargetView]) -> float:
+    """Rms of points of views, the board's pose fitted to each; infinite where there is none."""
+    squares = []
+    for view in views:
+        pose = estimate_board_pose(view, fit.camera, allow_ambiguous=True)
+        lost = np.full((len(view), 2), np.inf)
+        squares.append(np.sum((lost if isinstance(pose, FitFailure) else pose.residuals) ** 2, 1))
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def print_lenses(seeds: range) -> None:
+    """Both kinds of lens, a row each."""
+    limit = stats.chi2.ppf(0.95, 4)
+    print("lens        n  right  refused  inside  chi2/4       px  pinhole px  no pinhole")
+    for lens in get_args(Lens):
+        right = refused = without = 0
+        squares, own, pinhole = [], [], []
+        for seed in seeds:
+            truth, views, more = draw_wide(lens, seed)
+            fit = calibrate_camera(views)
+            if not isinstance(fit, CameraFit):
+                refused += 1
+                print(f"  {lens} {seed} refused: {fit.reason}", file=sys.stderr)
+                continue
+            if fit.camera.lens == lens:
+                right += 1
+                squares.append(chi2_of(fit, truth))
+            else:
+                print(f"  {lens} {seed} taken for a {fit.camera.lens}", file=sys.stderr)
+            own.append(unseen_px(fit, more))
+            plain = calibrate_camera(views, CameraOptions(distortion="k1k2p1p2k3", n_folds=0))
+            if isinstance(plain, CameraFit):
+                pinhole.append(unseen_px(plain, more))
+            else:
+                without += 1
+        print(
+            f"{lens:9s} {len(own):3d} {right:6d} {refused:8d} "
+            f"{np.sum(np.array(squares) <= limit):7d} "
+            f"{np.mean(squares) / 4:7.2f} {np.median(own):8.4f} {np.median(pinhole):11.4f} "
+            f"{without:11d}",
+            flush=True,
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--alike", choices=["no", "yes"])
     parser.add_argument("--bow", type=float, default=0.0)
+    parser.add_argument("--lenses", action="store_true")
     given = parser.parse_args()
     seeds = range(given.first, given.first + given.draws)
     cv2.setNumThreads(1)
     print(__doc__.split("\n")[0])
     print(f"seeds {seeds[0]} to {seeds[-1]}")
+    if given.lenses:
+        print_lenses(seeds)
+        return
     print(
         f"{'lens has':11s} {'covers':7s} {'alike':5s} {'n':>4s} {'right':>5s} {'less':>5s} "
         f"{'more':>5s} {'inside':>7s} {'chi2/4':>7s}  {'free in':>7s} {'chi2/4':>7s} "

@@ -6,11 +6,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from scipy.stats import chi2
 
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions, focal_reasons
-from armscan.vision.targets.target import TargetView
-from rigs.camera_scene import CAMERA, Scene, make_views
+from armscan.calibration.cameras.start import intrinsics_from_homographies, view_homography
+from armscan.geometry.estimate import FitFailure
+from armscan.vision.targets.target import Chessboard, TargetView
+from rigs.camera_scene import CAMERA, Scene, make_views, normalised_error
 from rigs.plain_scanner import plain_camera
 
 FOCAL_PX, MIDDLE_PX = 600.0, 1024.0
@@ -38,6 +42,28 @@ def test_a_lens_wider_than_the_model_is_named() -> None:
     rng = np.random.default_rng(1)
     (warning,) = far_out([by_angle(view, rng) for view in views])
     assert "wider than its coefficients" in warning and "--distortion fisheye" in warning
+
+
+@pytest.mark.parametrize("seed", [10, 30])
+def test_lines_bent_by_much_keep_no_camera_from_its_start(seed: int) -> None:
+    """38 degrees to each side and a barrel of a quarter: the closed form finds nothing."""
+    barrel = plain_camera(
+        (416.0,) * 2, (320.7, 239.3), (640, 480), [-0.32, 0.045, 1e-4, 2e-4, 0.0086]
+    )
+    noise_px = 0.08
+    scene = Scene(barrel, Chessboard(9, 6, 25.0), 10, noise_px, 217.0, 40.0, 0.35)
+    views, _ = make_views(scene, seed)
+    homographies = [view_homography(view) for view in views]
+    good = [each for each in homographies if not isinstance(each, FitFailure)]
+    assert isinstance(intrinsics_from_homographies(good, 640, 480), FitFailure)
+    fit = calibrate_camera(views)
+    assert isinstance(fit, CameraFit)
+    assert fit.camera.lens == "pinhole"
+    assert fit.rms_px == pytest.approx(np.sqrt(2.0) * noise_px, rel=0.1)
+    error = normalised_error(
+        barrel.parameters[:4], fit.camera.parameters[:4], fit.covariance[:4, :4]
+    )
+    assert error < chi2.isf(6e-5, 4)
 
 
 def test_points_that_are_off_here_and_there_do_not_blame_the_lens() -> None:

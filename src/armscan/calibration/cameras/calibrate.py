@@ -63,7 +63,6 @@ from armscan.calibration.cameras.robust import (
 )
 from armscan.calibration.cameras.start import (
     estimate_board_pose,
-    repeated_views,
     seen_stretch,
     starting_state,
     view_homography,
@@ -142,6 +141,30 @@ def prepare_views(
     prepared = PreparedViews(tuple(used), tuple(homographies), left_out, tuple(refused), repeats)
     failure = _too_few(prepared, len(views))
     return prepared if failure is None else failure
+
+
+NEAR_PX_PER_WIDTH = 0.005
+"""Two views whose points differ by less than this share of the image width are the same view."""
+
+
+def repeated_views(views: Sequence[TargetView]) -> dict[int, int]:
+    """Views that show the board where an earlier view shows it: index to earlier index."""
+    repeated: dict[int, int] = {}
+    for later in range(len(views)):
+        for earlier in range(later):
+            if earlier not in repeated and _is_repeated(views[earlier], views[later]):
+                repeated[later] = earlier
+                break
+    return repeated
+
+
+def _is_repeated(a: TargetView, b: TargetView) -> bool:
+    _, in_a, in_b = np.intersect1d(a.point_index, b.point_index, return_indices=True)
+    if not len(in_a):
+        return False
+    shift = a.points_px[in_a] - b.points_px[in_b]
+    rms = float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
+    return rms < NEAR_PX_PER_WIDTH * a.width_px
 
 
 def _too_few(prepared: PreparedViews, n_given: int) -> FitFailure | None:

@@ -331,8 +331,6 @@ SUSPECT_HOMOGRAPHY = 6.0
 """A view whose homography fits this much worse than the median is not used for the start."""
 
 EDGE_ON = 0.02
-NEAR_PX_PER_WIDTH = 0.005
-"""Two views whose points differ by less than this share of the image width are the same view."""
 
 
 def view_homography(view: TargetView) -> FloatArray | FitFailure:
@@ -348,26 +346,6 @@ def homography_rms_px(view: TargetView, homography: FloatArray) -> float:
     """Root median square distance of a view's points from its homography."""
     error = map_points(homography, view.points_board_mm[:, :2]) - view.points_px
     return float(np.sqrt(np.median(np.sum(error**2, axis=1))))
-
-
-def repeated_views(views: Sequence[TargetView]) -> dict[int, int]:
-    """Views that show the board where an earlier view shows it: index to earlier index."""
-    repeated: dict[int, int] = {}
-    for later in range(len(views)):
-        for earlier in range(later):
-            if earlier not in repeated and _is_repeated(views[earlier], views[later]):
-                repeated[later] = earlier
-                break
-    return repeated
-
-
-def _is_repeated(a: TargetView, b: TargetView) -> bool:
-    _, in_a, in_b = np.intersect1d(a.point_index, b.point_index, return_indices=True)
-    if not len(in_a):
-        return False
-    shift = a.points_px[in_a] - b.points_px[in_b]
-    rms = float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
-    return rms < NEAR_PX_PER_WIDTH * a.width_px
 
 
 def starting_state(
@@ -407,7 +385,11 @@ def starting_state(
     chosen = [h for h, ok in zip(homographies, trusted, strict=True) if ok]
     matrix = intrinsics_from_homographies(chosen, width, height)
     if isinstance(matrix, FitFailure):
-        return matrix
+        # lines that are bent by much hide what the closed form looks for
+        bent = _fisheye_start(views, replace(observations, lens="fisheye"))
+        if isinstance(bent, FitFailure):
+            return matrix
+        return _with_distortion(bent[0], observations, bent[1], model), bent[1]
     matrix = _held(matrix, width, height, options)
     shared = np.zeros(11)
     shared[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]

@@ -233,3 +233,13 @@ def test_a_terminal_without_our_signs_is_served() -> None:
     )
     assert result.returncode == 0, result.stderr
     assert "fx px: 477." in result.stdout
+
+
+def test_the_package_runs_as_a_module() -> None:
+    """Where the script is not on the path: the same command line and exit codes."""
+    for words, code in ((["--version"], 0), (["nosuch"], 2)):
+        result = subprocess.run(
+            [sys.executable, "-m", "armscan", *words], capture_output=True, text=True, check=False
+        )
+        assert result.returncode == code
+        assert "armscan 0." in result.stdout if code == 0 else "nosuch" in result.stderr

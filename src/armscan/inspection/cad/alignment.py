@@ -20,16 +20,18 @@ from armscan.inspection.cad.point_errors import PointErrors
 from armscan.inspection.cad.search import (
     APART,
     PoseCandidate,
+    across_mm,
     closer,
     fit_step,
     is_significant,
     moved,
     robust_scale,
+    scale_mismatch,
     search_pose,
     spread_rows,
     tukey_weights,
+    unit_mismatch,
 )
-from armscan.inspection.cad.units import across_mm, scale_mismatch, unit_mismatch
 from armscan.records.cloud import PointCloud
 
 AlignMethod = Literal["best", "none", "321", "features", "points", "markers"]

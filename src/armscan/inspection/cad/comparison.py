@@ -25,7 +25,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.inspection.cad.alignment import TYPICAL, Alignment, measured, sight_of
 from armscan.inspection.cad.distance import PartSurface, SurfaceDistance
 from armscan.inspection.cad.point_errors import PointErrors, scatter_of_means
-from armscan.inspection.cad.units import across_mm
+from armscan.inspection.cad.search import across_mm
 from armscan.inspection.conformity import COVERAGE, judge
 from armscan.inspection.conformity import Verdict as Validity
 from armscan.records.cloud import PointCloud

@@ -41,8 +41,14 @@ from armscan.inspection.cad.distance import PartSurface, SurfaceDistance
 from armscan.inspection.cad.part import PartModel
 from armscan.inspection.cad.point_errors import PointErrors
 from armscan.inspection.cad.reference_points import ReferencePoints, align_points
-from armscan.inspection.cad.search import fit_step, moved, robust_scale, spread_rows, tukey_weights
-from armscan.inspection.cad.units import scale_mismatch
+from armscan.inspection.cad.search import (
+    fit_step,
+    moved,
+    robust_scale,
+    scale_mismatch,
+    spread_rows,
+    tukey_weights,
+)
 from armscan.inspection.search import SAME_SIDE
 from armscan.inspection.selection import MIN_POINTS, fit_robustly
 from armscan.records.cloud import PointCloud

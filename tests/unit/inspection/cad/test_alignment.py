@@ -23,8 +23,7 @@ from armscan.inspection.cad.comparison import CadComparison, CadOptions, compare
 from armscan.inspection.cad.datums import align_datums
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import PartModel, part_of
-from armscan.inspection.cad.search import closer, even_turns, spread_rows
-from armscan.inspection.cad.units import scale_mismatch
+from armscan.inspection.cad.search import closer, even_turns, scale_mismatch, spread_rows
 from rigs.inspection_clouds import cloud_of
 from rigs.parts import box_corners, turned, wedge_part
 

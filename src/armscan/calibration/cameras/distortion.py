@@ -228,7 +228,7 @@ def choose_model(
 
 WIDE = 0.6
 """Ideal radius X/Z up to which a fisheye's terms do what a pinhole's do."""
-LENS_SIGMAS = 3.0
+LENS_SIGMAS = 2.0
 """A fisheye takes a pinhole's place if the logarithms of unseen views' residuals fall by so many of
 their standard errors: one view that a pinhole cannot describe would hide in its own scatter."""
 

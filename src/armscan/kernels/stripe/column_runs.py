@@ -313,7 +313,7 @@ def measure_runs(
     A run dips where the three-pixel mean falls below `VALLEY_RATIO` of the peaks on both sides; of
     every `DIP_STEP` points one is asked, and its neighbours are told the same.
 
-    ``raw``, ``image``, ``unit``: As for `read_row`. ``background``: As for `set_limits`.
+    ``raw``, ``image``, ``unit``: As for `look_across`. ``background``: As for `set_limits`.
     ``rise``: Height by which a peak stands out of a dip. ``points``: (N, 6). ``base``: (N,) output.
     ``measured``: (3, N) output.
     """

@@ -121,18 +121,13 @@ def count_lanes(points: MapOut, first: int) -> int:
     return n
 
 
+# branches within what is inlined would count references anew at every row of pixels
 @compiled(is_inlined=True)
-def read_row(raw: Mask, image: Image, unit: float, y: int, x: int, levels: RowOut) -> None:
-    """Grey levels of `LANES` pixels of a row from a column on.
-
-    ``raw``: (H, W) of eight bits, to be divided by ``unit``; (1, 1) if ``image`` (H, W) holds them.
-    """
-    if raw.shape[0] > 1:
-        widen_bytes(raw, y * raw.shape[1] + x, np.float32(1.0 / unit), levels)
-    else:
-        row = image[y, x : x + LANES]
-        for k in range(LANES):
-            levels[k] = row[k]
+def copy_levels(image: Image, y: int, x: int, levels: RowOut) -> None:
+    """Grey levels of `LANES` pixels of a row of an image (H, W) from a column on."""
+    row = image[y, x : x + LANES]
+    for k in range(LANES):
+        levels[k] = row[k]
 
 
 @compiled(fastmath=True, error_model="numpy", is_inlined=True)
@@ -207,10 +202,12 @@ def look_across(
 ) -> None:
     """First pass: amplitude, centre, sigma and the background on both sides of each point.
 
-    ``raw``, ``image``, ``unit``: As for `read_row`. ``points``: (N, 6). ``sigma``, ``base``: (N,)
-    expected sigma along the column, and background. ``result``: (6, N) output.
+    ``raw``: (H, W) of eight bits, to be divided by ``unit``; (1, 1) if ``image`` (H, W) holds the
+    levels. ``points``: (N, 6). ``sigma``, ``base``: (N,) expected sigma along the column, and
+    background. ``result``: (6, N) output.
     """
-    height, width = raw.shape if raw.shape[0] > 1 else image.shape
+    has_bytes, share = raw.shape[0] > 1, np.float32(1.0 / unit)
+    height, width = raw.shape if has_bytes else image.shape
     levels, lanes = np.zeros(LANES, np.float32), np.zeros(3 * LANES, np.float32)
     sums = np.zeros(N_FIRST_SUMS * LANES, np.float32)
     first = 0
@@ -234,7 +231,10 @@ def look_across(
             lanes[2 * LANES + lane] = np.float32(base[i])
         sums[:] = np.float32(0.0)
         for y in range(top, bottom + 1):
-            read_row(raw, image, unit, y, left, levels)
+            if has_bytes:
+                widen_bytes(raw, y * width + left, share, levels)
+            else:
+                copy_levels(image, y, left, levels)
             add_moments(levels, np.float32(y - top), lanes, sums)
         for k in range(n):
             i = first + k
@@ -244,20 +244,20 @@ def look_across(
 
 
 @compiled(is_inlined=True)
-def read_counts(clipped: Mask, levels: Row, clip: float, y: int, x: int, counts: RowOut) -> None:
-    """Which of `LANES` pixels of a row count: 1 or 0.
-
-    ``clipped``: (H, W) 1 where the camera saturated; (1, 1) if a level of ``clip`` says so.
-    """
+def count_unclipped(clipped: Mask, y: int, x: int, counts: RowOut) -> None:
+    """1 or 0 for each of `LANES` pixels of a row of a mask (H, W) of those that saturated."""
     one, zero = np.float32(1.0), np.float32(0.0)
-    if clipped.shape[0] > 1:
-        own = clipped[y, x : x + LANES]
-        for k in range(LANES):
-            counts[k] = zero if own[k] > 0 else one
-    else:
-        limit = np.float32(clip)
-        for k in range(LANES):
-            counts[k] = one if levels[k] < limit else zero
+    own = clipped[y, x : x + LANES]
+    for k in range(LANES):
+        counts[k] = zero if own[k] > 0 else one
+
+
+@compiled(is_inlined=True)
+def count_below(levels: Row, clip: np.float32, counts: RowOut) -> None:
+    """1 or 0 for each of `LANES` levels, of which those from ``clip`` on saturated."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for k in range(LANES):
+        counts[k] = one if levels[k] < clip else zero
 
 
 @compiled(fastmath=True, error_model="numpy", is_inlined=True)
@@ -350,13 +350,16 @@ def fit_columns(
 ) -> None:
     """Second pass: a Gauss-Newton step of centre and amplitude, weighted by the noise.
 
-    ``raw``, ``image``, ``unit``: As for `read_row`. ``clipped``, ``clip``: As for `read_counts`.
-    ``points``: (N, 6). ``given``: (6, N) of `look_across`, its sigma and sides averaged along the
-    line. ``noise``: (3,) as for `add_weighted`. ``result``: (8, N) output: amplitude, centre,
-    sigma, variance of the centre (0: the step failed), score of a skew, its norm, by how much a
-    term ``u^3`` in the profile's exponent moves the centre in sigmas, count of clipped pixels.
+    ``raw``, ``image``, ``unit``: As for `look_across`. ``clipped``: (H, W) 1 where the camera
+    saturated; (1, 1) if a level of ``clip`` says so. ``points``: (N, 6). ``given``: (6, N) of
+    `look_across`, its sigma and sides averaged along the line. ``noise``: (3,) as for
+    `add_weighted`. ``result``: (8, N) output: amplitude, centre, sigma, variance of the centre (0:
+    the step failed), score of a skew, its norm, by how much a term ``u^3`` in the profile's
+    exponent moves the centre in sigmas, count of clipped pixels.
     """
-    height, width = raw.shape if raw.shape[0] > 1 else image.shape
+    has_bytes, has_mask = raw.shape[0] > 1, clipped.shape[0] > 1
+    height, width = raw.shape if has_bytes else image.shape
+    share, limit = np.float32(1.0 / unit), np.float32(clip)
     levels, counts = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
     lanes = np.zeros(5 * LANES, np.float32)
     sums = np.zeros(N_SECOND_SUMS * LANES, np.float32)
@@ -381,8 +384,14 @@ def fit_columns(
             lanes[4 * LANES + lane] = np.float32(sides / apart)
         sums[:] = np.float32(0.0)
         for y in range(top, bottom + 1):
-            read_row(raw, image, unit, y, left, levels)
-            read_counts(clipped, levels, clip, y, left, counts)
+            if has_bytes:
+                widen_bytes(raw, y * width + left, share, levels)
+            else:
+                copy_levels(image, y, left, levels)
+            if has_mask:
+                count_unclipped(clipped, y, left, counts)
+            else:
+                count_below(levels, limit, counts)
             add_weighted(levels, counts, np.float32(y - top), noise, lanes, sums)
         for k in range(n):
             keep_step(sums, k + shift, given, first + k, result)

@@ -199,12 +199,12 @@ def _brightest(
     """
     pixel_step = PEAK_STEP_PX * sparse if is_of_bytes(image) else PEAK_STEP_PX
     sample = image[::pixel_step, ::pixel_step]
-    few = sample[:: 16 // pixel_step, :: 16 // pixel_step].astype(np.float32).ravel()
+    few = sample[:: 16 // pixel_step, :: 16 // pixel_step].ravel()
     # nearly all pixels are dark: the bright ones are sorted alone
     k = int(0.98 * (len(few) - 1))
-    limit = float(np.partition(few, k)[k])
     n_above = (1.0 - PEAK_QUANTILE) * (sample.size - 1)
     if is_of_bytes(image):
+        limit = float(_level_at(np.bincount(few), k))
         counts = np.zeros(256, np.int64)
         is_bright_cell = (peaks > limit).view(np.uint8)
         count_bright(image, is_bright_cell, CELL_PX, pixel_step, int(limit), counts)
@@ -214,6 +214,7 @@ def _brightest(
             low, high = _level_at(counts, int(place)), _level_at(counts, int(place) + 1)
             return float(factor) * (low + (place - int(place)) * (high - low))
     else:
+        limit = float(np.partition(few.astype(np.float32), k)[k])
         bright = sample[sample > limit].astype(np.float32) * factor
         if len(bright) - 1 > n_above:
             return float(np.quantile(bright, 1.0 - n_above / (len(bright) - 1)))

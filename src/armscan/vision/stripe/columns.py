@@ -72,7 +72,7 @@ from armscan.kernels.stripe.section import (
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.stripe.fit import start_noise
-from armscan.vision.stripe.flags import MERGED_SIGMAS, close_gaps
+from armscan.vision.stripe.flags import MERGED_SIGMAS, close_gaps, is_short
 from armscan.vision.stripe.image import (
     NORMAL_SCALE,
     StripeOptions,
@@ -446,7 +446,8 @@ def _smooth(chains: _Chains, found: ColumnPoints, smoothing_px: float) -> Column
     variance = np.maximum(table[VARIANCE], LEAST_SIGMA_PX**2)
     is_used = ((flags & int(REJECTING)) == 0) & (table[VARIANCE] > 0.0)
     rows, start = _stretches(points, is_used)
-    centre, own = table[CENTRE, rows], variance[rows]
+    chosen = _all_or(rows, len(points))
+    centre, own = table[CENTRE, chosen], variance[chosen]
     score = np.zeros(len(rows))
     if score_middles(centre, own, start, _half_weights(OUTLIER_HALF), score):
         sample = score[:: max(len(score) // MOST_MEASURED, 1)]
@@ -457,7 +458,8 @@ def _smooth(chains: _Chains, found: ColumnPoints, smoothing_px: float) -> Column
             flags[rows[is_off]] |= int(StripeFlag.OUTLIER)
             is_used[rows[is_off]] = False
             rows, start = _stretches(points, is_used)
-            centre, own = table[CENTRE, rows], variance[rows]
+            chosen = _all_or(rows, len(points))
+            centre, own = table[CENTRE, chosen], variance[chosen]
     half = windows(max(smoothing_px, 1.0))
     correlation = _correlation(centre, own, start, half[-1])
     if correlation is None:
@@ -475,10 +477,10 @@ def _smooth(chains: _Chains, found: ColumnPoints, smoothing_px: float) -> Column
         smoothed = np.zeros((SMOOTH_ROWS, len(rows)))
         own = own * correlation[0]
         smooth_stretches(centre, own, start, halves, weights, inflation, CONFIDENCE, smoothed)
-        table[CENTRE, rows] = smoothed[SMOOTHED] - _pull(table, rows, smoothed, own)
-        slope[rows] = smoothed[SLOPE]
-        sigma[rows] = np.sqrt(smoothed[SMOOTH_VARIANCE])
-        noise_length[rows] = np.maximum(own * alike / smoothed[SMOOTH_VARIANCE], 1.0)
+        table[CENTRE, chosen] = smoothed[SMOOTHED] - _pull(table, chosen, smoothed, own)
+        slope[chosen] = smoothed[SLOPE]
+        sigma[chosen] = np.sqrt(smoothed[SMOOTH_VARIANCE])
+        noise_length[chosen] = np.maximum(own * alike / smoothed[SMOOTH_VARIANCE], 1.0)
     return replace(
         found, table=table, slope=slope, sigma=sigma, noise_length=noise_length, flags=flags
     )
@@ -491,8 +493,13 @@ def _stretches(points: NDArray[np.int32], is_used: BoolArray) -> tuple[IntArray,
     return rows[: start[n]], start[: n + 1]
 
 
+def _all_or(rows: IntArray, n: int) -> IntArray | slice:
+    """Rising rows (M,) of ``n``; a slice if they are all of them, so that nothing is copied."""
+    return slice(None) if len(rows) == n else rows
+
+
 def _pull(
-    table: FloatArray, rows: IntArray, smoothed: FloatArray, variance: FloatArray
+    table: FloatArray, rows: IntArray | slice, smoothed: FloatArray, variance: FloatArray
 ) -> FloatArray:
     """By how much bends pull the centres (M,) of columns that cut them at a slant: `find_pulls`.
 
@@ -578,9 +585,9 @@ def _to_profile(
     segment = np.zeros(len(column), np.int64)
     np.cumsum(is_new, out=segment[1:])
     flags = kept.flags
-    is_short = _arc_lengths(at, segment) < SHORTEST_PX
-    if is_short.any():
-        flags = flags | np.where(is_short[segment], int(StripeFlag.SHORT_SEGMENT), 0)
+    short = is_short(at, segment)
+    if short.any():
+        flags = flags | np.where(short, int(StripeFlag.SHORT_SEGMENT), 0)
     binning = exposure.window.binning
     profile = Profile(
         source=exposure.source,
@@ -602,13 +609,3 @@ def _to_profile(
     if plane.unknown is not None:
         keep &= is_on_known_ground(plane.unknown, rows, across_px)
     return profile.select(keep)
-
-
-def _arc_lengths(points: FloatArray, segment: IntArray) -> FloatArray:
-    """Length of each segment of points (N, 2), which bear increasing numbers (N,)."""
-    if not len(points):
-        return np.zeros(0)
-    step = np.diff(points, axis=0)
-    length = np.sqrt((step * step).sum(axis=1))
-    length[np.diff(segment) != 0] = 0.0
-    return np.asarray(np.bincount(segment[1:], length, int(segment[-1]) + 1), np.float64)

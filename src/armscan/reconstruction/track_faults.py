@@ -221,11 +221,11 @@ def _judged_steps(places: FloatArray, t_ns: IntArray, resolution_mm: float) -> _
             around = own[:, None] + beside
             inside = (around >= start) & (around < end)
             near = velocity[np.clip(around, start, end - 1)]
-            usual = np.nanmedian(np.where(inside[:, :, None], near, np.nan), axis=1)
-            speed = _largest(near.reshape(-1, 12)).reshape(inside.shape)
+            usual = _medians(near, inside)
+            speed = _largest(near.reshape(-1, 12)).reshape(*inside.shape, 1)
             samples.append(own)
             leaps.append(way[own] - usual * seconds[own, None])
-            speeds.append(np.nanmedian(np.where(inside, speed, np.nan), axis=1))
+            speeds.append(_medians(speed, inside)[:, 0])
             sides.append(np.where(inside.sum(axis=1) >= WINDOW + 2, 1.0, 2.0))
     if not samples:
         return empty
@@ -237,6 +237,13 @@ def _judged_steps(places: FloatArray, t_ns: IntArray, resolution_mm: float) -> _
     # at the ends of a piece the speed is known from one side only
     granted = NOISE_SIGMAS * scatter + moved * np.concatenate(sides)
     return _Steps(sample, leap, size, np.maximum(granted, SAME_MM))
+
+
+def _medians(values: FloatArray, is_counted: BoolArray) -> FloatArray:
+    """(K, C) medians of those of values (K, W, C) that count, (K, W): one a row at least."""
+    ordered = np.sort(np.where(is_counted[:, :, None], values, np.inf), axis=1)
+    count, row = is_counted.sum(axis=1), np.arange(len(values))
+    return np.asarray(0.5 * (ordered[row, (count - 1) // 2] + ordered[row, count // 2]))
 
 
 def _events(steps: _Steps, n_samples: int) -> IntArray:

@@ -140,10 +140,11 @@ class Pixels:
     @property
     def transposed(self) -> Pixels:
         """The same with rows and columns exchanged."""
+        sought = _turned(self.sought)
         return Pixels(
-            sought=_turned(self.sought),
+            sought=sought,
             sought_unit=self.sought_unit,
-            raw=_turned(self.raw),
+            raw=sought if self.raw is self.sought else _turned(self.raw),
             unit=self.unit,
             image=_turned(self.image),
             clipped=_turned(self.clipped),

@@ -92,13 +92,12 @@ def number_segments(
     mean = np.zeros((2, windows))
     slope = np.zeros((2, windows))
     for axis in range(2):
-        means, slopes = mean[axis], slope[axis]
+        means, slopes, own = mean[axis], slope[axis], points[:, axis].copy()
         for k in range(m):
             share = (k - middle) / square
             for w in range(windows):
-                value = points[w + k, axis]
-                means[w] += value / m
-                slopes[w] += share * value
+                means[w] += own[w + k] / m
+                slopes[w] += share * own[w + k]
     size = np.zeros(places)
     sure = 0.99 * math.tan(turn_limit)
     half = 0.5 * m
@@ -612,19 +611,23 @@ def sum_off_planes(
     ``samples``: (H, 3) pixel and depth. ``key``: (H,) column of the output. ``planes``: (B, 14)
     middle, inverse depth and its slopes, their covariance. ``off``, ``sigma``: (B, K) zeros.
     """
+    x, y, depth = samples[:, 0].copy(), samples[:, 1].copy(), samples[:, 2].copy()
+    far, spread = np.zeros(depth.shape[0]), np.zeros(depth.shape[0])
     for b in range(planes.shape[0]):
-        plane = planes[b]
-        for i in range(samples.shape[0]):
-            x = (samples[i, 0] - plane[0]) / scale_px
-            y = (samples[i, 1] - plane[1]) / scale_px
-            depth = samples[i, 2]
-            square = depth * depth
-            expected = plane[2] + x * plane[3] + y * plane[4]
-            variance = plane[5] + x * x * plane[9] + y * y * plane[13]
-            variance += x * (plane[6] + plane[8]) + y * (plane[7] + plane[11])
-            variance += x * y * (plane[10] + plane[12])
-            off[b, key[i]] += abs(expected - 1.0 / depth) * square
-            sigma[b, key[i]] += math.sqrt(variance) * square
+        plane = planes[b].copy()
+        for i in range(depth.shape[0]):
+            u, v = (x[i] - plane[0]) / scale_px, (y[i] - plane[1]) / scale_px
+            square = depth[i] * depth[i]
+            expected = plane[2] + u * plane[3] + v * plane[4]
+            variance = plane[5] + u * u * plane[9] + v * v * plane[13]
+            variance += u * (plane[6] + plane[8]) + v * (plane[7] + plane[11])
+            variance += u * v * (plane[10] + plane[12])
+            far[i] = abs(expected - 1.0 / depth[i]) * square
+            spread[i] = math.sqrt(variance) * square
+        # apart, so that the numbers are made together
+        for i in range(depth.shape[0]):
+            off[b, key[i]] += far[i]
+            sigma[b, key[i]] += spread[i]
 
 
 @compiled(fastmath=True)

@@ -137,9 +137,8 @@ class RightStripes:
     def of(profile: Profile) -> RightStripes:
         """Gather the accepted points."""
         row = np.flatnonzero(profile.is_accepted)
-        table = np.zeros((len(row), 5))
-        table[:, :2], table[:, 2:4] = profile.points_px[row], profile.normals_px[row]
-        table[:, 4] = profile.sigma_px[row]
+        columns = (profile.points_px, profile.normals_px, profile.sigma_px)
+        table = np.column_stack([values.take(row, axis=0) for values in columns])
         x, y = table[:, 0], table[:, 1]
         low = float(x.min(initial=np.inf)), float(y.min(initial=np.inf))
         high = float(x.max(initial=-np.inf)), float(y.max(initial=-np.inf))

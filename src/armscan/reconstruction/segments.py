@@ -80,7 +80,7 @@ def cut_segments(profile: Profile, *, at_light: bool = False) -> StripeSegments:
     jump_px = max(JUMP_PX, JUMP_SIGMAS * float(np.median(profile.sigma_px[row])))
     normals = profile.normals_px
     if n < len(points):
-        points, normals = points[row], normals[row]
+        points, normals = points.take(row, axis=0), normals.take(row, axis=0)
     number_segments(points, normals, is_cut, KINK_POINTS, float(KINK_RAD), jump_px, number)
     return StripeSegments(row, number)
 

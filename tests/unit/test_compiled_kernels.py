@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import stat
@@ -150,6 +151,7 @@ def imported(source: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr("numba.core.config.CACHE_DIR", str(folder / "cache"))
     place = folder / "kernels_of_a_test.py"
     place.write_text(source)
+    os.utime(place, (1, 1))
     spec = importlib.util.spec_from_file_location("kernels_of_a_test", place)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -190,6 +192,39 @@ def test_a_kernel_that_fails_is_named_and_the_others_are_loaded(
         assert len(module.mean.overloads) == 1
     finally:
         arrays._WAITING.pop("kernels_of_a_test.broken")
+
+
+def test_a_kernel_is_compiled_anew_when_another_that_it_calls_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Numba's own stamp is of the caller's file alone."""
+    module = imported(SOURCE, tmp_path, monkeypatch)
+    given = np.array([1.0, 2.0, 6.0])
+    assert module.mean(given) == 3.0
+    assert module.mean.stats.cache_misses
+    warm = imported(SOURCE, tmp_path, monkeypatch)
+    assert warm.mean(given) == 3.0
+    assert warm.mean.stats.cache_hits and not warm.mean.stats.cache_misses
+    stamp = arrays.source_stamp
+    monkeypatch.setattr(arrays, "source_stamp", lambda path: (*stamp(path), ("other.py", 1, 1)))
+    anew = imported(SOURCE, tmp_path, monkeypatch)
+    assert anew.mean(given) == 3.0
+    assert anew.mean.stats.cache_misses
+
+
+def test_the_stamp_of_a_kernel_names_all_modules_that_it_uses() -> None:
+    """What its module took from other modules of kernels, and what these took."""
+    folder = Path(arrays.__file__).parent
+    for name in kernel_modules():
+        module = importlib.import_module(name)
+        used = {
+            own.py_func.__module__ for own in vars(module).values() if hasattr(own, "py_func")
+        } - {name}
+        stamped = {one for one, _, _ in arrays.source_stamp(Path(str(module.__file__)))}
+        assert {each.rpartition(".")[2] + ".py" for each in used} <= stamped
+        assert Path(str(module.__file__)).name in stamped
+    placing = {one for one, _, _ in arrays.source_stamp(folder / "placing.py")}
+    assert placing == {"arrays.py", "placing.py", "rays.py"}
 
 
 def test_every_module_of_kernels_is_compiled_ahead() -> None:

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, cast
 
@@ -147,6 +149,9 @@ def _on_first_use(kernel: Any, signature: Any) -> Any:
     """
     name = f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
     template_of = kernel.get_call_template
+    kept = getattr(kernel._cache, "_cache_file", None)
+    if kept is not None:
+        kept._source_stamp = source_stamp(Path(kernel.py_func.__code__.co_filename))
 
     def load() -> Any:
         # numba's lock first: who holds it may come to wait for the file's
@@ -175,6 +180,29 @@ def _on_first_use(kernel: Any, signature: Any) -> Any:
     kernel._compile_for_args, kernel.get_call_template = first_call, call_template
     _WAITING[name] = load
     return kernel
+
+
+_IMPORTED = re.compile(r"^from armscan\.kernels\.([\w.]+) import", re.MULTILINE)
+
+
+def source_stamp(path: Path) -> tuple[tuple[str, int, int], ...]:
+    """Name, time and size of each file that kernels of a module are made of.
+
+    A kernel holds the code and the constants of those that it calls, and numba looks at its own
+    file only: one that was compiled before another module changed would go on as before.
+    """
+    return tuple(
+        (one.name, (told := one.stat()).st_mtime_ns, told.st_size)
+        for one in sorted(_files_of(path))
+    )
+
+
+@cache
+def _files_of(path: Path) -> frozenset[Path]:
+    folder = Path(__file__).parent
+    modules = _IMPORTED.findall(path.read_text("utf-8"))
+    called = (folder.joinpath(*name.split(".")).with_suffix(".py") for name in modules)
+    return frozenset({path}.union(*(_files_of(one) for one in called)))
 
 
 def _compile(kernel: Any, signature: Any) -> None:

@@ -95,12 +95,24 @@ class Side:
         }
 
 
+def is_fisheye(camera: Any) -> bool:
+    """Matrix and the four terms of `cv2.fisheye`; a pinhole has five coefficients here."""
+    return bool(np.size(camera[1]) == 4)
+
+
 def rays_of(pixels: Array, camera: Any) -> Array:
     """(N, 3) rays by an inverse of the lens that is iterated to the end."""
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
     points = np.asarray(pixels, dtype=float).reshape(-1, 1, 2)
-    xy = cv2.undistortPoints(points, *camera, criteria=criteria).reshape(-1, 2)
+    invert = cv2.fisheye.undistortPoints if is_fisheye(camera) else cv2.undistortPoints
+    xy = invert(points, *camera, criteria=criteria).reshape(-1, 2)
     return np.column_stack([xy, np.ones(len(xy))])
+
+
+def pixels_of(points: Array, camera: Any) -> Array:
+    """(N, 2) pixels of points (N, 3) before the camera."""
+    project = cv2.fisheye.projectPoints if is_fisheye(camera) else cv2.projectPoints
+    return project(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), *camera)[0].reshape(-1, 2)
 
 
 def board_distance(points: Array, pose: Any) -> Array:
@@ -111,7 +123,10 @@ def board_distance(points: Array, pose: Any) -> Array:
 def pose_of(pixels: Array, points_mm: Array, camera: Any) -> Any:
     """Rotation and translation of a board by `solvePnP`."""
     flat = np.column_stack([np.asarray(points_mm)[:, :2], np.zeros(len(points_mm))])
-    _, rotation, translation = cv2.solvePnP(flat, np.asarray(pixels, dtype=float), *camera)
+    pixels = np.asarray(pixels, dtype=float)
+    if is_fisheye(camera):
+        pixels, camera = rays_of(pixels, camera)[:, :2], (np.eye(3), np.zeros(5))
+    _, rotation, translation = cv2.solvePnP(flat, pixels, *camera)
     return cv2.Rodrigues(rotation)[0], translation.ravel()
 
 
@@ -246,6 +261,8 @@ def camera_of(document: dict[str, Any]) -> Any:
     values = document["camera"]["intrinsics"]
     fx, fy, cx, cy = (values[f"{name}_px"] for name in ("fx", "fy", "cx", "cy"))
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    if values["model"].startswith("fisheye"):
+        return matrix, np.array([*(values[name] for name in ("k1", "k2", "k3")), 0.0])
     return matrix, np.array([values[name] for name in ("k1", "k2", "p1", "p2", "k3")])
 
 
@@ -426,7 +443,7 @@ def judge_cloud(folder: Path, ours: Side, theirs: dict[str, Any], photos: LaserS
         return Cloud()
     vertices, sources = read_cloud(folder / "cloud.ply")
     points = np.column_stack([vertices[k] for k in "xyz"])
-    pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), *ours.camera)[0].reshape(-1, 2)
+    pixels = pixels_of(points, ours.camera)
     target = script.Board.of(photos.target)
     pitch = float(np.diff(np.unique(target.points_mm[:, 0])).min())
     margin = np.minimum(photos.margin_mm, pitch)

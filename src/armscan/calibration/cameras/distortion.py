@@ -228,9 +228,10 @@ def choose_model(
 
 WIDE = 0.6
 """Ideal radius X/Z up to which a fisheye's terms do what a pinhole's do."""
-LENS_SIGMAS = 2.0
-"""A fisheye takes a pinhole's place if the logarithms of unseen views' residuals fall by so many of
-their standard errors: one view that a pinhole cannot describe would hide in its own scatter."""
+LENS_SIGMAS, LENS_FACTOR = 2.0, 1.5
+"""A fisheye takes a pinhole's place if unseen views' residuals fall by this factor, in the mean of
+their logarithms, and by so many of its standard errors. A pinhole that does nearly as well stays:
+every other program reads it."""
 
 
 def choose_lens(
@@ -256,10 +257,14 @@ def choose_lens(
         reason = "fisheye: no pinhole with five coefficients explains the views"
         return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason)
     both = replace(fisheye, weights=fisheye.weights * pinhole.solution.weights)
-    gain = _fall_sigmas(validate(pinhole.solution, both), validate(both, both))
-    if gain < LENS_SIGMAS:
+    fall, error = _fall_of_residuals(validate(pinhole.solution, both), validate(both, both))
+    if fall < LENS_SIGMAS * error:
         return pinhole
-    reason = "fisheye: unseen views are predicted better than by a pinhole with five coefficients"
+    factor = float(np.exp(fall))
+    if factor < LENS_FACTOR:
+        said = f"--distortion fisheye would predict unseen views {factor:.2f} times as well"
+        return replace(pinhole, reason=f"{pinhole.reason}; {said}")
+    reason = f"fisheye: unseen views are predicted {factor:.1f} times as well as by a pinhole"
     return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason)
 
 
@@ -303,12 +308,17 @@ def _is_wide(solution: Solution) -> bool:
     return bool(np.any(np.sum(xy[is_valid] ** 2, axis=1) > WIDE**2))
 
 
-def _fall_sigmas(pinhole: CrossValidation | None, fisheye: CrossValidation | None) -> float:
-    """Mean over views of the fall of held-out residuals' logarithms, over its standard error."""
+def _fall_of_residuals(
+    pinhole: CrossValidation | None, fisheye: CrossValidation | None
+) -> tuple[float, float]:
+    """Mean over views of the fall of held-out residuals' logarithms, and its standard error.
+
+    Of logarithms, for one view that a pinhole cannot describe would hide in its own scatter.
+    """
     if pinhole is None or fisheye is None:
-        return 0.0
+        return 0.0, np.inf
     fall = np.log(pinhole.view_rms_px) - np.log(fisheye.view_rms_px)
-    return float(np.mean(fall) / max(np.std(fall, ddof=1) / np.sqrt(len(fall)), 1e-300))
+    return float(np.mean(fall)), float(np.std(fall, ddof=1) / np.sqrt(len(fall)))
 
 
 def _unfolded(

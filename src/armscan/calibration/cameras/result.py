@@ -500,8 +500,7 @@ def _about_outliers(fit: CameraFit) -> list[str]:
     is_at_edge = n >= FEW_OUTLIERS and np.median(radius[is_outlier]) >= edge
     if not is_at_edge or not len(fit.camera.folded_border()):
         return [said]
-    was_tried = fit.camera.lens == "fisheye" or fit.cross_validation is not None
-    way_out = "" if was_tried else "try --distortion fisheye, or "
+    way_out = "" if fit.camera.lens == "fisheye" else "try --distortion fisheye, or "
     return [
         f"{said}, most of them more than {edge:.0f} px from the principal point: there the lens "
         f"seems wider than its coefficients can describe; {way_out}do not measure farther out, "

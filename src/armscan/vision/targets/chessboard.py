@@ -26,8 +26,9 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, apply_homography
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, apply_homography, homogeneous
 from armscan.geometry.estimate import FitFailure
+from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.crossings import (
     Crossings,
@@ -257,28 +258,106 @@ _POINTS_PER_TERM = 3.0
 """Fewest points per term of the polynomial; fewer let it follow a single corner."""
 
 
+_FISHEYE_FOCALS = np.geomspace(0.15, 1.5, 16)
+"""Of the image's longer side."""
+_MUCH_BETTER = 0.5
+"""Of what a board misses a homography by: below it, it is seen through a fisheye."""
+
+
 def off_lattice(
-    board: FloatArray, points_px: FloatArray, least_sigma_px: FloatArray, tolerance_px: float
+    board: FloatArray,
+    points_px: FloatArray,
+    least_sigma_px: FloatArray,
+    tolerance_px: float,
+    size_px: tuple[int, int],
 ) -> tuple[BoolArray, float]:
     """Tell which of N corners are off the lattice that the others make.
 
     ``board``: (N, 2) places on the board, any unit. ``points_px``: (N, 2) image points.
     ``least_sigma_px``: (N,) their standard deviations; the scatter found is not taken to be
     smaller. ``tolerance_px``: What a print's own errors may be; corners that are off by less stay.
+    ``size_px``: Width and height of the image.
 
     Returns ``is_off``: (N,) True for corners to leave out. ``scatter_px``: Robust standard
     deviation, per axis, of the rest; infinite if there is no homography.
     """
+    is_off, scatter_px = _off_smooth(board, points_px, least_sigma_px, tolerance_px, None)
+    if not is_off.any() and scatter_px <= tolerance_px:
+        return is_off, scatter_px
+    lens = _fisheye_before(board, points_px, size_px)
+    if lens is None:
+        return is_off, scatter_px
+    off, scatter = _off_smooth(board, points_px, least_sigma_px, tolerance_px, lens)
+    is_better = scatter < _MUCH_BETTER * scatter_px or off.sum() < is_off.sum()
+    return (off, scatter) if is_better else (is_off, scatter_px)
+
+
+def _fisheye_before(
+    board: FloatArray, points_px: FloatArray, size_px: tuple[int, int]
+) -> CameraModel | None:
+    """An equidistant lens before which a flat board fits; None if it does hardly better so."""
+    every = np.ones(len(board), dtype=np.bool_)
+    flat = _flat_board(board, points_px, every, None)
+    if flat is None:
+        return None
+    best, least = None, _MUCH_BETTER * float(np.median(np.hypot(*(flat - points_px).T)))
+    middle = 0.5 * (np.array(size_px) - 1.0)
+    for focal in _FISHEYE_FOCALS * max(size_px):
+        lens = CameraModel.from_parameters([focal, focal, *middle, *[0.0] * 5], *size_px, "fisheye")
+        seen = _flat_board(board, points_px, every, lens)
+        missed = np.inf if seen is None else float(np.median(np.hypot(*(seen - points_px).T)))
+        if missed < least:
+            best, least = lens, missed
+    return best
+
+
+def _flat_board(
+    board: FloatArray, points_px: FloatArray, trusted: BoolArray, lens: CameraModel | None
+) -> FloatArray | None:
+    """Image points (N, 2) of a flat board that fits trusted ones, before a lens or a pinhole."""
+    if lens is None:
+        homography, _ = cv2.findHomography(board[trusted], points_px[trusted], 0)
+        return None if homography is None else apply_homography(np.asarray(homography), board)
+    xy, is_valid = lens.undistort(points_px)
+    if not is_valid.all():
+        return None
+    # a pixel is worth the less of X/Z the farther from the axis
+    weight = 1.0 / (1.0 + np.sum(xy[trusted] ** 2, axis=1))
+    homography = _weighted_homography(board[trusted], xy[trusted], weight)
+    return lens.project(homogeneous(apply_homography(homography, board)))
+
+
+def _weighted_homography(board: FloatArray, xy: FloatArray, weight: FloatArray) -> FloatArray:
+    middle, scale = board.mean(axis=0), max(float(np.ptp(board)), 1e-9)
+    to_unit = np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, scale]]) / scale
+    rows = homogeneous((board - middle) / scale) * weight[:, None]
+    none = np.zeros_like(rows)
+    design = np.concatenate(
+        [
+            np.concatenate([rows, none, -xy[:, :1] * rows], axis=1),
+            np.concatenate([none, rows, -xy[:, 1:] * rows], axis=1),
+        ]
+    )
+    return np.asarray(np.linalg.svd(design)[2][-1].reshape(3, 3) @ to_unit)
+
+
+def _off_smooth(
+    board: FloatArray,
+    points_px: FloatArray,
+    least_sigma_px: FloatArray,
+    tolerance_px: float,
+    lens: CameraModel | None,
+) -> tuple[BoolArray, float]:
+    """As `off_lattice`, before one lens: off a flat board and a smooth field about it."""
     weights = np.ones(len(board))
     size = scatter = np.full(len(board), np.inf)
     for _ in range(_HOMOGRAPHIES):
         trusted = weights > _TRUSTED
         if trusted.sum() < 4:
             break
-        homography, _ = cv2.findHomography(board[trusted], points_px[trusted], 0)
-        if homography is None:
+        mapped = _flat_board(board, points_px, trusted, lens)
+        if mapped is None:
             break
-        mapped = apply_homography(np.asarray(homography), board)
         field = _terms(mapped)
         for _ in range(_ROUNDS):
             size = np.hypot(*_without_itself(field, points_px - mapped, weights).T)
@@ -486,7 +565,9 @@ def _measured(grey: RawGrey, target: Chessboard, numbered: NumberedCorners) -> _
     if is_good.sum() >= 4:
         good = np.flatnonzero(is_good)
         board = cells[good].astype(np.float64)
-        is_off, scatter = off_lattice(board, corners[good], sigma[good], PRINT_ERROR * step)
+        is_off, scatter = off_lattice(
+            board, corners[good], sigma[good], PRINT_ERROR * step, (int(size[0]), int(size[1]))
+        )
         is_good[good[is_off]] = False
     return _Corners(cells, corners, covariance, is_good, scatter, step)
 

@@ -166,6 +166,13 @@ _NEAR_CELLS = 14
 _GAP = 2
 """Most cells without a crossing that are bridged."""
 _MAX_ROUNDS = 40
+_N_PARABOLA = 6
+"""Terms of a parabola in two variables."""
+_BENT, _HALF_BENT = 0.25, 0.5
+"""Of a homography's mean square: below it a parabola is followed, as before a fisheye, and asked
+whether a crossing lies on it."""
+_FLAT = 0.01
+"""Residuals of a homography, over the extent of the cells around, below which none is asked for."""
 
 
 def find_lattices(crossings: Crossings) -> list[Lattice]:
@@ -202,21 +209,49 @@ def cell_arrays(lattice: Lattice) -> tuple[IntArray, IntArray]:
     )
 
 
-def predict_cells(cells: IntArray, points_px: FloatArray, wanted: IntArray) -> FloatArray:
+def predict_cells(
+    cells: IntArray, points_px: FloatArray, wanted: IntArray, *, may_bend: bool = True
+) -> FloatArray:
     """Image points (M, 2) of ``wanted`` cells (M, 2), each from the known cells nearest to it.
 
     ``cells``, ``points_px``: (N, 2) known cells and their image points. ``wanted``: (M, 2) cells.
+    ``may_bend``: By a parabola where a homography fits much worse.
 
     Returns (M, 2) image points; NaN where the cells around do not fix a homography.
     """
     _, near = _nearest(cells, wanted, min(_NEAR_CELLS, len(cells)))
-    return _mapped_by_homography(
-        (cells[near] - wanted[:, None, :]).astype(np.float64), points_px[near]
-    )
+    around = (cells[near] - wanted[:, None, :]).astype(np.float64), points_px[near]
+    places, variance = _mapped_by_homography(*around)
+    if not may_bend or around[0].shape[1] <= _N_PARABOLA:
+        return places
+    extent = np.ptp(around[1], axis=1).max(axis=1)
+    doubted = np.flatnonzero(variance > (_FLAT * extent) ** 2)
+    if len(doubted):
+        bent, left = _mapped_by_parabola(*(each[doubted] for each in around))
+        is_bent = left < _BENT * variance[doubted]
+        places[doubted[is_bent]] = bent[is_bent]
+    return places
 
 
-def _mapped_by_homography(cells: FloatArray, points_px: FloatArray) -> FloatArray:
-    """Image (M, 2) of the cell (0, 0) by the homographies that M sets of K pairs fix."""
+def _mapped_by_parabola(cells: FloatArray, points_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """As `_mapped_by_homography`, by parabolas of the cell."""
+    a, b = cells[..., 0], cells[..., 1]
+    terms = np.stack([np.ones_like(a), a, b, a * a, a * b, b * b], axis=-1)
+    turned = terms.transpose(0, 2, 1)
+    middle = points_px.mean(axis=1, keepdims=True)
+    ridge = 1e-7 * np.eye(_N_PARABOLA)
+    solved = np.linalg.solve(turned @ terms + ridge, turned @ (points_px - middle))
+    missed = np.sum((terms @ solved + middle - points_px) ** 2, axis=(1, 2))
+    return solved[:, 0] + middle[:, 0], missed / (2 * (cells.shape[1] - _N_PARABOLA))
+
+
+def _mapped_by_homography(
+    cells: FloatArray, points_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Image (M, 2) of the cell (0, 0) by the homographies that M sets of K pairs fix.
+
+    And the variance (M,) that these leave of the pairs, along an axis, px^2.
+    """
     middle = points_px.mean(axis=1, keepdims=True)
     scale = np.maximum(np.abs(points_px - middle).max(axis=(1, 2)), 1e-9)
     uv = (points_px - middle) / scale[:, None, None]
@@ -236,7 +271,15 @@ def _mapped_by_homography(cells: FloatArray, points_px: FloatArray) -> FloatArra
         np.einsum("mki,mkj->mij", cells - cells.mean(axis=1, keepdims=True), cells)
     )
     solved[spans[:, 0] < 0.5] = np.nan
-    return np.asarray(solved[:, [2, 5]] * scale[:, None] + middle[:, 0])
+    depth = 1.0 + a * solved[:, 6:7] + b * solved[:, 7:8]
+    seen = np.stack([_affine(a, b, solved[:, :3]), _affine(a, b, solved[:, 3:6])], axis=-1)
+    missed = np.sum((seen / depth[..., None] - uv) ** 2, axis=(1, 2)) * scale**2
+    place = solved[:, [2, 5]] * scale[:, None] + middle[:, 0]
+    return place, missed / max(2 * cells.shape[1] - 8, 1)
+
+
+def _affine(a: FloatArray, b: FloatArray, terms: FloatArray) -> FloatArray:
+    return a * terms[:, :1] + b * terms[:, 1:2] + terms[:, 2:]
 
 
 def _links(crossings: Crossings) -> IntArray:
@@ -329,10 +372,11 @@ def _regular(crossings: Crossings, lattice: Lattice) -> Lattice:
         return lattice
     points = crossings.points_px[index]
     others = _nearest(cells, cells, _NEAR_CELLS)[1][:, 1:]
-    predicted = _mapped_by_homography(
-        (cells[others] - cells[:, None, :]).astype(np.float64), points[others]
-    )
-    missed = np.hypot(*(predicted - points).T)
+    around = (cells[others] - cells[:, None, :]).astype(np.float64), points[others]
+    flat, variance = _mapped_by_homography(*around)
+    bent, left = _mapped_by_parabola(*around)
+    missed, beside = (np.hypot(*(each - points).T) for each in (flat, bent))
+    missed = np.where(left < _HALF_BENT * variance, np.fmin(missed, beside), missed)
     step = np.linalg.norm(points[others] - points[:, None, :], axis=-1).min(axis=1)
     is_regular = ~(missed > _POSITION_TOLERANCE * step)
     return {
@@ -344,16 +388,17 @@ def _regular(crossings: Crossings, lattice: Lattice) -> Lattice:
 
 def _extended(crossings: Crossings, lattice: Lattice) -> Lattice:
     """The lattice with crossings that lie, with the right sectors, where its cells continue."""
-    lattice = dict(lattice)
+    lattice, may_bend = dict(lattice), _is_bent(crossings, lattice)
     for _ in range(_MAX_ROUNDS):
         cells, index = cell_arrays(lattice)
         if len(cells) < _MIN_CELLS:
             return lattice
         points = crossings.points_px[index]
         wanted = _free_cells(cells)
-        places = predict_cells(cells, points, wanted)
-        beside = predict_cells(cells, points, wanted + np.array([1, 0]))
-        below = predict_cells(cells, points, wanted + np.array([0, 1]))
+        places, beside, below = (
+            predict_cells(cells, points, wanted + np.array(step), may_bend=may_bend)
+            for step in ((0, 0), (1, 0), (0, 1))
+        )
         step = np.minimum(np.hypot(*(beside - places).T), np.hypot(*(below - places).T))
         known = np.isfinite(places).all(axis=1) & np.isfinite(step)
         nearest, beside_it = _nearest(crossings.points_px, np.where(known[:, None], places, 0.0), 1)
@@ -361,8 +406,9 @@ def _extended(crossings: Crossings, lattice: Lattice) -> Lattice:
         fits = known & (distance < _POSITION_TOLERANCE * step)
         fits &= ~np.isin(found, index)
         fits &= _is_alike(crossings, lattice, wanted, found)
-        if not fits.any():
+        if not fits.any() and not may_bend:
             return lattice
+        may_bend = bool(fits.any())
         order = np.argsort(distance, kind="stable")
         used: set[int] = set()
         for k in order[fits[order]].tolist():
@@ -370,6 +416,18 @@ def _extended(crossings: Crossings, lattice: Lattice) -> Lattice:
                 used.add(int(found[k]))
                 lattice[int(wanted[k, 0]), int(wanted[k, 1])] = int(found[k])
     return lattice
+
+
+def _is_bent(crossings: Crossings, lattice: Lattice) -> bool:
+    """Whether homographies of some cells' neighbours leave more than of a flat board."""
+    cells, index = cell_arrays(lattice)
+    if len(cells) <= _NEAR_CELLS:
+        return False
+    points = crossings.points_px[index]
+    others = _nearest(cells, cells, _NEAR_CELLS)[1][:, 1:]
+    around = (cells[others] - cells[:, None, :]).astype(np.float64), points[others]
+    extent = np.ptp(points[others], axis=1).max(axis=1)
+    return bool(np.any(_mapped_by_homography(*around)[1] > (_FLAT * extent) ** 2))
 
 
 def _free_cells(cells: IntArray) -> IntArray:

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chessboards through a fisheye, rendered by OpenCV's model: every corner, and what is off."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.records.exposure import Exposure
+from armscan.vision.targets.chessboard import MAX_SCATTER, off_lattice
+from armscan.vision.targets.detect import detect_target
+from armscan.vision.targets.target import Chessboard, TargetView
+from rigs.fisheye import see_through_fisheye
+
+SIZE_PX = (960, 720)
+LENS = np.array([270.0, 270.0, 478.0, 362.0, 0.01, -0.004, 0.0, 0.0, 0.0])
+BOARD = Chessboard(8, 6, 30.0)
+FRONTAL: Pose[Sensor, Board] = Pose(np.eye(3), np.array([-105.0, -75.0, 62.0]))
+"""Its outermost corners lie 64 degrees from the axis."""
+TILTED: Pose[Sensor, Board] = Pose.from_vectors([0.1, -0.6, 0.3], [-60.0, -120.0, 120.0])
+
+
+def photograph(pose: Pose[Sensor, Board], rng: np.random.Generator) -> np.ndarray:
+    """Levels of the board on a light wall: nine rays a pixel, blur and noise."""
+    fine, (width, height) = 3, SIZE_PX
+    v, u = np.mgrid[: height * fine, : width * fine]
+    pixels = (np.stack([u.ravel(), v.ravel()], axis=1) + 0.5) / fine - 0.5
+    matrix = np.array([[LENS[0], 0, LENS[2]], [0, LENS[1], LENS[3]], [0, 0, 1.0]])
+    terms = np.array([LENS[4], LENS[5], LENS[8], 0.0])
+    away = np.hypot(*((pixels - LENS[2:4]) / LENS[:2]).T)
+    is_seen = away < 1.4
+    xy = cv2.fisheye.undistortPoints(pixels[is_seen][:, None], matrix, terms)[:, 0]
+    # the ray from the camera's centre meets the board's plane z = 0
+    rays = np.column_stack([xy, np.ones(len(xy))]) @ pose.rotation
+    centre = -pose.rotation.T @ pose.translation_mm
+    at = centre + rays * (-centre[2] / rays[:, 2])[:, None]
+    a, b = at[:, 0] / BOARD.square_mm, at[:, 1] / BOARD.square_mm
+    square = np.where((np.floor(a) + np.floor(b)) % 2 == 0, 40.0, 210.0)
+    is_print = (a > -1.0) & (a < BOARD.columns) & (b > -1.0) & (b < BOARD.rows)
+    levels = np.full(len(pixels), 20.0)
+    levels[is_seen] = np.where(is_print, square, 230.0)
+    image = levels.reshape(height, fine, width, fine).mean(axis=(1, 3))
+    image = gaussian_filter(image, 0.7) + rng.normal(0.0, 1.5, image.shape)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("pose", [FRONTAL, TILTED], ids=["frontal", "tilted"])
+def test_corners_are_found_up_to_the_outermost(pose: Pose[Sensor, Board]) -> None:
+    """Edges that bend within the reach of a corner's fit may cost it, wherever it lies."""
+    view = detect_target(Exposure(photograph(pose, np.random.default_rng(1)), "wide.png"), BOARD)
+    assert isinstance(view, TargetView)
+    assert len(view) > 0.85 * BOARD.columns * BOARD.rows
+    truth = see_through_fisheye(LENS, BOARD, pose)
+    # the half-turned numbering of an even board is as good
+    turned = truth[::-1]
+    error = min(
+        (np.hypot(*(view.points_px - each[view.point_index]).T) for each in (truth, turned)),
+        key=lambda each: float(each.max()),
+    )
+    assert error.max() < 0.15
+    away = np.hypot(*(truth - LENS[2:4]).T)
+    assert np.hypot(*(view.points_px - LENS[2:4]).T).max() > away.max() - 1.0
+
+
+def corners(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    seen = see_through_fisheye(LENS, BOARD, FRONTAL)
+    return BOARD.points_board_mm[:, :2] / BOARD.square_mm, seen + rng.normal(0.0, 0.05, seen.shape)
+
+
+def test_a_bent_lattice_has_no_corner_off_it_but_those_that_are() -> None:
+    board, points = corners(np.random.default_rng(2))
+    sigma, tolerance = np.full(len(board), 0.05), 0.5
+    is_off, scatter = off_lattice(board, points, sigma, tolerance, SIZE_PX)
+    assert not is_off.any()
+    assert scatter < 0.2
+    moved = points.copy()
+    moved[[0, 20]] += [3.0, -2.0]
+    is_off, _ = off_lattice(board, moved, sigma, tolerance, SIZE_PX)
+    assert np.flatnonzero(is_off).tolist() == [0, 20]
+
+
+def test_a_misprint_is_none_that_a_fisheye_explains() -> None:
+    """One column twice as wide: such a board stays refused."""
+    board, _ = corners(np.random.default_rng(3))
+    wide = board.copy()
+    wide[:, 0] += wide[:, 0] >= 4
+    seen = wide * 40.0 + [300.0, 200.0] + 0.05 * np.random.default_rng(4).normal(size=wide.shape)
+    is_off, scatter = off_lattice(board, seen, np.full(len(board), 0.05), 0.5, SIZE_PX)
+    assert scatter > MAX_SCATTER * 40.0 or is_off.mean() > 0.2

@@ -85,6 +85,10 @@ def describe_stereo(path: Path) -> dict[str, Any]:
         "pairs": calibration.n_pairs,
         "points": calibration.n_points,
     }
+    for word, camera in (("left", left), ("right", right)):
+        values = zip(PARAMETER_NAMES, camera.parameters, strict=True)
+        told = (f"{name} {value:.6g}" for name, value in values if name in camera.parameter_names)
+        content[word] = f"{camera.lens}, {', '.join(told)}"
     if known is not None:
         content["epipolar_rms_px"] = known.epipolar_rms_px
         content["epipolar_mean_px"] = known.epipolar_mean_px

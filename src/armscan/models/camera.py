@@ -323,11 +323,15 @@ class CameraModel(ArrayRecord):
     def folded_border(self, n_steps: int = 24) -> FloatArray:
         """(K, 2) pixels on the image's border for which the distortion has no inverse.
 
+        None of a fisheye whose terms grow up to `WIDEST_RAD`: it sees nothing beyond.
+
         Parameters
         ----------
         n_steps
             Pixels tested along each side.
         """
+        if fold_radius(self.distortion, self.lens) == np.tan(WIDEST_RAD):
+            return np.zeros((0, 2))
         right, bottom = self.width_px - 1.0, self.height_px - 1.0
         u, v = np.linspace(0.0, right, n_steps), np.linspace(0.0, bottom, n_steps)
         border = np.concatenate(

@@ -210,6 +210,7 @@ def camera_page(
         provenance,
         CAMERA_TITLE,
         f"{fit.camera.width_px} × {fit.camera.height_px} px camera, "
+        f"{'fisheye lens, ' if fit.camera.lens == 'fisheye' else ''}"
         f"{fit.n_views} of {n_images} images used, {fit.n_points} target points",
         sections,
         cards=only(told, "parameters.fx", "parameters.cx", "rms_px", "hold_out_rms_px"),

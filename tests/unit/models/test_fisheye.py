@@ -74,3 +74,11 @@ def test_a_fisheye_has_no_tangential_distortion() -> None:
     with pytest.raises(InputError, match="no kind of lens"):
         CameraModel.from_parameters(CAMERA.parameters, 960, 600, "mirror")  # type: ignore[arg-type]
     assert CAMERA.parameter_names == ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3")
+
+
+def test_only_a_lens_that_folds_has_a_folded_border() -> None:
+    """The image's corners lie 113 degrees out: no ray, and nothing wrong with the lens."""
+    assert not CAMERA.undistort(np.array([[0.0, 0.0]]))[1][0]
+    assert not len(CAMERA.folded_border())
+    folding = CAMERA.moved_to([*CAMERA.parameters[:4], -0.3, 0.0, 0.0, 0.0, 0.0])
+    assert len(folding.folded_border()) == 96

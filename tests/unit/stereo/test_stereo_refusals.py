@@ -64,3 +64,15 @@ def test_the_baseline_counts_along_itself(fit: StereoFit) -> None:
     (reason,) = reasons_to_refuse(with_sigma(fit, 2 * N + 3 + along, sigma))
     assert "distance" in reason
     assert reasons_to_refuse(with_sigma(fit, 2 * N + 3 + across, sigma)) == ()
+
+
+def test_pairs_that_disagree_are_named_before_what_they_spoil(fit: StereoFit) -> None:
+    """Only beside a reason to refuse: by themselves they are warned of."""
+    unsteady = replace(fit, typical_level=49.0)
+    assert reasons_to_refuse(unsteady) == ()
+    focal_px = fit.views.left.fx_px
+    spoilt = with_sigma(unsteady, 0, 1.1 * LARGEST_FOCAL_SIGMA * focal_px)
+    first, second = reasons_to_refuse(spoilt)
+    worst = max(fit.related, key=lambda pair: pair.level)
+    assert "7 standard deviations apart" in first and worst.pair.name in first
+    assert "focal length" in second

@@ -445,4 +445,17 @@ def reasons_to_refuse(fit: StereoFit) -> tuple[str, ...]:
             f"the cameras' distance of {length:.1f} mm is known to {sigma_mm:.1f} mm only, "
             f"{100.0 * LARGEST_BASELINE_SIGMA:.0f} % is the limit"
         )
+    if reasons and fit.typical_level > UNSTEADY_LEVEL:
+        # one pair whose board moved between its images bends cameras that are well known alone
+        reasons.insert(0, _disagreement(fit))
     return tuple(reasons)
+
+
+def _disagreement(fit: StereoFit) -> str:
+    """How far apart the pairs put the right camera, and which one the farthest, where they do."""
+    worst = max(fit.related, key=lambda pair: pair.level)
+    return (
+        f"the pairs put the right camera {np.sqrt(fit.typical_level):.0f} standard deviations "
+        f"apart, {worst.pair.name} the farthest: leave out pairs whose board or head moved between "
+        "the two images"
+    )

@@ -32,6 +32,7 @@ from rigs.calibration_documents import (
     sensor_calibration,
     stereo_sensor_calibration,
 )
+from rigs.fisheye import TANGENTIAL, as_fisheye
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -293,3 +294,43 @@ def test_a_covariance_of_another_count_of_cameras_is_refused(tmp_path: Path) -> 
     path.write_bytes(json.dumps(content).encode())
     with pytest.raises(FileFormatError, match=r"covariance"):
         read_sensor_calibration(path)
+
+
+def fisheye_calibration() -> CameraCalibration:
+    known = camera_calibration()
+    covariance = known.covariance.copy()
+    covariance[TANGENTIAL] = covariance[:, TANGENTIAL] = 0.0
+    return replace(known, camera=as_fisheye(known.camera), covariance=covariance)
+
+
+def test_a_fisheye_comes_back_exactly_and_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    path.write_bytes(camera_document(fisheye_calibration()))
+    assert_same(read_camera_calibration(path), fisheye_calibration())
+    told = describe_files([str(path)]).data["items"][0]
+    assert told["lens"] == "fisheye"
+    assert "p1" not in told and "k3" in told
+
+
+@pytest.mark.parametrize("model", [None, "", 3, "mirror", "pinhole"])
+def test_a_document_says_which_lens_it_is_of(tmp_path: Path, model: Any) -> None:
+    """Nothing is taken for granted: the same numbers mean another camera."""
+    tree = json.loads(camera_document(fisheye_calibration()))
+    del tree["sha256"]
+    if model == "":
+        del tree["camera"]["intrinsics"]["model"]
+    else:
+        tree["camera"]["intrinsics"]["model"] = model
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(tree))
+    with pytest.raises(FileFormatError, match="model"):
+        read_camera_calibration(path)
+
+
+def test_a_fisheye_has_no_variance_of_tangential_distortion(tmp_path: Path) -> None:
+    known = fisheye_calibration()
+    wrong = replace(known, covariance=known.covariance + np.diag([0, 0, 0, 0, 0, 0, 1e-8, 0, 0]))
+    path = tmp_path / "camera.json"
+    path.write_bytes(camera_document(wrong))
+    with pytest.raises(FileFormatError, match="tangential"):
+        read_camera_calibration(path)

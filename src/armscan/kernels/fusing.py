@@ -248,8 +248,9 @@ def fuse_stripes(
             radial = (across_x * x + across_y * y) * scale
             own[first + 4] = radial * q
             own[first + 5] = radial * q * q
-            own[first + 6] = across_x * 2.0 * x * y + across_y * (r2 + 2.0 * y * y)
-            own[first + 7] = across_x * (r2 + 2.0 * x * x) + across_y * 2.0 * x * y
+            by_p1 = across_x * 2.0 * x * y + across_y * (r2 + 2.0 * y * y)
+            by_p2 = across_x * (r2 + 2.0 * x * x) + across_y * 2.0 * x * y
+            own[first + 6], own[first + 7] = by_p1 * scale * scale, by_p2 * scale * scale
             own[first + 8] = radial * q * q * q
         for c in range(N_SHEET):
             own[SHEET + c] = -surface[4 + c]

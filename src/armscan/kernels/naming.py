@@ -368,9 +368,9 @@ def cross_stripes(
         by_lens[0, 3], by_lens[1, 3] = -ixy / fy, -iyy / fy
         for c in range(5):
             if c == 2:
-                kx, ky = 2.0 * x * y, r2 + 2.0 * y * y
+                kx, ky = scale * scale * 2.0 * x * y, scale * scale * (r2 + 2.0 * y * y)
             elif c == 3:
-                kx, ky = r2 + 2.0 * x * x, 2.0 * x * y
+                kx, ky = scale * scale * (r2 + 2.0 * x * x), scale * scale * 2.0 * x * y
             else:
                 power = scale * (q if c == 0 else (q * q if c == 1 else q * q * q))
                 kx, ky = x * power, y * power
@@ -393,8 +393,8 @@ def cross_stripes(
         row[SECOND], row[SECOND + 1] = n0 * there[0], n1 * there[1]
         row[SECOND + 2], row[SECOND + 3] = n0, n1
         row[SECOND + 4], row[SECOND + 5] = radial * q, radial * q * q
-        row[SECOND + 6] = f0 * 2.0 * rx * ry + f1 * (r2 + 2.0 * ry * ry)
-        row[SECOND + 7] = f0 * (r2 + 2.0 * rx * rx) + f1 * 2.0 * rx * ry
+        row[SECOND + 6] = (f0 * 2.0 * rx * ry + f1 * (r2 + 2.0 * ry * ry)) * scale * scale
+        row[SECOND + 7] = (f0 * (r2 + 2.0 * rx * rx) + f1 * 2.0 * rx * ry) * scale * scale
         row[SECOND + 8] = radial * q * q * q
         for a in range(3):
             g[a] = n0 * by_right[0, a] + n1 * by_right[1, a]

@@ -353,11 +353,11 @@ def differentiate_sheets(
         scale, q = radial_base(r2, camera[10] != 0.0)
         for c in range(5):
             if c == 2:
-                kx = 2.0 * x * y
-                ky = r2 + 2.0 * y * y
+                kx = scale * scale * 2.0 * x * y
+                ky = scale * scale * (r2 + 2.0 * y * y)
             elif c == 3:
-                kx = r2 + 2.0 * x * x
-                ky = 2.0 * x * y
+                kx = scale * scale * (r2 + 2.0 * x * x)
+                ky = scale * scale * 2.0 * x * y
             else:
                 power = scale * (q if c == 0 else (q * q if c == 1 else q * q * q))
                 kx = x * power

@@ -64,7 +64,8 @@ def distort(
     dd_dxy
         (N, 2, 2) derivative by the ideal coordinates.
     dd_dcoefficients
-        (N, 2, 5) derivative by the coefficients; a fisheye's p1, p2 are held, theirs has no use.
+        (N, 2, 5) derivative by the coefficients; by a fisheye's p1, p2, which are zero, as if they
+        acted on the angle: what a decentred lens would do.
     """
     x, y = xy[:, 0], xy[:, 1]
     r2 = x * x + y * y
@@ -79,9 +80,10 @@ def distort(
     scale, q = _radial_base(r2, lens)
     powers = np.stack([scale * q, scale * q * q, scale * q * q * q], axis=1)
     dd_dcoefficients[:, :, [0, 1, 4]] = xy[:, :, None] * powers[:, None, :]
-    dd_dcoefficients[:, 0, 2] = dd_dcoefficients[:, 1, 3] = 2.0 * x * y
-    dd_dcoefficients[:, 0, 3] = r2 + 2.0 * x * x
-    dd_dcoefficients[:, 1, 2] = r2 + 2.0 * y * y
+    u, v = scale * x, scale * y
+    dd_dcoefficients[:, 0, 2] = dd_dcoefficients[:, 1, 3] = 2.0 * u * v
+    dd_dcoefficients[:, 0, 3] = q + 2.0 * u * u
+    dd_dcoefficients[:, 1, 2] = q + 2.0 * v * v
     return distorted, dd_dxy, dd_dcoefficients
 
 

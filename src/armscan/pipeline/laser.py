@@ -296,8 +296,12 @@ def about_cameras(boards: Sequence[BoardStripes], cameras: HeadCameras) -> tuple
     for number in sorted({board.camera for board in boards}):
         of_place = {board.place: board.view for board in boards if board.camera == number}
         views = [replace(view, source=place) for place, view in of_place.items()]
-        own = calibrate_camera(views, OWN_CAMERA) if len(views) >= FEWEST_OF_OWN_CAMERA else None
-        if own is None or isinstance(own, FitFailure):
+        if len(views) < FEWEST_OF_OWN_CAMERA:
+            continue
+        is_fisheye = cameras.model(number).lens == "fisheye"
+        options = replace(OWN_CAMERA, distortion="fisheye") if is_fisheye else OWN_CAMERA
+        own = calibrate_camera(views, options)
+        if isinstance(own, FitFailure):
             continue
         given_px, own_px = (
             rms_of_poses_px(views, model) for model in (cameras.model(number), own.camera)

@@ -382,14 +382,18 @@ def _rms(residuals: ViewResiduals | None) -> float:
 def _two_cameras_section(fit: StereoFit) -> Section:
     n = len(PARAMETER_NAMES)
     rows = []
+    lenses = (fit.views.left.lens, fit.views.right.lens)
     for k, name in enumerate(PARAMETER_NAMES):
+        if name not in {*fit.views.left.parameter_names, *fit.views.right.parameter_names}:
+            continue
+        meanings = dict.fromkeys(meaning_of(name, lens) for lens in lenses)
         cells = []
         for side, camera in enumerate((fit.views.left, fit.views.right)):
             value, sigma = camera.parameters[k], fit.sigma[side * n + k]
             is_free = name in fit.sides[side].single.free_parameters
             text = with_sigma(value, sigma, unit_of(name))
             cells.append(text if is_free or sigma > 0.0 else f"{value:g} (held)")
-        rows.append((name.removesuffix("_px"), *cells, meaning_of(name, fit.views.left.lens)))
+        rows.append((name.removesuffix("_px"), *cells, "; ".join(meanings)))
     heads = ("parameter", "left ± 1 sigma", "right ± 1 sigma", "meaning")
     reasons = f"Left: {sentence(fit.left.single.reason)} Right: {sentence(fit.right.single.reason)}"
     return Section("The two cameras", (Table(heads, tuple(rows), "", (3,)), Text(reasons)))

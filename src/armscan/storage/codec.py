@@ -231,6 +231,8 @@ class Layout:
         Fields with a record whose keys stand among this one's.
     optional
         Fields that are left out where they have their default.
+    required
+        Fields whose default does not stand for a key that is missing.
     given
         Fields that stand with the record that holds this one.
     lends
@@ -252,6 +254,7 @@ class Layout:
     spread: Mapping[str, Sequence[str]] = field(default_factory=dict)
     flat: Sequence[str] = ()
     optional: Sequence[str] = ()
+    required: Sequence[str] = ()
     given: Sequence[str] = ()
     lends: Mapping[str, str] = field(default_factory=dict)
     constants: Mapping[str, str] = field(default_factory=dict)
@@ -398,11 +401,12 @@ class RecordCodec:
             return {name: tuple(map(float, rows)) if is_tuple else np.array(rows)}
         own = layout.keys.get(name, name)
         used.add(own)
-        if own not in tree and not _has_no_default(item):
+        if own not in tree and not _has_no_default(item) and name not in layout.required:
             return {}
         content, place = _taken(tree, own, key), _join(key, own)
         if name in layout.codecs:
-            return {name: None if content is None else layout.codecs[name].read(content, place)}
+            is_none = content is None and name not in layout.required
+            return {name: None if is_none else layout.codecs[name].read(content, place)}
         if name in layout.lends:
             lent = layout.lends[name]
             kind = _hints(slot.hint)["provenance"]

@@ -208,6 +208,9 @@ def _sensor_of_tree(content: Any, key: str) -> SensorCalibration:
 
 def _fault_of_camera(camera: CameraCalibration) -> str:
     x_min, y_min, x_max, y_max = camera.covered_px
+    has_name = np.isin(PARAMETER_NAMES, camera.camera.parameter_names)
+    if np.any(camera.covariance[~has_name] != 0.0):
+        return "has a fisheye lens and a covariance of tangential distortion, which that has not"
     return "" if x_min <= x_max and y_min <= y_max else "has a valid region that is turned round"
 
 
@@ -246,6 +249,7 @@ LAYOUTS: Mapping[type, Layout] = {
     CameraModel: Layout(
         keys={"lens": "model"},
         codecs={"lens": FieldCodec(LENS_TEXTS.__getitem__, _lens)},
+        required=("lens",),
         spread={"distortion": PARAMETER_NAMES[4:]},
         constants={"pixel_origin": "centre of the top-left pixel"},
     ),

@@ -7,12 +7,18 @@ What the lens shows is OpenCV's fisheye model.
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
+from armscan.calibration.cameras import distortion
 from armscan.calibration.cameras.calibrate import calibrate_camera
-from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.calibration.cameras.distortion import ChosenModel
+from armscan.calibration.cameras.result import CameraFit, CameraOptions, CrossValidation
+from armscan.calibration.cameras.robust import Solution
+from armscan.geometry.estimate import FitFailure
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard, TargetView
 from rigs.camera_scene import Scene, make_views, normalised_error
@@ -72,3 +78,112 @@ def test_few_views_that_fit_alike_keep_the_pinhole() -> None:
     fit = calibrate_camera(make_views(Scene(narrow, BOARD, n_views=8, reach=0.3), 6)[0])
     assert isinstance(fit, CameraFit)
     assert fit.camera.lens == "pinhole"
+
+
+def test_sigmas_hold_what_the_decentring_of_a_lens_may_be() -> None:
+    """A lens whose tangential terms are 3e-4, which no coefficient of a fisheye describes.
+
+    Displacements (p1, p2) as of a pinhole's, of the angle; some thousandths of what usual lenses
+    have pass for noise, and move the principal point.
+    """
+    for seed in (1, 2):
+        decentred = []
+        for view in drawn(seed):
+            u, v = ((view.points_px - TRUTH[2:4]) / TRUTH[:2]).T
+            q, p1, p2 = u * u + v * v, 3e-4, -2e-4
+            moved = np.stack(
+                [2 * p1 * u * v + p2 * (q + 2 * u * u), p1 * (q + 2 * v * v) + 2 * p2 * u * v], 1
+            )
+            decentred.append(replace(view, points_px=view.points_px + moved * TRUTH[:2]))
+        fit = calibrate_camera(decentred)
+        certain = calibrate_camera(decentred, CameraOptions(distortion="fisheye"))
+        assert isinstance(fit, CameraFit) and isinstance(certain, CameraFit)
+        assert fit.camera.lens == "fisheye"
+        assert not fit.covariance[[6, 7]].any()
+        error = np.abs(fit.camera.parameters[:4] - TRUTH[:4])
+        assert (error < 4.0 * fit.sigma[:4]).all()
+        assert (fit.sigma[2:4] > 1.5 * certain.sigma[2:4]).all()
+
+
+def lens_of(
+    pinhole_px: list[float],
+    fisheye_px: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    is_wide: bool = True,
+    is_converged: bool = True,
+) -> ChosenModel | FitFailure:
+    """The choice when unseen views leave these residuals."""
+    held_out = {"k1": pinhole_px, "fisheye": fisheye_px}
+
+    def solution(model: str, *, is_converged: bool = True) -> Solution:
+        weights = np.ones(3)
+        return cast(
+            Solution, SimpleNamespace(model=model, weights=weights, is_converged=is_converged)
+        )
+
+    def validate(one: Solution, _reference: Solution) -> CrossValidation:
+        rms = held_out[cast(SimpleNamespace, one).model]
+        return CrossValidation(5, float(np.mean(rms)), 0.1, (), tuple(rms))
+
+    monkeypatch.setattr(distortion, "_is_wide", lambda _solution: is_wide)
+    monkeypatch.setattr(distortion, "replace", _with)
+    pinhole = ChosenModel("k1", solution("k1"), None, "k1: says so")
+    return distortion.choose_lens(
+        pinhole, lambda _model: solution("fisheye", is_converged=is_converged), validate
+    )
+
+
+def _with(record: object, **changes: object) -> object:
+    if isinstance(record, SimpleNamespace):
+        return SimpleNamespace(**(vars(record) | changes))
+    return replace(cast(ChosenModel, record), **changes)  # type: ignore[arg-type]
+
+
+STEADY = [1.0, 1.02, 0.98, 1.01, 0.99, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("factors", "lens", "is_doubted"),
+    [
+        ([1.7 * each for each in STEADY], "fisheye", False),
+        ([1.4 * each for each in STEADY], "k1", True),
+        ([1.02 * each for each in STEADY], "k1", True),
+        ([0.98 * each for each in STEADY], "k1", False),
+        ([20.0, 0.5, 9.0, 0.4, 3.0, 0.5], "k1", True),
+        ([np.nan] * 6, "k1", False),
+    ],
+)
+def test_a_pinhole_gives_way_to_much_better_predictions(
+    factors: list[float], lens: str, is_doubted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By half more and by two standard errors; what is better by less is told."""
+    found = lens_of(factors, [1.0] * 6, monkeypatch)
+    assert isinstance(found, ChosenModel)
+    assert found.model == lens
+    assert ("--distortion fisheye" in found.doubt) == is_doubted
+    assert found.untested == (("p1", "p2") if lens == "fisheye" else ())
+
+
+def test_no_fisheye_is_taken_that_did_not_settle_or_is_not_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    better = [3.0 * each for each in STEADY]
+    for changes in ({"is_wide": False}, {"is_converged": False}):
+        found = lens_of(better, [1.0] * 6, monkeypatch, **changes)
+        assert isinstance(found, ChosenModel) and found.model == "k1" and not found.doubt
+
+
+def test_a_doubt_is_a_warning() -> None:
+    """A fisheye of which boards show 43 degrees: a pinhole will do, and may not beyond."""
+    rng = np.random.default_rng(3)
+    narrow = [view.select(np.hypot(*(view.points_px - TRUTH[2:4]).T) < 175.0) for view in drawn(8)]
+    views = [view for view in narrow if len(view) >= 20]
+    noisy = [
+        replace(view, points_px=view.points_px + 0.3 * rng.normal(size=view.points_px.shape))
+        for view in views
+    ]
+    fit = calibrate_camera(noisy)
+    assert isinstance(fit, CameraFit)
+    is_told = any("--distortion fisheye" in warning for warning in fit.warnings)
+    assert fit.camera.lens == "fisheye" or is_told

@@ -11,8 +11,9 @@ from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.result import BoardStripes
 from armscan.models.camera import CameraModel
 from armscan.pipeline.laser import about_cameras
-from armscan.vision.targets.target import TargetView
+from armscan.vision.targets.target import Chessboard, TargetView
 from rigs.camera_scene import CAMERA, Scene, make_views
+from rigs.fisheye import fisheye_views
 from rigs.sheet_rig import PROVENANCE, make_profile
 from rigs.true_scanner import certain_camera
 
@@ -57,3 +58,14 @@ def test_bent_boards_say_nothing_of_their_own_camera(seed: int) -> None:
 def test_few_boards_say_nothing_of_a_camera() -> None:
     views, _ = make_views(BENT, 1)
     assert told(views[:4], other(1.1, K1)) == ()
+
+
+@pytest.mark.parametrize(("factor", "is_named"), [(1.0, False), (1.1, True)])
+def test_a_fisheye_is_compared_with_a_fisheye(factor: float, is_named: bool) -> None:
+    """70 degrees to each side, where no pinhole fits the boards and all would seem well."""
+    board = Chessboard(9, 6, 24.0)
+    truth = np.array([231.0, 229.5, 472.0, 305.0, 0.021, -0.012, 0.0, 0.0, 0.004])
+    views = fisheye_views(truth, (960, 600), board, n_views=8, noise_px=0.05, seed=3)
+    values = truth * np.array([factor, factor, *[1.0] * 7])
+    said = told(views, CameraModel.from_parameters(values, 960, 600, "fisheye"))
+    assert bool(said) == is_named

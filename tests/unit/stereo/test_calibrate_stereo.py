@@ -20,6 +20,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import IntrinsicsUse, TwoViews
+from rigs.fisheye import as_fisheye
 from rigs.stereo_rig import (
     CONVERGING,
     GRID,
@@ -268,3 +269,26 @@ def fold_px(camera: CameraModel) -> float:
     k1 = float(camera.distortion[0])
     radius = (-1.0 / (3.0 * k1)) ** 0.5
     return camera.fx_px * radius * (1.0 + k1 * radius**2)
+
+
+def test_two_fisheyes_without_noise_are_found() -> None:
+    views = TwoViews(as_fisheye(LEFT), as_fisheye(RIGHT), CONVERGING)
+    scene = StereoScene(views, n_pairs=6, noise_px=(0.0, 0.0))
+    options = StereoOptions(CameraOptions(distortion="fisheye", n_folds=0), n_folds=0)
+    fit = solved(make_pairs(scene, 0)[0], scene, options)
+    assert (fit.views.left.lens, fit.views.right.lens) == ("fisheye", "fisheye")
+    assert np.abs(increments(fit.views, views)).max() < 1e-4
+    assert fit.epipolar_rms_px < 1e-6
+
+
+def test_a_pinhole_beside_a_fisheye_keeps_each_its_lens() -> None:
+    """Both given and held: the relative pose alone is solved, each point by its own camera."""
+    views = TwoViews(LEFT, as_fisheye(RIGHT), CONVERGING)
+    scene = StereoScene(views, n_pairs=6, noise_px=(0.0, 0.0))
+    given = tuple(held(camera, np.zeros((9, 9))) for camera in (views.left, views.right))
+    options = replace(OPTIONS, intrinsics="fixed")
+    fit = solved(make_pairs(scene, 1)[0], scene, options, (given[0], given[1]))
+    assert (fit.views.left.lens, fit.views.right.lens) == ("pinhole", "fisheye")
+    pose, true = fit.views.right_from_left, CONVERGING
+    np.testing.assert_allclose(pose.translation_mm, true.translation_mm, atol=1e-4)
+    np.testing.assert_allclose(pose.rotation, true.rotation, atol=1e-7)

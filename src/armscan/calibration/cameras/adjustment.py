@@ -418,7 +418,11 @@ def descend(
 
     found = minimise(start, evaluate, propose, max_steps=max_steps)
     if found is None:
-        return FitFailure("the starting values put the board behind the camera")
+        return FitFailure(
+            "the starting values put the board behind the camera",
+            "check the target's columns and rows; tilt the board by 20 to 45 degrees, in a "
+            "different direction from view to view",
+        )
     return found
 
 

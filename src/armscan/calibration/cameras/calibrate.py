@@ -18,6 +18,7 @@ from armscan.calibration.cameras.adjustment import (
     joint_covariance,
 )
 from armscan.calibration.cameras.distortion import (
+    DECENTRING,
     ChosenModel,
     chance_of_coefficients,
     choose_lens,
@@ -71,7 +72,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
-from armscan.models.camera import CameraModel
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.vision.targets.target import TargetView
 
 
@@ -228,6 +229,10 @@ def assemble(
         unit, shift = left.unit_covariance, left.shift
     covariance = covariance_with_target_error(unit, sigma0_squared, target_error, found)
     covariance = covariance + np.outer(shift, shift)
+    if observations.lens == "fisheye":
+        # what its decentring may be widens the others; it has no such parameters itself
+        absent = [PARAMETER_NAMES.index(name) for name in DECENTRING]
+        covariance[absent] = covariance[:, absent] = 0.0
     # a bent or stretched target is told by its residuals, not by the sigma that they widen
     refusal = _focal_refusal(solution, covariance / design.widening)
     if refusal is not None:
@@ -270,7 +275,8 @@ def assemble(
         options=options,
     )
     repeats = [(views[a].source, views[b].source) for a, b in prepared.repeats.items()]
-    return advise(fit, repeats, is_converged=solution.is_converged)
+    told = advise(fit, repeats, is_converged=solution.is_converged)
+    return replace(told, warnings=(*told.warnings, chosen.doubt)) if chosen.doubt else told
 
 
 def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | None:

@@ -163,6 +163,8 @@ class ChosenModel:
     untested
         Names of the coefficients that the choice left at zero, for lack of evidence: nobody said
         that they are.
+    doubt
+        What speaks for another kind of lens, in words; empty for nothing.
     """
 
     model: DistortionModel
@@ -170,6 +172,7 @@ class ChosenModel:
     cross_validation: CrossValidation | None
     reason: str
     untested: tuple[str, ...] = ()
+    doubt: str = ""
 
 
 def choose_model(
@@ -228,6 +231,8 @@ def choose_model(
 
 WIDE = 0.6
 """Ideal radius X/Z up to which a fisheye's terms do what a pinhole's do."""
+DECENTRING = ("p1", "p2")
+"""Of a fisheye: left at zero, and not known to be."""
 LENS_SIGMAS, LENS_FACTOR = 2.0, 1.5
 """A fisheye takes a pinhole's place if unseen views' residuals fall by this factor, in the mean of
 their logarithms, and by so many of its standard errors. A pinhole that does nearly as well stays:
@@ -255,17 +260,21 @@ def choose_lens(
         return pinhole
     if isinstance(pinhole, FitFailure):
         reason = "fisheye: no pinhole with five coefficients explains the views"
-        return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason)
+        return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, DECENTRING)
     both = replace(fisheye, weights=fisheye.weights * pinhole.solution.weights)
     fall, error = _fall_of_residuals(validate(pinhole.solution, both), validate(both, both))
-    if fall < LENS_SIGMAS * error:
+    if not fall > 0.0:
         return pinhole
     factor = float(np.exp(fall))
-    if factor < LENS_FACTOR:
-        said = f"--distortion fisheye would predict unseen views {factor:.2f} times as well"
-        return replace(pinhole, reason=f"{pinhole.reason}; {said}")
+    if fall < LENS_SIGMAS * error or factor < LENS_FACTOR:
+        doubt = (
+            f"the lens is wide, and a fisheye predicts unseen views {factor:.2f} times as well as "
+            "this pinhole: where no target points lie the two may differ by many pixels; compare "
+            "--distortion fisheye, and do not measure outside the covered part"
+        )
+        return replace(pinhole, doubt=doubt)
     reason = f"fisheye: unseen views are predicted {factor:.1f} times as well as by a pinhole"
-    return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason)
+    return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, DECENTRING)
 
 
 def _further(model: DistortionModel, larger: DistortionModel) -> tuple[str, ...]:

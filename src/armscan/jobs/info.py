@@ -23,7 +23,7 @@ from armscan.models.calibration import (
     SensorCalibration,
     SheetCalibration,
 )
-from armscan.models.camera import PARAMETER_NAMES
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.reconstruction.sync import exposure_poses, largest_gap_ns
 from armscan.records.cloud import PointCloud
 from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
@@ -173,7 +173,7 @@ def second_camera_facts(second: SecondCamera) -> dict[str, Any]:
     camera, pose = second.camera.camera, second.right_from_sensor
     turn_deg = float(np.degrees(np.linalg.norm(pose.rotation_vector_rad)))
     return {
-        "second_camera": f"{camera.width_px} x {camera.height_px} px, "
+        "second_camera": f"{_size_of(camera)}, "
         f"fx {camera.fx_px:.2f} px, turned by {turn_deg:.3f} deg",
         "baseline_mm": round(float(np.linalg.norm(pose.translation_mm)), 4),
     }
@@ -519,12 +519,16 @@ def _evidence(calibration: CameraCalibration) -> dict[str, Any]:
     }
 
 
+def _size_of(camera: CameraModel) -> str:
+    lens = " with a fisheye lens" if camera.lens == "fisheye" else ""
+    return f"{camera.width_px} x {camera.height_px} px{lens}"
+
+
 def _sensor(calibration: SensorCalibration) -> dict[str, Any]:
     camera = calibration.camera.camera
     sheets = [_sheet_line(sheet) for sheet in calibration.sheets]
     return {
-        "what": f"sensor calibration, {len(sheets)} light sheets, camera "
-        f"{camera.width_px} x {camera.height_px} px",
+        "what": f"sensor calibration, {len(sheets)} light sheets, camera {_size_of(camera)}",
         "sheets": sheets,
         **({} if calibration.second is None else second_camera_facts(calibration.second)),
         **_origin(calibration.provenance),

@@ -125,7 +125,7 @@ def pose_of(pixels: Array, points_mm: Array, camera: Any) -> Any:
     flat = np.column_stack([np.asarray(points_mm)[:, :2], np.zeros(len(points_mm))])
     pixels = np.asarray(pixels, dtype=float)
     if is_fisheye(camera):
-        pixels, camera = rays_of(pixels, camera)[:, :2], (np.eye(3), np.zeros(5))
+        pixels, camera = rays_of(pixels, camera)[:, :2].copy(), (np.eye(3), np.zeros(5))
     _, rotation, translation = cv2.solvePnP(flat, pixels, *camera)
     return cv2.Rodrigues(rotation)[0], translation.ravel()
 

@@ -233,10 +233,9 @@ WIDE = 0.6
 """Ideal radius X/Z up to which a fisheye's terms do what a pinhole's do."""
 DECENTRING = ("p1", "p2")
 """Of a fisheye: left at zero, and not known to be."""
-LENS_SIGMAS, LENS_FACTOR = 2.0, 1.5
-"""A fisheye takes a pinhole's place if unseen views' residuals fall by this factor, in the mean of
-their logarithms, and by so many of its standard errors. A pinhole that does nearly as well stays:
-every other program reads it."""
+LENS_SIGMAS = 2.0
+"""A fisheye takes a pinhole's place if unseen views' residuals fall, in the mean of their logarithms,
+by so many of its standard errors; it has fewer coefficients. Less than that is a doubt."""
 
 
 def choose_lens(
@@ -266,14 +265,14 @@ def choose_lens(
     if not fall > 0.0:
         return pinhole
     factor = float(np.exp(fall))
-    if fall < LENS_SIGMAS * error or factor < LENS_FACTOR:
+    if fall < LENS_SIGMAS * error:
         doubt = (
             f"the lens is wide, and a fisheye predicts unseen views {factor:.2f} times as well as "
             "this pinhole: where no target points lie the two may differ by many pixels; compare "
             "--distortion fisheye, and do not measure outside the covered part"
         )
         return replace(pinhole, doubt=doubt)
-    reason = f"fisheye: unseen views are predicted {factor:.1f} times as well as by a pinhole"
+    reason = f"fisheye: unseen views are predicted {factor:.2f} times as well as by a pinhole"
     return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, DECENTRING)
 
 

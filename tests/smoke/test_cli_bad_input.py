@@ -243,7 +243,7 @@ def test_folder_that_may_not_be_written(bench: Bench, fails: Fails, tmp_path: Pa
     ("option", "value", "message"),
     [
         ("--fix", "everything", "choose aspect or centre"),
-        ("--distortion", "fisheye", "distortion model"),
+        ("--distortion", "rational", "distortion model"),
         ("--bits-used", "77", "bits used is 77"),
         ("--bits-used", "12", "8 bits a pixel"),
         ("--bits-align", "middle", "choose low or high"),

@@ -234,7 +234,7 @@ WIDE = 0.6
 DECENTRING = ("p1", "p2")
 """Of a fisheye: left at zero, and not known to be."""
 LENS_SIGMAS = 2.0
-"""A fisheye takes a pinhole's place if unseen views' residuals fall, in the mean of their logarithms,
+"""A fisheye takes a pinhole's place if the logarithms of unseen views' residuals fall, in the mean,
 by so many of its standard errors; it has fewer coefficients. Less than that is a doubt."""
 
 

@@ -48,6 +48,7 @@ from armscan.calibration.cameras.robust import (
     MISFIT_LEVEL,
     MISFIT_OUTLIERS,
     WRONG_LEVEL,
+    BoardResiduals,
     Solution,
     board_residuals,
     board_warp,
@@ -220,19 +221,9 @@ def assemble(
     is_told = not options.is_aspect_fixed
     stretch = print_stretch(solution, options.max_steps) if is_told else (0.0, np.inf)
     sigma0_squared = solution.variance_factor * design.widening
-    shift = np.zeros(len(unit))
-    if chosen.untested:
-        level = target_error.independent_share * sigma0_squared
-        left = coefficients_left_at_zero(solution, chosen.untested, level)
-        if isinstance(left, FitFailure):
-            return left
-        unit, shift = left.unit_covariance, left.shift
-    covariance = covariance_with_target_error(unit, sigma0_squared, target_error, found)
-    covariance = covariance + np.outer(shift, shift)
-    if observations.lens == "fisheye":
-        # what its decentring may be widens the others; it has no such parameters itself
-        absent = [PARAMETER_NAMES.index(name) for name in DECENTRING]
-        covariance[absent] = covariance[:, absent] = 0.0
+    covariance = _stated_covariance(unit, solution, chosen.untested, sigma0_squared, found)
+    if isinstance(covariance, FitFailure):
+        return covariance
     # a bent or stretched target is told by its residuals, not by the sigma that they widen
     refusal = _focal_refusal(solution, covariance / design.widening)
     if refusal is not None:
@@ -277,6 +268,31 @@ def assemble(
     repeats = [(views[a].source, views[b].source) for a, b in prepared.repeats.items()]
     told = advise(fit, repeats, is_converged=solution.is_converged)
     return replace(told, warnings=(*told.warnings, chosen.doubt)) if chosen.doubt else told
+
+
+def _stated_covariance(
+    unit: FloatArray,
+    solution: Solution,
+    untested: tuple[str, ...],
+    sigma0_squared: float,
+    found: BoardResiduals | None,
+) -> FloatArray | FitFailure:
+    """Joint covariance with what the target's points miss and what was left at zero may be."""
+    target_error = estimate_target_error(found)
+    shift = np.zeros(len(unit))
+    if untested:
+        level = target_error.independent_share * sigma0_squared
+        left = coefficients_left_at_zero(solution, untested, level)
+        if isinstance(left, FitFailure):
+            return left
+        unit, shift = left.unit_covariance, left.shift
+    covariance = covariance_with_target_error(unit, sigma0_squared, target_error, found)
+    covariance = covariance + np.outer(shift, shift)
+    if solution.observations.lens == "fisheye":
+        # what its decentring may be widens the others; it has no such parameters itself
+        absent = [PARAMETER_NAMES.index(name) for name in DECENTRING]
+        covariance[absent] = covariance[:, absent] = 0.0
+    return covariance
 
 
 def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | None:

@@ -33,6 +33,10 @@ Lens = Literal["pinhole", "fisheye"]
 three terms of Kannala and Brandt (2006), as OpenCV's fisheye model with k4 = 0."""
 WIDEST_RAD = np.deg2rad(88.0)
 """Angle from the axis beyond which a ray has no use as X/Z, Y/Z."""
+TANGENTIAL = ("p1", "p2")
+"""Coefficients that a fisheye has not."""
+FISHEYE_FOCALS = np.geomspace(0.15, 1.5, 16)
+"""Focal lengths of fisheyes that are tried, over the image's longer side."""
 NEAR_AXIS = 1e-12
 """Square of a radius below which a fisheye's terms are those of its series."""
 
@@ -244,7 +248,7 @@ class CameraModel(ArrayRecord):
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Those of `PARAMETER_NAMES` that its lens has: a fisheye has no p1, p2."""
-        absent = ("p1", "p2") if self.lens == "fisheye" else ()
+        absent = TANGENTIAL if self.lens == "fisheye" else ()
         return tuple(name for name in PARAMETER_NAMES if name not in absent)
 
     @property

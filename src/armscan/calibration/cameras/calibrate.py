@@ -18,7 +18,6 @@ from armscan.calibration.cameras.adjustment import (
     joint_covariance,
 )
 from armscan.calibration.cameras.distortion import (
-    DECENTRING,
     ChosenModel,
     chance_of_coefficients,
     choose_lens,
@@ -73,7 +72,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
-from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.camera import PARAMETER_NAMES, TANGENTIAL, CameraModel
 from armscan.vision.targets.target import TargetView
 
 
@@ -290,7 +289,7 @@ def _stated_covariance(
     covariance = covariance + np.outer(shift, shift)
     if solution.observations.lens == "fisheye":
         # what its decentring may be widens the others; it has no such parameters itself
-        absent = [PARAMETER_NAMES.index(name) for name in DECENTRING]
+        absent = [PARAMETER_NAMES.index(name) for name in TANGENTIAL]
         covariance[absent] = covariance[:, absent] = 0.0
     return covariance
 

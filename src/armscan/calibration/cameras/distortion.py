@@ -41,7 +41,7 @@ from armscan.calibration.cameras.robust import (
 )
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
-from armscan.models.camera import PARAMETER_NAMES
+from armscan.models.camera import PARAMETER_NAMES, TANGENTIAL
 
 NO_SHARED = np.zeros((11, 0))
 
@@ -231,8 +231,6 @@ def choose_model(
 
 WIDE = 0.6
 """Ideal radius X/Z up to which a fisheye's terms do what a pinhole's do."""
-DECENTRING = ("p1", "p2")
-"""Of a fisheye: left at zero, and not known to be."""
 LENS_SIGMAS = 2.0
 """A fisheye takes a pinhole's place if the logarithms of unseen views' residuals fall, in the mean,
 by so many of its standard errors; it has fewer coefficients. Less than that is a doubt."""
@@ -259,7 +257,7 @@ def choose_lens(
         return pinhole
     if isinstance(pinhole, FitFailure):
         reason = "fisheye: no pinhole with five coefficients explains the views"
-        return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, DECENTRING)
+        return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, TANGENTIAL)
     both = replace(fisheye, weights=fisheye.weights * pinhole.solution.weights)
     fall, error = _fall_of_residuals(validate(pinhole.solution, both), validate(both, both))
     if not fall > 0.0:
@@ -273,7 +271,7 @@ def choose_lens(
         )
         return replace(pinhole, doubt=doubt)
     reason = f"fisheye: unseen views are predicted {factor:.2f} times as well as by a pinhole"
-    return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, DECENTRING)
+    return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, TANGENTIAL)
 
 
 def _further(model: DistortionModel, larger: DistortionModel) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray, homogeneous
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import nearest_rotation, rotation_from_vector, vector_from_rotation
-from armscan.models.camera import PARAMETER_NAMES, CameraModel, distort
+from armscan.models.camera import FISHEYE_FOCALS, PARAMETER_NAMES, CameraModel, distort
 from armscan.vision.targets.target import TargetView
 
 MIN_POINTS = 4
@@ -397,10 +397,6 @@ def starting_state(
     return _with_distortion(state, observations, trusted, model), trusted
 
 
-FISHEYE_FOCALS = np.geomspace(0.15, 1.5, 16)
-"""Of the image's longer side."""
-
-
 def _fisheye_start(
     views: Sequence[TargetView], observations: Observations
 ) -> tuple[State, BoolArray] | FitFailure:
@@ -413,7 +409,9 @@ def _fisheye_start(
         if (middle := float(np.median(rms))) < least:
             trusted = np.asarray(np.array(rms) <= SUSPECT_HOMOGRAPHY * middle)
             best, least = (State.from_poses(shared, poses), trusted), middle
-    return best or FitFailure("the points do not fit a flat target before a fisheye lens")
+    if best is None:
+        return FitFailure("the points do not fit a flat target before a fisheye lens")
+    return best
 
 
 def _flat_pose(view: TargetView, camera: CameraModel) -> tuple[Pose[Sensor, Board], float]:

@@ -28,7 +28,7 @@ import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, apply_homography, homogeneous
 from armscan.geometry.estimate import FitFailure
-from armscan.models.camera import CameraModel
+from armscan.models.camera import FISHEYE_FOCALS, CameraModel
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.crossings import (
     Crossings,
@@ -258,8 +258,6 @@ _POINTS_PER_TERM = 3.0
 """Fewest points per term of the polynomial; fewer let it follow a single corner."""
 
 
-_FISHEYE_FOCALS = np.geomspace(0.15, 1.5, 16)
-"""Of the image's longer side."""
 _MUCH_BETTER = 0.5
 """Of what a board misses a homography by: below it, it is seen through a fisheye."""
 
@@ -302,7 +300,7 @@ def _fisheye_before(
         return None
     best, least = None, _MUCH_BETTER * float(np.median(np.hypot(*(flat - points_px).T)))
     middle = 0.5 * (np.array(size_px) - 1.0)
-    for focal in _FISHEYE_FOCALS * max(size_px):
+    for focal in FISHEYE_FOCALS * max(size_px):
         lens = CameraModel.from_parameters([focal, focal, *middle, *[0.0] * 5], *size_px, "fisheye")
         seen = _flat_board(board, points_px, every, lens)
         missed = np.inf if seen is None else float(np.median(np.hypot(*(seen - points_px).T)))

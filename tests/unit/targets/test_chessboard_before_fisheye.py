@@ -11,7 +11,8 @@ from scipy.ndimage import gaussian_filter
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.chessboard import MAX_SCATTER, off_lattice
+from armscan.vision.targets.chessboard import MAX_SCATTER
+from armscan.vision.targets.crossings import fit_lattice
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, TargetView
 from rigs.fisheye import see_through_fisheye
@@ -22,11 +23,13 @@ BOARD = Chessboard(8, 6, 30.0)
 FRONTAL: Pose[Sensor, Board] = Pose(np.eye(3), np.array([-105.0, -75.0, 62.0]))
 """Its outermost corners lie 64 degrees from the axis."""
 TILTED: Pose[Sensor, Board] = Pose.from_vectors([0.1, -0.6, 0.3], [-60.0, -120.0, 120.0])
+BESIDE: Pose[Sensor, Board] = Pose.from_vectors([-0.166, -0.235, 0.225], [-56.0, -66.8, 53.0])
+"""The search misses a third of its corners, for cells shrink to a tenth towards the right."""
 
 
 def photograph(pose: Pose[Sensor, Board], rng: np.random.Generator) -> np.ndarray:
-    """Levels of the board on a light wall: nine rays a pixel, blur and noise."""
-    fine, (width, height) = 3, SIZE_PX
+    """Levels of the board on a light wall: 36 rays a pixel, blur and noise."""
+    fine, (width, height) = 6, SIZE_PX
     v, u = np.mgrid[: height * fine, : width * fine]
     pixels = (np.stack([u.ravel(), v.ravel()], axis=1) + 0.5) / fine - 0.5
     matrix = np.array([[LENS[0], 0, LENS[2]], [0, LENS[1], LENS[3]], [0, 0, 1.0]])
@@ -48,22 +51,24 @@ def photograph(pose: Pose[Sensor, Board], rng: np.random.Generator) -> np.ndarra
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("pose", [FRONTAL, TILTED], ids=["frontal", "tilted"])
-def test_corners_are_found_up_to_the_outermost(pose: Pose[Sensor, Board]) -> None:
-    """Edges that bend within the reach of a corner's fit may cost it, wherever it lies."""
+@pytest.mark.parametrize("pose", [FRONTAL, TILTED, BESIDE], ids=["frontal", "tilted", "beside"])
+def test_corners_are_found_up_to_the_outermost_without_bias(pose: Pose[Sensor, Board]) -> None:
+    """Straight edges would put them 0.03 to 0.08 px too far inward, ten sigmas and more."""
     view = detect_target(Exposure(photograph(pose, np.random.default_rng(1)), "wide.png"), BOARD)
     assert isinstance(view, TargetView)
-    assert len(view) > 0.85 * BOARD.columns * BOARD.rows
+    assert len(view) > 0.93 * BOARD.columns * BOARD.rows
     truth = see_through_fisheye(LENS, BOARD, pose)
     # the half-turned numbering of an even board is as good
-    turned = truth[::-1]
-    error = min(
-        (np.hypot(*(view.points_px - each[view.point_index]).T) for each in (truth, turned)),
-        key=lambda each: float(each.max()),
-    )
-    assert error.max() < 0.15
-    away = np.hypot(*(truth - LENS[2:4]).T)
-    assert np.hypot(*(view.points_px - LENS[2:4]).T).max() > away.max() - 1.0
+    errors = [view.points_px - each[view.point_index] for each in (truth, truth[::-1])]
+    error = min(errors, key=lambda each: float(np.abs(each).max()))
+    outward = view.points_px - LENS[2:4]
+    away = np.hypot(*outward.T)
+    sigma = np.sqrt(0.5 * np.trace(view.covariance_px2, axis1=1, axis2=2))
+    inward = -(error * outward).sum(axis=1) / away
+    assert abs(np.average(inward, weights=sigma**-2.0)) < 0.004
+    # 36 rays a pixel err by 0.003 px themselves
+    assert np.mean((error / np.hypot(sigma, 0.003)[:, None]) ** 2) < 2.0
+    assert away.max() > np.hypot(*(truth - LENS[2:4]).T).max() - 25.0
 
 
 def corners(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -74,13 +79,15 @@ def corners(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 def test_a_bent_lattice_has_no_corner_off_it_but_those_that_are() -> None:
     board, points = corners(np.random.default_rng(2))
     sigma, tolerance = np.full(len(board), 0.05), 0.5
-    is_off, scatter = off_lattice(board, points, sigma, tolerance, SIZE_PX)
-    assert not is_off.any()
-    assert scatter < 0.2
+    lattice = fit_lattice(board, points, sigma, tolerance, SIZE_PX)
+    assert lattice is not None
+    assert not lattice.is_off.any()
+    assert lattice.scatter_px < 0.2
     moved = points.copy()
     moved[[0, 20]] += [3.0, -2.0]
-    is_off, _ = off_lattice(board, moved, sigma, tolerance, SIZE_PX)
-    assert np.flatnonzero(is_off).tolist() == [0, 20]
+    lattice = fit_lattice(board, moved, sigma, tolerance, SIZE_PX)
+    assert lattice is not None
+    assert np.flatnonzero(lattice.is_off).tolist() == [0, 20]
 
 
 def test_a_misprint_is_none_that_a_fisheye_explains() -> None:
@@ -89,5 +96,6 @@ def test_a_misprint_is_none_that_a_fisheye_explains() -> None:
     wide = board.copy()
     wide[:, 0] += wide[:, 0] >= 4
     seen = wide * 40.0 + [300.0, 200.0] + 0.05 * np.random.default_rng(4).normal(size=wide.shape)
-    is_off, scatter = off_lattice(board, seen, np.full(len(board), 0.05), 0.5, SIZE_PX)
-    assert scatter > MAX_SCATTER * 40.0 or is_off.mean() > 0.2
+    lattice = fit_lattice(board, seen, np.full(len(board), 0.05), 0.5, SIZE_PX)
+    assert lattice is not None
+    assert lattice.scatter_px > MAX_SCATTER * 40.0 or lattice.is_off.mean() > 0.2

@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from armscan.kernels.circle_edges import (
+from armscan.kernels.target_edges import (
     collect_band,
     direction_angle,
     fit_sectors,

@@ -9,9 +9,8 @@ does not end along a line of the squares and gives no such evidence.
 The camera looks at the front of a print, so that in the image the board's y lies clockwise of its
 x. Where several numberings remain, the one whose x points most to the right is taken.
 
-A flat board seen through any lens is a homography followed by a smooth field: a polynomial of third
-degree over the image holds distortion and a bow. A corner that a light stripe or a shadow pulled
-lies off it by many times the scatter of the rest.
+Corners are measured twice where the lattice that they make bends: a straight edge lies beside a
+bent one by a third of the arc's height within reach of the fit, 0.02 to 0.1 px before a fisheye.
 
 The origin is the inner corner whose outer square (towards -x, -y) is dark. Part of a board is
 enough where its ends tell which part it is.
@@ -26,28 +25,33 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, apply_homography, homogeneous
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
-from armscan.models.camera import FISHEYE_FOCALS, CameraModel
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.crossings import (
     Crossings,
     Lattice,
+    SmoothLattice,
     cell_arrays,
     find_crossings,
     find_lattices,
+    fit_lattice,
     predict_cells,
 )
 from armscan.vision.targets.saddle import (
     MIN_CONTRAST,
     Grey32,
     RawGrey,
+    Saddles,
     fit_saddles,
     grey_channels,
     sample,
+    window_radius,
 )
 from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView, rightness
 
+Steps = tuple[FloatArray, FloatArray]
+"""Ways (N, 2) to the next corner along x and along y, image pixels."""
 Side = Literal["ends", "may end", "continues", "unknown"]
 """What is seen beyond the outermost corners; "may end" where too few of them tell."""
 
@@ -249,143 +253,6 @@ def _first_number(count: int, wanted: int, before: Side, after: Side) -> int | N
     return None
 
 
-_OUTLIER_SIGMAS = 6.0
-_TUKEY = 4.7
-_HOMOGRAPHIES, _ROUNDS = 3, 6
-_TRUSTED = 0.1
-"""Least weight with which a point helps to fix the homography."""
-_POINTS_PER_TERM = 3.0
-"""Fewest points per term of the polynomial; fewer let it follow a single corner."""
-
-
-_MUCH_BETTER = 0.5
-"""Of what a board misses a homography by: below it, it is seen through a fisheye."""
-
-
-def off_lattice(
-    board: FloatArray,
-    points_px: FloatArray,
-    least_sigma_px: FloatArray,
-    tolerance_px: float,
-    size_px: tuple[int, int],
-) -> tuple[BoolArray, float]:
-    """Tell which of N corners are off the lattice that the others make.
-
-    ``board``: (N, 2) places on the board, any unit. ``points_px``: (N, 2) image points.
-    ``least_sigma_px``: (N,) their standard deviations; the scatter found is not taken to be
-    smaller. ``tolerance_px``: What a print's own errors may be; corners that are off by less stay.
-    ``size_px``: Width and height of the image.
-
-    Returns ``is_off``: (N,) True for corners to leave out. ``scatter_px``: Robust standard
-    deviation, per axis, of the rest; infinite if there is no homography.
-    """
-    is_off, scatter_px = _off_smooth(board, points_px, least_sigma_px, tolerance_px, None)
-    if not is_off.any() and scatter_px <= tolerance_px:
-        return is_off, scatter_px
-    lens = _fisheye_before(board, points_px, size_px)
-    if lens is None:
-        return is_off, scatter_px
-    off, scatter = _off_smooth(board, points_px, least_sigma_px, tolerance_px, lens)
-    is_better = scatter < _MUCH_BETTER * scatter_px or off.sum() < is_off.sum()
-    return (off, scatter) if is_better else (is_off, scatter_px)
-
-
-def _fisheye_before(
-    board: FloatArray, points_px: FloatArray, size_px: tuple[int, int]
-) -> CameraModel | None:
-    """An equidistant lens before which a flat board fits; None if it does hardly better so."""
-    every = np.ones(len(board), dtype=np.bool_)
-    flat = _flat_board(board, points_px, every, None)
-    if flat is None:
-        return None
-    best, least = None, _MUCH_BETTER * float(np.median(np.hypot(*(flat - points_px).T)))
-    middle = 0.5 * (np.array(size_px) - 1.0)
-    for focal in FISHEYE_FOCALS * max(size_px):
-        lens = CameraModel.from_parameters([focal, focal, *middle, *[0.0] * 5], *size_px, "fisheye")
-        seen = _flat_board(board, points_px, every, lens)
-        missed = np.inf if seen is None else float(np.median(np.hypot(*(seen - points_px).T)))
-        if missed < least:
-            best, least = lens, missed
-    return best
-
-
-def _flat_board(
-    board: FloatArray, points_px: FloatArray, trusted: BoolArray, lens: CameraModel | None
-) -> FloatArray | None:
-    """Image points (N, 2) of a flat board that fits trusted ones, before a lens or a pinhole."""
-    if lens is None:
-        homography, _ = cv2.findHomography(board[trusted], points_px[trusted], 0)
-        return None if homography is None else apply_homography(np.asarray(homography), board)
-    xy, is_valid = lens.undistort(points_px)
-    if not is_valid.all():
-        return None
-    # a pixel is worth the less of X/Z the farther from the axis
-    weight = 1.0 / (1.0 + np.sum(xy[trusted] ** 2, axis=1))
-    homography = _weighted_homography(board[trusted], xy[trusted], weight)
-    return lens.project(homogeneous(apply_homography(homography, board)))
-
-
-def _weighted_homography(board: FloatArray, xy: FloatArray, weight: FloatArray) -> FloatArray:
-    middle, scale = board.mean(axis=0), max(float(np.ptp(board)), 1e-9)
-    to_unit = np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, scale]]) / scale
-    rows = homogeneous((board - middle) / scale) * weight[:, None]
-    none = np.zeros_like(rows)
-    design = np.concatenate(
-        [
-            np.concatenate([rows, none, -xy[:, :1] * rows], axis=1),
-            np.concatenate([none, rows, -xy[:, 1:] * rows], axis=1),
-        ]
-    )
-    return np.asarray(np.linalg.svd(design)[2][-1].reshape(3, 3) @ to_unit)
-
-
-def _off_smooth(
-    board: FloatArray,
-    points_px: FloatArray,
-    least_sigma_px: FloatArray,
-    tolerance_px: float,
-    lens: CameraModel | None,
-) -> tuple[BoolArray, float]:
-    """As `off_lattice`, before one lens: off a flat board and a smooth field about it."""
-    weights = np.ones(len(board))
-    size = scatter = np.full(len(board), np.inf)
-    for _ in range(_HOMOGRAPHIES):
-        trusted = weights > _TRUSTED
-        if trusted.sum() < 4:
-            break
-        mapped = _flat_board(board, points_px, trusted, lens)
-        if mapped is None:
-            break
-        field = _terms(mapped)
-        for _ in range(_ROUNDS):
-            size = np.hypot(*_without_itself(field, points_px - mapped, weights).T)
-            # The median length of a two-dimensional normal is 1.18 sigma.
-            scatter = np.maximum(np.median(size) / 1.1774, least_sigma_px)
-            weights = np.clip(1.0 - (size / (_TUKEY * 1.5 * scatter)) ** 2, 1e-3, None) ** 2
-    is_off = size > np.maximum(_OUTLIER_SIGMAS * scatter, tolerance_px)
-    return is_off, float(np.median(size) / 1.1774)
-
-
-def _without_itself(field: FloatArray, residual: FloatArray, weights: FloatArray) -> FloatArray:
-    """Distance (N, 2) of each point from the smooth field through the others."""
-    root = np.sqrt(weights)[:, None]
-    q, _ = np.linalg.qr(field * root)
-    smooth = q @ (q.T @ (residual * root)) / root
-    leverage = np.einsum("np,np->n", q, q)
-    return np.asarray((residual - smooth) / np.maximum(1.0 - leverage, 0.05)[:, None])
-
-
-def _terms(image: FloatArray) -> FloatArray:
-    """Polynomial terms (N, P) over the image, as many as the points can bear."""
-    middle = 0.5 * (image.min(axis=0) + image.max(axis=0))
-    x, y = ((image - middle) / np.maximum(0.5 * np.ptp(image, axis=0), 1e-9)).T
-    terms = [np.ones_like(x), x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
-    for count in (10, 6, 3):
-        if len(image) >= _POINTS_PER_TERM * count:
-            return np.stack(terms[:count], axis=-1)
-    return np.stack(terms[:1], axis=-1)
-
-
 SEARCH_SIZE_PX = 1400
 """Larger images are reduced to this size for the search; corners are measured in the full one."""
 MIN_SEEN_FRACTION = 0.4
@@ -398,6 +265,10 @@ MAX_SCATTER = 0.03
 """Largest scatter about a smooth lattice, as a fraction of a step: more is no flat board."""
 PRINT_ERROR = 0.02
 """Error of a corner on the board itself that is no fault of the image, as a fraction of a step."""
+_BENT_SIGMAS, _FEW_BENT = 0.5, 0.1
+"""An arc's height within reach of a corner's fit, in its sigmas (a third of it is the error of a
+straight edge), and the share of corners that may have more."""
+_FEWEST_FOR_LATTICE = 4
 _MANY_BAD, _FEW_BAD = 0.5, 0.95
 """With fewer of its corners measured this is no board, with more no other channel is needed."""
 _MAX_TRIED = 2
@@ -412,12 +283,10 @@ deviation is smaller than this part of theirs: noise alone changes it by less in
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Corners:
-    """Corners measured on raw pixels: cells (N, 2), points (N, 2), covariances, use (N,)."""
+    """Corners measured on raw pixels, and the cell (N, 2) of each."""
 
     cells: IntArray
-    points_px: FloatArray
-    covariance_px2: FloatArray
-    is_good: BoolArray
+    saddles: Saddles
     scatter_px: float
     step_px: float
 
@@ -437,9 +306,9 @@ def detect_chessboard(exposure: Exposure, target: Chessboard) -> TargetView | Fi
             corners = _best_measured(grey, others, target, numbered)
             refusal = _refusal(exposure, target, corners)
             if refusal is None:
-                good = corners.is_good
+                found, covariance, good = corners.saddles
                 number = corners.cells[good, 1] * target.columns + corners.cells[good, 0]
-                found, covariance = corners.points_px[good], corners.covariance_px2[good]
+                found, covariance = found[good], covariance[good]
                 return TargetView.of_image(exposure, target, number, found, covariance)
             why = refusal if why is None else why
     return _not_found(exposure, target, seen) if why is None else why
@@ -508,10 +377,10 @@ def _best_measured(
     clearest = _clearest([grey, *others], numbered)
     best = _measured(clearest, target, numbered)
     for other in (channel for channel in (grey, *others) if channel is not clearest):
-        if not _MANY_BAD < best.is_good.mean() <= _FEW_BAD:
+        if not _MANY_BAD < best.saddles.is_good.mean() <= _FEW_BAD:
             break
         corners = _measured(other, target, numbered)
-        if corners.is_good.sum() > best.is_good.sum():
+        if corners.saddles.is_good.sum() > best.saddles.is_good.sum():
             best = corners
     return best
 
@@ -530,12 +399,13 @@ def _clearest(channels: Sequence[RawGrey], numbered: NumberedCorners) -> RawGrey
     step_y = predict_cells(*known, cells + np.array([0, 1])) - start
     clearest, least, fewest = channels[0], np.inf, 0
     for channel in channels:
-        _, covariance, is_good = fit_saddles(channel, start, step_x, step_y)
-        if is_good.sum() < max(fewest, 0.5 * len(some)):
+        saddles = fit_saddles(channel, start, step_x, step_y)
+        n_good = int(saddles.is_good.sum())
+        if n_good < max(fewest, 0.5 * len(some)):
             continue
-        sigma = float(np.sqrt(np.median(np.trace(covariance[is_good], axis1=1, axis2=2))))
+        sigma = float(np.median(saddles.sigma_px[saddles.is_good]))
         if channel is channels[0]:
-            fewest, least = int(is_good.sum()), _CLEARER * sigma
+            fewest, least = n_good, _CLEARER * sigma
         elif sigma < least:
             clearest, least = channel, sigma
     return clearest
@@ -555,19 +425,67 @@ def _measured(grey: RawGrey, target: Chessboard, numbered: NumberedCorners) -> _
     within = np.isfinite(start + step_x + step_y).all(axis=1)
     within &= ((start > 1.0) & (start < size - 2.0)).all(axis=1)
     cells, start, step_x, step_y = every[within], start[within], step_x[within], step_y[within]
-    corners, covariance, is_good = fit_saddles(grey, start, step_x, step_y)
-    is_good &= _has_squares_around(grey, target, cells, corners, (step_x, step_y))
-    sigma = np.sqrt(0.5 * np.trace(covariance, axis1=1, axis2=2))
+    steps = step_x, step_y
+    saddles = fit_board_saddles(grey, cells, start, steps)
+    is_good = _has_squares_around(grey, target, cells, saddles.points_px, steps)
+    is_good &= saddles.is_good
+    lattice = _lattice(grey, cells, saddles._replace(is_good=is_good), steps)
     scatter = float("inf")
-    step = float(np.median(np.minimum(np.hypot(*step_x.T), np.hypot(*step_y.T))))
-    if is_good.sum() >= 4:
-        good = np.flatnonzero(is_good)
-        board = cells[good].astype(np.float64)
-        is_off, scatter = off_lattice(
-            board, corners[good], sigma[good], PRINT_ERROR * step, (int(size[0]), int(size[1]))
-        )
-        is_good[good[is_off]] = False
-    return _Corners(cells, corners, covariance, is_good, scatter, step)
+    if lattice is not None:
+        scatter = lattice.scatter_px
+        is_good[np.flatnonzero(is_good)[lattice.is_off]] = False
+    return _Corners(cells, saddles._replace(is_good=is_good), scatter, _typical_step(steps))
+
+
+def fit_board_saddles(
+    grey: RawGrey,
+    cells: IntArray,
+    corners_px: FloatArray,
+    steps_px: Steps,
+    clear_cells: float = 1.0,
+) -> Saddles:
+    """Refine the corners of one board, whose edges bend as the lattice that they make.
+
+    ``grey``, ``corners_px``, ``steps_px``: As of `fit_saddles`. ``cells``: (N, 2) column and row.
+    ``clear_cells``: How far along a row a step goes, as of ``steps_px``.
+    """
+    saddles = fit_saddles(grey, corners_px, *steps_px)
+    lattice = _lattice(grey, cells, saddles, steps_px)
+    if lattice is None:
+        return saddles
+    board = cells.astype(np.float64)
+    curvature = np.nan_to_num(lattice.curvature(board))
+    radius = window_radius(*steps_px)
+    arc_px = 0.5 * radius * radius * np.abs(curvature).max(axis=1)
+    is_bent = (arc_px > _BENT_SIGMAS * saddles.sigma_px) & saddles.is_good
+    if is_bent.sum() <= _FEW_BENT * saddles.is_good.sum():
+        return saddles
+    # where the search missed one, local predictions lie up to 40 px off before a fisheye
+    steps = clear_cells * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    seen, ahead, below = (lattice.seen(board + step) for step in steps)
+    is_seen = np.isfinite(seen + ahead + below).all(axis=1, keepdims=True)
+    lost = np.where(is_seen, seen, corners_px)
+    start = np.where(saddles.is_good[:, None], saddles.points_px, lost)
+    along_x = np.where(is_seen, ahead - seen, steps_px[0])
+    along_y = np.where(is_seen, below - seen, steps_px[1])
+    return fit_saddles(grey, start, along_x, along_y, curvature)
+
+
+def _lattice(
+    grey: RawGrey, cells: IntArray, saddles: Saddles, steps_px: Steps
+) -> SmoothLattice | None:
+    """The lattice of the good corners (M,); none where they are too few."""
+    good = saddles.is_good
+    if good.sum() < _FEWEST_FOR_LATTICE:
+        return None
+    board, size_px = cells[good].astype(np.float64), (grey.shape[1], grey.shape[0])
+    tolerance = PRINT_ERROR * _typical_step(steps_px)
+    points, sigma = saddles.points_px[good], saddles.sigma_px[good]
+    return fit_lattice(board, points, sigma, tolerance, size_px)
+
+
+def _typical_step(steps_px: Steps) -> float:
+    return float(np.median(np.min([np.hypot(*way.T) for way in steps_px], axis=0)))
 
 
 def _has_squares_around(
@@ -575,7 +493,7 @@ def _has_squares_around(
     target: Chessboard,
     cells: IntArray,
     corners_px: FloatArray,
-    steps_px: tuple[FloatArray, FloatArray],
+    steps_px: Steps,
 ) -> BoolArray:
     """(N,) False for corners of the outermost rows whose squares end within reach of the fit.
 
@@ -598,10 +516,10 @@ def _has_squares_around(
 
 
 def _refusal(exposure: Exposure, target: Chessboard, corners: _Corners) -> FitFailure | None:
-    n_good, n_all = int(corners.is_good.sum()), target.columns * target.rows
+    n_good, n_all = int(corners.saddles.is_good.sum()), target.columns * target.rows
     last = (target.columns - 1, target.rows - 1)
     is_inner = ((corners.cells > 0) & (corners.cells < last)).all(axis=1)
-    inner = corners.is_good[is_inner]
+    inner = corners.saddles.is_good[is_inner]
     n_inner = max(LEAST_JUDGED, MIN_SEEN_FRACTION * (last[0] - 1) * (last[1] - 1))
     is_inside = len(inner) >= n_inner and inner.mean() >= MIN_GOOD_FRACTION
     least = max(MIN_SEEN_FRACTION * n_all, MIN_GOOD_FRACTION * len(corners.cells))

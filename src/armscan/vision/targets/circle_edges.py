@@ -15,7 +15,7 @@ import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA
-from armscan.kernels.circle_edges import fit_sectors, order_by_sector
+from armscan.kernels.target_edges import fit_sectors, order_by_sector
 from armscan.vision.targets.ellipse import BandPixels, Ellipses, Rims, band_pixels, fit_ellipses
 from armscan.vision.targets.saddle import APERTURE_SIGMA_PX, RawGrey
 

@@ -9,17 +9,31 @@ From a corner of a chessboard four edges run to its four neighbours, and each ne
 and dark sectors swapped. Crossings that are the nearest such neighbours of each other are linked;
 what hangs together is a lattice. Cells in which no crossing was found (a light stripe, a
 reflection, a finger) are bridged by a homography of the cells around them.
+
+A flat board seen through any lens is a homography followed by a smooth field: a polynomial of third
+degree over the image holds distortion and a bow. A corner that a light stripe or a shadow pulled
+lies off it by many times the scatter of the rest.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats
+from armscan.geometry.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    apply_homography,
+    floats,
+    homogeneous,
+)
+from armscan.models.camera import FISHEYE_FOCALS, CameraModel
 from armscan.vision.targets.saddle import Grey32
 
 _BLUR_PX = 1.2
@@ -463,3 +477,208 @@ def _is_alike(
         & (np.abs(_half_turn(falling[found] - like_falling)) < _SAME_EDGE_RAD)
         & (contrast < np.log(_MAX_CONTRAST_RATIO))
     )
+
+
+_OUTLIER_SIGMAS = 6.0
+_TUKEY = 4.7
+_HOMOGRAPHIES, _ROUNDS = 3, 6
+_TRUSTED = 0.1
+"""Least weight with which a point helps to fix the homography."""
+_POINTS_PER_TERM = 3.0
+"""Fewest points per term of the polynomial; fewer let it follow a single corner."""
+
+
+_MUCH_BETTER = 0.5
+"""Of what a board misses a homography by: below it, it is seen through a fisheye."""
+_ARC_CELLS = 0.25
+"""How far to both sides of a corner points tell the curvature of its edges."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothLattice:
+    """What N corners of a board agree on: a flat board before a lens, and a smooth field about it.
+
+    ``lens``: none is a pinhole without distortion. ``is_off``: (N,) True for corners that are off
+    it. ``scatter_px``: Robust standard deviation, per axis, of the rest; infinite if there is no
+    homography.
+    """
+
+    homography: FloatArray
+    lens: CameraModel | None
+    field: _Field | None
+    is_off: BoolArray
+    scatter_px: float
+
+    def seen(self, board: FloatArray) -> FloatArray:
+        """Image points (M, 2) of places (M, 2) on the board."""
+        flat = _through(self.homography, board, self.lens)
+        return flat if self.field is None else flat + self.field.at(flat)
+
+    def curvature(self, board: FloatArray) -> FloatArray:
+        """Curvature (M, 2), 1/px, of the board's lines along x and along y, as of `fit_saddles`."""
+        curvature = np.zeros((len(board), 2))
+        for axis, step in enumerate(_ARC_CELLS * np.eye(2)):
+            before, at, after = (self.seen(board + k * step) for k in (-1.0, 0.0, 1.0))
+            slope, bend = 0.5 * (after - before), after - 2.0 * at + before
+            turn = slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]
+            curvature[:, axis] = turn / np.hypot(slope[:, 0], slope[:, 1]) ** 3
+        return curvature
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Field:
+    """Shift of image points as a polynomial over the image: coefficients (P, 2)."""
+
+    middle_px: FloatArray
+    half_px: FloatArray
+    coefficients: FloatArray
+
+    def at(self, image: FloatArray) -> FloatArray:
+        return _terms(image, self.middle_px, self.half_px, len(self.coefficients)) @ (
+            self.coefficients
+        )
+
+
+def fit_lattice(
+    board: FloatArray,
+    points_px: FloatArray,
+    least_sigma_px: FloatArray,
+    tolerance_px: float,
+    size_px: tuple[int, int],
+) -> SmoothLattice | None:
+    """Find the lattice that N corners make, and which of them are off it.
+
+    ``board``: (N, 2) places on the board, cells. ``points_px``: (N, 2) image points.
+    ``least_sigma_px``: (N,) their standard deviations; the scatter found is not taken to be
+    smaller. ``tolerance_px``: What a print's own errors may be; corners that are off by less stay,
+    and a field as large asks for a fisheye. ``size_px``: Width and height of the image.
+
+    Returns None where no homography maps the board.
+    """
+    plain = _smooth(board, points_px, least_sigma_px, tolerance_px, None)
+    if plain is None or plain.field is None:
+        return plain
+    shift = plain.field.at(plain.seen(board))
+    is_bent = float(np.sqrt((shift**2).mean())) > tolerance_px
+    if not plain.is_off.any() and plain.scatter_px <= tolerance_px and not is_bent:
+        return plain
+    lens = _fisheye_before(board, points_px, size_px)
+    if lens is None:
+        return plain
+    wide = _smooth(board, points_px, least_sigma_px, tolerance_px, lens)
+    if wide is None:
+        return plain
+    is_better = wide.scatter_px < _MUCH_BETTER * plain.scatter_px
+    return wide if is_better or wide.is_off.sum() < plain.is_off.sum() else plain
+
+
+def _fisheye_before(
+    board: FloatArray, points_px: FloatArray, size_px: tuple[int, int]
+) -> CameraModel | None:
+    """An equidistant lens before which a flat board fits; None if it does hardly better so."""
+    every = np.ones(len(board), dtype=np.bool_)
+    flat = _homography(board, points_px, every, None)
+    if flat is None:
+        return None
+    missed = np.hypot(*(_through(flat, board, None) - points_px).T)
+    best, least = None, _MUCH_BETTER * float(np.median(missed))
+    middle = 0.5 * (np.array(size_px) - 1.0)
+    for focal in FISHEYE_FOCALS * max(size_px):
+        lens = CameraModel.from_parameters([focal, focal, *middle, *[0.0] * 5], *size_px, "fisheye")
+        homography = _homography(board, points_px, every, lens)
+        if homography is None:
+            continue
+        missed = np.hypot(*(_through(homography, board, lens) - points_px).T)
+        if (median := float(np.median(missed))) < least:
+            best, least = lens, median
+    return best
+
+
+def _homography(
+    board: FloatArray, points_px: FloatArray, trusted: BoolArray, lens: CameraModel | None
+) -> FloatArray | None:
+    """From the board to X/Z before a lens, or to a pinhole's pixels, by trusted points."""
+    if lens is None:
+        homography, _ = cv2.findHomography(board[trusted], points_px[trusted], 0)
+        return None if homography is None else np.asarray(homography)
+    xy, is_valid = lens.undistort(points_px)
+    if not is_valid.all():
+        return None
+    # a pixel is worth the less of X/Z the farther from the axis
+    weight = 1.0 / (1.0 + np.sum(xy[trusted] ** 2, axis=1))
+    return _weighted_homography(board[trusted], xy[trusted], weight)
+
+
+def _through(homography: FloatArray, board: FloatArray, lens: CameraModel | None) -> FloatArray:
+    """Image points (N, 2) of a flat board before a lens or a pinhole."""
+    mapped = apply_homography(homography, board)
+    return mapped if lens is None else lens.project(homogeneous(mapped))
+
+
+def _weighted_homography(board: FloatArray, xy: FloatArray, weight: FloatArray) -> FloatArray:
+    middle, scale = board.mean(axis=0), max(float(np.ptp(board)), 1e-9)
+    to_unit = np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, scale]]) / scale
+    rows = homogeneous((board - middle) / scale) * weight[:, None]
+    none = np.zeros_like(rows)
+    design = np.concatenate(
+        [
+            np.concatenate([rows, none, -xy[:, :1] * rows], axis=1),
+            np.concatenate([none, rows, -xy[:, 1:] * rows], axis=1),
+        ]
+    )
+    return np.asarray(np.linalg.svd(design)[2][-1].reshape(3, 3) @ to_unit)
+
+
+def _smooth(
+    board: FloatArray,
+    points_px: FloatArray,
+    least_sigma_px: FloatArray,
+    tolerance_px: float,
+    lens: CameraModel | None,
+) -> SmoothLattice | None:
+    """As `fit_lattice`, before one lens: a flat board and a smooth field about it."""
+    weights = np.ones(len(board))
+    lattice: SmoothLattice | None = None
+    for _ in range(_HOMOGRAPHIES):
+        trusted = weights > _TRUSTED
+        homography = _homography(board, points_px, trusted, lens) if trusted.sum() >= 4 else None
+        if homography is None:
+            break
+        mapped = _through(homography, board, lens)
+        middle, half = 0.5 * (mapped.min(axis=0) + mapped.max(axis=0)), 0.5 * np.ptp(mapped, axis=0)
+        half = np.maximum(half, 1e-9)
+        terms = _terms(mapped, middle, half, _n_terms(len(mapped)))
+        for _ in range(_ROUNDS):
+            shift, missed = _without_itself(terms, points_px - mapped, weights)
+            size = np.hypot(*missed.T)
+            # The median length of a two-dimensional normal is 1.18 sigma.
+            scatter = np.maximum(np.median(size) / 1.1774, least_sigma_px)
+            weights = np.clip(1.0 - (size / (_TUKEY * 1.5 * scatter)) ** 2, 1e-3, None) ** 2
+        is_off = size > np.maximum(_OUTLIER_SIGMAS * scatter, tolerance_px)
+        scatter_px = float(np.median(size) / 1.1774)
+        lattice = SmoothLattice(homography, lens, _Field(middle, half, shift), is_off, scatter_px)
+    return lattice
+
+
+def _without_itself(
+    terms: FloatArray, residual: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (P, 2) of the smooth field, and how far (N, 2) from it without that point."""
+    root = np.sqrt(weights)[:, None]
+    q, r = np.linalg.qr(terms * root)
+    along = q.T @ (residual * root)
+    leverage = np.einsum("np,np->n", q, q)
+    missed = (residual - q @ along / root) / np.maximum(1.0 - leverage, 0.05)[:, None]
+    return np.linalg.solve(r, along), np.asarray(missed)
+
+
+def _n_terms(n_points: int) -> int:
+    """Terms of the polynomial that so many points can bear."""
+    return next((n for n in (10, 6, 3) if n_points >= _POINTS_PER_TERM * n), 1)
+
+
+def _terms(image: FloatArray, middle_px: FloatArray, half_px: FloatArray, n: int) -> FloatArray:
+    """The first polynomial terms (N, n) over the image."""
+    x, y = ((image - middle_px) / half_px).T
+    terms = [np.ones_like(x), x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
+    return np.stack(terms[:n], axis=-1)

@@ -18,13 +18,12 @@ from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, apply_homog
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.chessboard import detect_chessboard
+from armscan.vision.targets.chessboard import Steps, detect_chessboard, fit_board_saddles
 from armscan.vision.targets.circle_grid import detect_circle_grid
 from armscan.vision.targets.saddle import (
     WINDOW_FRACTION,
     Grey8,
     RawGrey,
-    fit_saddles,
     grey_channels,
     to_grey8,
 )
@@ -174,9 +173,13 @@ def _corners(
     if ids is not None and len(ids) >= MIN_CORNERS:
         index = np.asarray(ids, dtype=np.int64).ravel()
         rough_px = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-        steps = _steps(board, index, rough_px)
+        clear_cells = _clear_cells(board)
+        steps = _steps(board, index, rough_px, clear_cells * board.square_mm)
         if steps is not None:
-            refined, covariance, is_good = fit_saddles(raw, rough_px, *steps)
+            row, column = np.divmod(index, board.columns - 1)
+            cells = np.stack([column, row], axis=-1)
+            saddles = fit_board_saddles(raw, cells, rough_px, steps, clear_cells)
+            refined, covariance, is_good = saddles
             n_corners = int(is_good.sum())
             if n_corners >= MIN_CORNERS:
                 found, number = refined[is_good], index[is_good]
@@ -188,17 +191,21 @@ def _corners(
     )
 
 
+def _clear_cells(target: Charuco) -> float:
+    """Part of a square, such that the fit of a corner reaches no marker."""
+    gap_mm = (target.square_mm - target.marker_mm) / np.sqrt(2.0)
+    return float(min(1.0, _CLEARANCE * gap_mm / (WINDOW_FRACTION * target.square_mm)))
+
+
 def _steps(
-    target: Charuco, index: IntArray, rough_px: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Way (N, 2) along x and y in which nothing but the two edges of a corner is seen."""
+    target: Charuco, index: IntArray, rough_px: FloatArray, length_mm: float
+) -> Steps | None:
+    """Way (N, 2) along x and y of a length on the board."""
     board: FloatArray = target.points_board_mm[index, :2]
     found, _ = cv2.findHomography(board, rough_px, cv2.RANSAC, 3.0)
     if found is None:
         return None
     homography = np.asarray(found, dtype=np.float64)
-    gap_mm = (target.square_mm - target.marker_mm) / np.sqrt(2.0)
-    length_mm = min(target.square_mm, _CLEARANCE * gap_mm / WINDOW_FRACTION)
     centre = apply_homography(homography, board)
     along_x = apply_homography(homography, board + np.array([length_mm, 0.0])) - centre
     along_y = apply_homography(homography, board + np.array([0.0, length_mm])) - centre

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats
-from armscan.kernels.circle_edges import collect_band, fit_conics
+from armscan.kernels.target_edges import collect_band, fit_conics
 from armscan.vision.targets.saddle import RawGrey
 
 _STEPS = 12

@@ -5,12 +5,15 @@ exposure in which a target may show, the likeliest first.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA
+from armscan.kernels.target_edges import CROSSING, fit_crossings
 from armscan.records.exposure import Exposure
 
 MIN_CONTRAST = 0.02
@@ -99,33 +102,53 @@ _LEAST_RESIDUAL = 0.3
 _AT_REST_PX = 1e-4
 """A fiftieth of the smallest standard deviation of a corner."""
 _OUTLIER_SIGMAS = 4.0
-_PARAMETERS = 9
+
+
+class Saddles(NamedTuple):
+    """Fitted corners.
+
+    ``points_px``: (N, 2) image pixels. ``covariance_px2``: (N, 2, 2) from the pixel noise that the
+    fit's residuals show. ``is_good``: (N,) False where the fit left its window, found no crossing
+    of two edges, or leaves residuals that other corners of the board do not have.
+    """
+
+    points_px: FloatArray
+    covariance_px2: FloatArray
+    is_good: BoolArray
+
+    @property
+    def sigma_px(self) -> FloatArray:
+        """(N,) standard deviation along an axis."""
+        return np.asarray(np.sqrt(0.5 * np.trace(self.covariance_px2, axis1=1, axis2=2)))
 
 
 def fit_saddles(
-    grey: RawGrey, corners_px: FloatArray, step_x_px: FloatArray, step_y_px: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+    grey: RawGrey,
+    corners_px: FloatArray,
+    step_x_px: FloatArray,
+    step_y_px: FloatArray,
+    curvature_1_px: FloatArray | None = None,
+) -> Saddles:
     """Refine chessboard corners.
 
     ``grey``: (H, W) image, raw levels. ``corners_px``: (N, 2) corners to about 2 px, image pixels.
     ``step_x_px``, ``step_y_px``: (N, 2) way to the next corner along the board's x and y.
-
-    Returns ``corners_px``: (N, 2) refined corners. ``covariance_px2``: (N, 2, 2) covariance from
-    the pixel noise that the fit's residuals show. ``is_good``: (N,) False where the fit left its
-    window, found no crossing of two edges, or leaves residuals that other corners of the board do
-    not have.
+    ``curvature_1_px``: (N, 2) curvature of the edges along x and along y, 1/px, positive where
+    they turn from u towards v on that way; straight without it.
     """
-    radius = _window_radius(step_x_px, step_y_px)
+    radius = window_radius(step_x_px, step_y_px)
     origin = np.rint(corners_px)
     levels, offsets, weights = _windows(grey, origin, radius)
     start = _initial(levels, offsets, weights, (corners_px - origin, step_x_px, step_y_px))
-    parameters = _iterate(levels, offsets, weights, start)
-    weights = _without_outliers(_model(levels, offsets, parameters)[0], weights)
-    parameters = _iterate(levels, offsets, weights, parameters)
-    residuals, jacobian = _model(levels, offsets, parameters)
+    # the first edge runs along y, the second along x
+    bends = np.zeros((len(start), 2))
+    if curvature_1_px is not None:
+        bends[:] = curvature_1_px[:, ::-1]
+    parameters, residuals, _ = _fit(levels, offsets, weights, start, bends)
+    weights = _without_outliers(residuals, weights)
+    parameters, residuals, inverse = _fit(levels, offsets, weights, parameters, bends)
     variance = _variance(residuals, weights)
-    normal = (jacobian * weights[:, :, None]).transpose(0, 2, 1) @ jacobian
-    inverse = _inverse(normal) * variance[:, None, None]
+    inverse *= variance[:, None, None]
     covariance = inverse[:, :2, :2]
     contrast = np.abs(parameters[:, 6])
     moved = np.hypot(*(parameters[:, :2] - (corners_px - origin)).T)
@@ -138,10 +161,11 @@ def fit_saddles(
     is_good &= contrast > _MIN_SIGNIFICANCE * np.sqrt(inverse[:, 6, 6])
     is_good &= contrast > _MIN_CONTRAST_RATIO * np.median(contrast)
     is_good &= ~_is_disturbed(np.sqrt(variance), contrast, is_good)
-    return origin + parameters[:, :2], covariance, is_good
+    return Saddles(origin + parameters[:, :2], covariance, is_good)
 
 
-def _window_radius(step_x_px: FloatArray, step_y_px: FloatArray) -> FloatArray:
+def window_radius(step_x_px: FloatArray, step_y_px: FloatArray) -> FloatArray:
+    """Radius (N,) px in which nothing but the two edges of a corner is seen."""
     area = np.abs(step_x_px[:, 0] * step_y_px[:, 1] - step_x_px[:, 1] * step_y_px[:, 0])
     longest = np.maximum(np.hypot(*step_x_px.T), np.hypot(*step_y_px.T))
     radius: FloatArray = WINDOW_FRACTION * area / longest
@@ -173,14 +197,17 @@ def _initial(
 ) -> FloatArray:
     """Start (N, 9): corner, two normals' angles, blur, mean, contrast, gradient."""
     start, step_x_px, step_y_px = lattice
-    parameters = np.zeros((len(levels), _PARAMETERS))
+    parameters = np.zeros((len(levels), CROSSING))
     parameters[:, :2] = start
     parameters[:, 2] = np.arctan2(step_y_px[:, 0], -step_y_px[:, 1])
     parameters[:, 3] = np.arctan2(step_x_px[:, 0], -step_x_px[:, 1])
     parameters[:, 4] = 1.0
     parameters[:, 5] = (levels * weights).sum(axis=1) / np.maximum(weights.sum(axis=1), 1.0)
-    edges = _edges(offsets, parameters)
-    product = edges[0] * edges[1] * weights
+    product = weights.copy()
+    for angle in (parameters[:, 2:3], parameters[:, 3:4]):
+        away = np.cos(angle) * (offsets[:, 0] - parameters[:, :1])
+        away += np.sin(angle) * (offsets[:, 1] - parameters[:, 1:2])
+        product *= erf(away / (np.sqrt(2.0) * parameters[:, 4:5]))
     scale = np.maximum((product * product).sum(axis=1), 1e-9)
     # sectors of skewed edges are unequal: without the level taken off they would decide the sign
     centred = levels - parameters[:, 5:6]
@@ -188,80 +215,25 @@ def _initial(
     return parameters
 
 
-def _edges(offsets: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-    scale = np.sqrt(2.0) * parameters[:, 4:5]
-    du = offsets[:, 0] - parameters[:, :1]
-    dv = offsets[:, 1] - parameters[:, 1:2]
-    first = np.cos(parameters[:, 2:3]) * du + np.sin(parameters[:, 2:3]) * dv
-    second = np.cos(parameters[:, 3:4]) * du + np.sin(parameters[:, 3:4]) * dv
-    return np.asarray(erf(first / scale)), np.asarray(erf(second / scale))
-
-
-def _model(
-    levels: FloatArray, offsets: FloatArray, parameters: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals (N, K), measured minus model, and the model's Jacobian (N, K, 9)."""
-    s, m, c = (parameters[:, k : k + 1] for k in (4, 5, 6))
-    gradient_u, gradient_v = parameters[:, 7:8], parameters[:, 8:9]
-    du = offsets[:, 0] - parameters[:, :1]
-    dv = offsets[:, 1] - parameters[:, 1:2]
-    jacobian = np.zeros((*levels.shape, _PARAMETERS))
-    edges, slopes = [], []
-    for angle in (parameters[:, 2:3], parameters[:, 3:4]):
-        d = np.cos(angle) * du + np.sin(angle) * dv
-        edges.append(erf(d / (np.sqrt(2.0) * s)))
-        slopes.append(np.sqrt(2.0 / np.pi) / s * np.exp(-0.5 * (d / s) ** 2))
-    for k, angle in enumerate((parameters[:, 2:3], parameters[:, 3:4])):
-        slope = c * slopes[k] * edges[1 - k]
-        d = np.cos(angle) * du + np.sin(angle) * dv
-        jacobian[..., 0] -= slope * np.cos(angle)
-        jacobian[..., 1] -= slope * np.sin(angle)
-        jacobian[..., 2 + k] = slope * (np.cos(angle) * dv - np.sin(angle) * du)
-        jacobian[..., 4] -= slope * d / s
-    jacobian[..., 0] -= gradient_u
-    jacobian[..., 1] -= gradient_v
-    jacobian[..., 5] = 1.0
-    jacobian[..., 6] = edges[0] * edges[1]
-    jacobian[..., 7] = du
-    jacobian[..., 8] = dv
-    model = m + c * edges[0] * edges[1] + gradient_u * du + gradient_v * dv
-    return levels - model, jacobian
-
-
-def _iterate(
-    levels: FloatArray, offsets: FloatArray, weights: FloatArray, parameters: FloatArray
-) -> FloatArray:
-    """Levenberg-Marquardt on all corners at once; each keeps its own damping until it rests."""
-    parameters = parameters.copy()
-    active = np.arange(len(levels))
-    damping = np.full(len(levels), 1e-3)
-    residuals, jacobian = _model(levels, offsets, parameters)
-    cost = (weights * residuals**2).sum(axis=1)
-    diagonal = np.arange(_PARAMETERS)
-    for _ in range(_STEPS):
-        weighted = (jacobian * weights[active, :, None]).transpose(0, 2, 1)
-        normal = weighted @ jacobian
-        normal[:, diagonal, diagonal] *= 1.0 + damping[:, None]
-        rhs = (weighted @ residuals[:, :, None])[:, :, 0]
-        step = np.einsum("nij,nj->ni", _inverse(normal), rhs)
-        trial = parameters[active] + step
-        trial[:, 4] = np.clip(trial[:, 4], APERTURE_SIGMA_PX, 3.0 * MAX_WINDOW_PX)
-        new_residuals, new_jacobian = _model(levels[active], offsets, trial)
-        new_cost = (weights[active] * new_residuals**2).sum(axis=1)
-        better = new_cost <= cost
-        parameters[active[better]], cost[better] = trial[better], new_cost[better]
-        residuals[better], jacobian[better] = new_residuals[better], new_jacobian[better]
-        damping = np.where(better, 0.2 * damping, 10.0 * damping)
-        moving = np.abs(step[:, :2]).max(axis=1) >= _AT_REST_PX
-        if not moving.any():
-            break
-        active, damping, cost = active[moving], damping[moving], cost[moving]
-        residuals, jacobian = residuals[moving], jacobian[moving]
-    return parameters
+def _fit(
+    levels: FloatArray,
+    offsets: FloatArray,
+    weights: FloatArray,
+    start: FloatArray,
+    bends: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Corners (N, 9), residuals (N, K), inverse normal equations (N, 9, 9)."""
+    corners, residuals = start.copy(), np.zeros_like(levels)
+    inverses = np.zeros((len(levels), CROSSING * CROSSING))
+    blurs = APERTURE_SIGMA_PX, 3.0 * MAX_WINDOW_PX
+    fit_crossings(
+        levels, offsets, weights, bends, blurs, _STEPS, _AT_REST_PX, corners, residuals, inverses
+    )
+    return corners, residuals, inverses.reshape(-1, CROSSING, CROSSING)
 
 
 def _variance(residuals: FloatArray, weights: FloatArray) -> FloatArray:
-    freedom = np.maximum(weights.sum(axis=1) - _PARAMETERS, 1.0)
+    freedom = np.maximum(weights.sum(axis=1) - CROSSING, 1.0)
     return np.asarray((weights * residuals**2).sum(axis=1) / freedom)
 
 
@@ -287,12 +259,3 @@ def _without_outliers(residuals: FloatArray, weights: FloatArray) -> FloatArray:
     sigma = MAD_TO_SIGMA * np.nanmedian(size, axis=1)
     kept = np.abs(residuals) <= _OUTLIER_SIGMAS * np.maximum(sigma, 0.3)[:, None]
     return np.asarray(weights * kept)
-
-
-def _inverse(normal: FloatArray) -> FloatArray:
-    """Inverse of (N, P, P) matrices, ridged where they are singular."""
-    diagonal = np.einsum("nii->ni", normal)
-    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-12))
-    scaled = normal * scale[:, :, None] * scale[:, None, :]
-    scaled = scaled + 1e-10 * np.eye(normal.shape[1])
-    return np.asarray(np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :])

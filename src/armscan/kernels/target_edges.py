@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edges of circles: pixels along an ellipse's rim, edge profiles in sectors, conics by Sampson
-distance. What the sums mean is told where they are used, in `armscan.vision.targets`.
+"""Edges of printed targets: pixels along an ellipse's rim, edge profiles in sectors, conics by
+Sampson distance, and corners where two edges cross. What the sums mean is told where they are used,
+in `armscan.vision.targets`.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ import math
 import numpy as np
 
 from armscan.kernels.arrays import (
+    FUSED,
     Floats,
     FloatsOut,
     Ints,
     IntsOut,
     Table,
     TableOut,
+    Two,
     compiled,
 )
 
@@ -162,6 +165,20 @@ SUMS = 14
 
 
 @compiled(error_model="numpy", fastmath=True)
+def normal_at(z: float) -> Two:
+    """Normal distribution and density, within `_FARTHEST`."""
+    node = int((z + _FARTHEST) * _NODES_PER_SIGMA + 0.5)
+    node = min(max(node, 0), len(_NORMAL) - 1)
+    at = node * _NODE_SIGMAS - _FARTHEST
+    t = z - at
+    share = _NORMAL[node, 0] + _NORMAL[node, 1] * t * (
+        1.0 + t * (-0.5 * at + t * ((at * at - 1.0) * _SIXTH))
+    )
+    a = -t * (at + 0.5 * t)
+    return share, _NORMAL[node, 1] * (1.0 + a * (1.0 + a * (0.5 + a * _SIXTH)))
+
+
+@compiled(error_model="numpy", fastmath=True)
 def sector_sums(
     pixels: Table, first: int, last: int, sector: Floats, blur: float, sums: FloatsOut
 ) -> float:
@@ -178,15 +195,7 @@ def sector_sums(
     per_blur, steepest = 1.0 / blur, contrast / blur
     for k in range(first, last):
         z = min(max((pixels[1, k] - shift) * per_blur, -_FARTHEST), _FARTHEST)
-        node = int((z + _FARTHEST) * _NODES_PER_SIGMA + 0.5)
-        node = min(max(node, 0), len(_NORMAL) - 1)
-        at = node * _NODE_SIGMAS - _FARTHEST
-        t = z - at
-        share = _NORMAL[node, 0] + _NORMAL[node, 1] * t * (
-            1.0 + t * (-0.5 * at + t * ((at * at - 1.0) * _SIXTH))
-        )
-        a = -t * (at + 0.5 * t)
-        density = _NORMAL[node, 1] * (1.0 + a * (1.0 + a * (0.5 + a * _SIXTH)))
+        share, density = normal_at(z)
         slope = steepest * density
         residual = pixels[0, k] - inner - contrast * share
         rest = 1.0 - share
@@ -357,35 +366,36 @@ def sampson_sums(
 def invert_symmetric(matrix: TableOut, inverse: TableOut) -> None:
     """Invert a symmetric matrix from its lower half; a tiny ridge keeps degenerate ones finite.
 
-    ``matrix``: (5, 5), overwritten. ``inverse``: (5, 5) output.
+    ``matrix``: (P, P), overwritten. ``inverse``: (P, P) output.
     """
+    n = matrix.shape[0]
     trace = 0.0
-    for i in range(TERMS):
+    for i in range(n):
         trace += matrix[i, i]
     # to unit diagonal: what is left is the condition that counts
     ridge = 1e-13 * trace + 1e-300
-    for i in range(TERMS):
+    for i in range(n):
         matrix[i, i] += ridge
-    for j in range(TERMS):
+    for j in range(n):
         pivot = matrix[j, j]
         for k in range(j):
             pivot -= matrix[j, k] * matrix[j, k]
         matrix[j, j] = math.sqrt(max(pivot, 1e-16 * trace + 1e-300))
-        for i in range(j + 1, TERMS):
+        for i in range(j + 1, n):
             value = matrix[i, j]
             for k in range(j):
                 value -= matrix[i, k] * matrix[j, k]
             matrix[i, j] = value / matrix[j, j]
-    column = np.zeros(TERMS)
-    for m in range(TERMS):
-        for i in range(TERMS):
+    column = np.zeros(n)
+    for m in range(n):
+        for i in range(n):
             value = 1.0 if i == m else 0.0
             for k in range(i):
                 value -= matrix[i, k] * column[k]
             column[i] = value / matrix[i, i]
-        for i in range(TERMS - 1, -1, -1):
+        for i in range(n - 1, -1, -1):
             value = column[i]
-            for k in range(i + 1, TERMS):
+            for k in range(i + 1, n):
                 value -= matrix[k, i] * column[k]
             column[i] = value / matrix[i, i]
             inverse[i, m] = column[i]
@@ -445,3 +455,168 @@ def fit_conics(
         for i in range(TERMS):
             for j in range(TERMS):
                 covariance[n, i * TERMS + j] = inverse[i, j]
+
+
+CROSSING = 9
+"""Parameters of a corner: place u, v; angles of the normals of two edges; blur sigma, px; mean
+level; contrast; slope of the level along u, v."""
+_BLOCK = 32
+_RIDGE = 1e-10
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def crossing_sums(
+    pixels: Table,
+    n_pixels: int,
+    corner: Floats,
+    bends: Floats,
+    residuals: FloatsOut,
+    normal: TableOut,
+    gradient: FloatsOut,
+) -> float:
+    """Normal equations of one corner's levels; return the squared residuals.
+
+    ``pixels``: (3, K) offsets u, v and levels, the first ``n_pixels`` of them. ``corner``: (9,)
+    parameters. ``bends``: (2,) curvature of each edge towards its normal, 1/px. ``residuals``:
+    (K,) output, measured less model. ``normal``: (9, 9) output, lower half. ``gradient``: (9,)
+    output.
+    """
+    rows = np.zeros((CROSSING + 1, _BLOCK))
+    normal[:] = 0.0
+    gradient[:] = 0.0
+    cos_a, sin_a = math.cos(corner[2]), math.sin(corner[2])
+    cos_b, sin_b = math.cos(corner[3]), math.sin(corner[3])
+    per_blur = 1.0 / corner[4]
+    contrast = corner[6]
+    square = 0.0
+    for first in range(0, n_pixels, _BLOCK):
+        count = min(_BLOCK, n_pixels - first)
+        for k in range(count):
+            du, dv = pixels[0, first + k] - corner[0], pixels[1, first + k] - corner[1]
+            across_a, along_a = cos_a * du + sin_a * dv, cos_a * dv - sin_a * du
+            across_b, along_b = cos_b * du + sin_b * dv, cos_b * dv - sin_b * du
+            turn_a, turn_b = bends[0] * along_a, bends[1] * along_b
+            z_a = (across_a - 0.5 * turn_a * along_a) * per_blur
+            z_b = (across_b - 0.5 * turn_b * along_b) * per_blur
+            share_a, density_a = normal_at(min(max(z_a, -_FARTHEST), _FARTHEST))
+            share_b, density_b = normal_at(min(max(z_b, -_FARTHEST), _FARTHEST))
+            edge_a, edge_b = 2.0 * share_a - 1.0, 2.0 * share_b - 1.0
+            slope_a = 2.0 * contrast * density_a * per_blur * edge_b
+            slope_b = 2.0 * contrast * density_b * per_blur * edge_a
+            rows[0, k] = (
+                -slope_a * (cos_a + turn_a * sin_a) - slope_b * (cos_b + turn_b * sin_b) - corner[7]
+            )
+            rows[1, k] = (
+                -slope_a * (sin_a - turn_a * cos_a) - slope_b * (sin_b - turn_b * cos_b) - corner[8]
+            )
+            rows[2, k] = slope_a * along_a * (1.0 + bends[0] * across_a)
+            rows[3, k] = slope_b * along_b * (1.0 + bends[1] * across_b)
+            rows[4, k] = -slope_a * z_a - slope_b * z_b
+            rows[5, k] = 1.0
+            rows[6, k] = edge_a * edge_b
+            rows[7, k] = du
+            rows[8, k] = dv
+            model = corner[5] + contrast * edge_a * edge_b + corner[7] * du + corner[8] * dv
+            residual = pixels[2, first + k] - model
+            rows[9, k] = residual
+            residuals[first + k] = residual
+            square += residual * residual
+        for i in range(CROSSING):
+            total = 0.0
+            for k in range(count):
+                total += rows[i, k] * rows[CROSSING, k]
+            gradient[i] += total
+            for j in range(i + 1):
+                total = 0.0
+                for k in range(count):
+                    total += rows[i, k] * rows[j, k]
+                normal[i, j] += total
+    return square
+
+
+@compiled(error_model="numpy")
+def invert_scaled(normal: Table, damping: float, work: TableOut, inverse: TableOut) -> None:
+    """Invert normal equations (P, P), their diagonal times ``1 + damping``, to unit diagonal."""
+    n = normal.shape[0]
+    scale = np.zeros(n)
+    for i in range(n):
+        scale[i] = 1.0 / math.sqrt(max(normal[i, i] * (1.0 + damping), 1e-12))
+    for i in range(n):
+        for j in range(i):
+            work[i, j] = normal[i, j] * scale[i] * scale[j]
+        work[i, i] = normal[i, i] * (1.0 + damping) * scale[i] * scale[i] + _RIDGE
+    invert_symmetric(work, inverse)
+    for i in range(n):
+        for j in range(n):
+            inverse[i, j] *= scale[i] * scale[j]
+
+
+@compiled(error_model="numpy")
+def fit_crossings(
+    levels: Table,
+    offsets: Table,
+    weights: Table,
+    bends: Table,
+    blurs: Two,
+    steps: int,
+    at_rest_px: float,
+    corners: TableOut,
+    residuals: TableOut,
+    inverses: TableOut,
+) -> None:
+    """Fit corners where two edges cross by Levenberg and Marquardt's steps.
+
+    ``levels``: (N, K) in the windows. ``offsets``: (K, 2) of their pixels from the middle, px.
+    ``weights``: (N, K); 0 leaves a pixel out. ``bends``: (N, 2) as of `crossing_sums`. ``blurs``:
+    least and most sigma, px. ``steps``: Most steps. ``at_rest_px``: A corner that a step moves by
+    less is done. ``corners``: (N, 9) start and result. ``residuals``: (N, K) output, also of pixels
+    left out. ``inverses``: (N, 81) output, of the normal equations.
+    """
+    n_pixels = levels.shape[1]
+    pixels, left = np.zeros((3, n_pixels)), np.zeros(n_pixels)
+    normal, trial_normal = np.zeros((CROSSING, CROSSING)), np.zeros((CROSSING, CROSSING))
+    work, inverse = np.zeros((CROSSING, CROSSING)), np.zeros((CROSSING, CROSSING))
+    gradient, trial_gradient = np.zeros(CROSSING), np.zeros(CROSSING)
+    corner, trial = np.zeros(CROSSING), np.zeros(CROSSING)
+    for n in range(levels.shape[0]):
+        count = 0
+        for k in range(n_pixels):
+            if weights[n, k] > 0.0:
+                pixels[0, count], pixels[1, count] = offsets[k, 0], offsets[k, 1]
+                pixels[2, count] = levels[n, k]
+                count += 1
+        for i in range(CROSSING):
+            corner[i] = corners[n, i]
+        damping = 1e-3
+        cost = crossing_sums(pixels, count, corner, bends[n], left, normal, gradient)
+        for _ in range(steps):
+            invert_scaled(normal, damping, work, inverse)
+            moved = 0.0
+            for i in range(CROSSING):
+                step = 0.0
+                for j in range(CROSSING):
+                    step += inverse[i, j] * gradient[j]
+                trial[i] = corner[i] + step
+                if i < 2:
+                    moved = max(moved, abs(step))
+            trial[4] = min(max(trial[4], blurs[0]), blurs[1])
+            new = crossing_sums(pixels, count, trial, bends[n], left, trial_normal, trial_gradient)
+            if new <= cost:
+                cost = new
+                for i in range(CROSSING):
+                    corner[i], gradient[i] = trial[i], trial_gradient[i]
+                    for j in range(CROSSING):
+                        normal[i, j] = trial_normal[i, j]
+                damping *= 0.2
+            else:
+                damping *= 10.0
+            if moved < at_rest_px:
+                break
+        invert_scaled(normal, 0.0, work, inverse)
+        for i in range(CROSSING):
+            corners[n, i] = corner[i]
+            for j in range(CROSSING):
+                inverses[n, i * CROSSING + j] = inverse[i, j]
+        for k in range(n_pixels):
+            pixels[0, k], pixels[1, k], pixels[2, k] = offsets[k, 0], offsets[k, 1], levels[n, k]
+        crossing_sums(pixels, n_pixels, corner, bends[n], residuals[n], trial_normal, gradient)

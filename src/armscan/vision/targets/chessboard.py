@@ -98,42 +98,55 @@ class Extent:
         return is_filled and "continues" not in self.sides
 
     @property
+    def n_ends(self) -> int:
+        """Sides on which the board is seen to end."""
+        return sum(side == "ends" for side in self.sides)
+
+    @property
     def counts(self) -> tuple[int, int]:
         """Counts along a and b, with one more for a side on which the board goes on."""
         more = [side == "continues" for side in self.sides]
         return self.size[0] + more[0] + more[1], self.size[1] + more[2] + more[3]
 
 
-def extents(grey: Grey32, crossings: Crossings, lattice: Lattice) -> Iterator[Extent]:
-    """Yield the rectangle of a lattice, then those without its sparse outermost rows.
+def extents(grey: Grey32, crossings: Crossings, lattice: Lattice) -> list[Extent]:
+    """Return the rectangle of a lattice, then those without its sparse outermost rows.
+
+    Not with a row before which a whole board is seen to end: it is of a frame or of what lies
+    behind, even if a count that is wrong by one asks for it.
 
     ``grey``: (H, W) levels of the image in which the crossings were found. ``crossings``: All of
     the image. ``lattice``: Those that make a lattice.
     """
     cells, index = cell_arrays(lattice)
+    found: list[Extent] = []
+    left_out: int | None = None
     while len(cells) and (np.ptp(cells, axis=0) + 1).min() >= SMALLEST:
         low = cells.min(axis=0)
         size = np.ptp(cells, axis=0) + 1
         placed = cells - low
         points = crossings.points_px[index]
         sides = _sides(grey, placed, points, size)
-        yield Extent(placed, points, (int(size[0]), int(size[1])), sides)
-        kept = _without_sparsest(placed, size)
-        if kept is None:
-            return
-        cells, index = cells[kept], index[kept]
+        extent = Extent(placed, points, (int(size[0]), int(size[1])), sides)
+        if left_out is not None and extent.is_whole and sides[left_out] == "ends":
+            found.clear()
+        found.append(extent)
+        fraction, axis, end = _sparsest(placed, size)
+        if fraction >= _MIN_FILLED:
+            break
+        kept = np.flatnonzero(placed[:, axis] != end)
+        cells, index, left_out = cells[kept], index[kept], 2 * axis + (end > 0)
+    return found
 
 
-def _without_sparsest(cells: IntArray, size: IntArray) -> IntArray | None:
-    """Rows of ``cells`` that remain without the emptiest outermost row; None if all are full."""
-    filled = [
+def _sparsest(cells: IntArray, size: IntArray) -> tuple[float, int, int]:
+    """Filled fraction, axis and number of the emptiest outermost row."""
+    return min(
         (float(np.mean(np.isin(np.arange(size[1 - axis]), cells[on, 1 - axis]))), axis, end)
         for axis in (0, 1)
         for end in (0, int(size[axis]) - 1)
         for on in (cells[:, axis] == end,)
-    ]
-    fraction, axis, end = min(filled)
-    return None if fraction >= _MIN_FILLED else np.flatnonzero(cells[:, axis] != end)
+    )
 
 
 def _sides(
@@ -269,6 +282,12 @@ _BENT_SIGMAS, _FEW_BENT = 0.5, 0.1
 """An arc's height within reach of a corner's fit, in its sigmas (a third of it is the error of a
 straight edge), and the share of corners that may have more."""
 _FEWEST_FOR_LATTICE = 4
+_SURE_ENDS = 2
+_LOCAL = 1.0 / 50.0
+"""Standard deviation of the weights of a local mean, of the image's longer side."""
+_LEAST_SCATTER, _PRINTED = 0.25, 0.7
+"""Scatter, of the least contrast, that is taken for noise; contrast, of the local scatter, that is
+taken for print: dark and light squares make 2."""
 _MANY_BAD, _FEW_BAD = 0.5, 0.95
 """With fewer of its corners measured this is no board, with more no other channel is needed."""
 _MAX_TRIED = 2
@@ -300,8 +319,12 @@ def detect_chessboard(exposure: Exposure, target: Chessboard) -> TargetView | Fi
     min_contrast = MIN_CONTRAST * exposure.full_scale
     why: FitFailure | None = None
     seen: list[Extent] = []
-    for k, grey in enumerate(channels):
-        others = channels[:k] + channels[k + 1 :]
+    for k in range(len(channels) + 1):
+        if k == len(channels):
+            if why is not None or any(_is_board(extent) for extent in seen):
+                break
+            channels.append(_levelled(channels[0], min_contrast))
+        grey, others = channels[k], channels[:k] + channels[k + 1 :]
         for numbered in _numbered(grey, target, min_contrast, seen):
             corners = _best_measured(grey, others, target, numbered)
             refusal = _refusal(exposure, target, corners)
@@ -312,6 +335,19 @@ def detect_chessboard(exposure: Exposure, target: Chessboard) -> TargetView | Fi
                 return TargetView.of_image(exposure, target, number, found, covariance)
             why = refusal if why is None else why
     return _not_found(exposure, target, seen) if why is None else why
+
+
+def _levelled(grey: RawGrey, min_contrast: float) -> RawGrey:
+    """The image less its local mean, over its local scatter: what is printed, however lit.
+
+    Squares before a thermal camera differ by little, on a board that is warm in its middle.
+    """
+    levels = np.ascontiguousarray(grey, dtype=np.float32)
+    sigma = _LOCAL * max(levels.shape)
+    away = levels - cv2.GaussianBlur(levels, (0, 0), sigma)
+    least = _LEAST_SCATTER * min_contrast
+    scatter = np.sqrt(cv2.GaussianBlur(away * away, (0, 0), sigma) + least * least)
+    return np.asarray(away / scatter * (min_contrast / _PRINTED), dtype=np.float64)
 
 
 def _numbered(
@@ -538,9 +574,14 @@ def _refusal(exposure: Exposure, target: Chessboard, corners: _Corners) -> FitFa
     return None
 
 
+def _is_board(extent: Extent) -> bool:
+    """Tell whether a rectangle is surely a board: clutter may alternate, but does not end."""
+    return extent.is_whole and extent.n_ends >= _SURE_ENDS
+
+
 def _not_found(exposure: Exposure, target: Chessboard, extents_seen: list[Extent]) -> FitFailure:
     wanted = f"{target.columns} x {target.rows}"
-    seen = max(extents_seen, key=lambda e: (e.is_whole, len(e.cells)), default=None)
+    seen = max(extents_seen, key=lambda e: (_is_board(e), e.is_whole, len(e.cells)), default=None)
     if seen is None:
         return FitFailure(
             f"{exposure.source}: no chessboard of {wanted} inner corners in view",
@@ -551,7 +592,7 @@ def _not_found(exposure: Exposure, target: Chessboard, extents_seen: list[Extent
         f"{exposure.source}: no chessboard of {wanted} inner corners in view; "
         f"{columns} x {rows} corners were seen"
     )
-    if seen.is_whole:
+    if _is_board(seen):
         return OtherCountSeen(
             reason, "count the corners where four squares meet", columns=columns, rows=rows
         )

@@ -510,9 +510,10 @@ class SmoothLattice:
     scatter_px: float
 
     def seen(self, board: FloatArray) -> FloatArray:
-        """Image points (M, 2) of places (M, 2) on the board."""
+        """Image points (M, 2) of places (M, 2) on the board; not finite where none is seen."""
         flat = _through(self.homography, board, self.lens)
-        return flat if self.field is None else flat + self.field.at(flat)
+        with np.errstate(invalid="ignore", over="ignore"):
+            return flat if self.field is None else flat + self.field.at(flat)
 
     def curvature(self, board: FloatArray) -> FloatArray:
         """Curvature (M, 2), 1/px, of the board's lines along x and along y, as of `fit_saddles`."""
@@ -520,8 +521,9 @@ class SmoothLattice:
         for axis, step in enumerate(_ARC_CELLS * np.eye(2)):
             before, at, after = (self.seen(board + k * step) for k in (-1.0, 0.0, 1.0))
             slope, bend = 0.5 * (after - before), after - 2.0 * at + before
-            turn = slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]
-            curvature[:, axis] = turn / np.hypot(slope[:, 0], slope[:, 1]) ** 3
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                turn = slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]
+                curvature[:, axis] = turn / np.hypot(slope[:, 0], slope[:, 1]) ** 3
         return curvature
 
 
@@ -610,9 +612,10 @@ def _homography(
 
 
 def _through(homography: FloatArray, board: FloatArray, lens: CameraModel | None) -> FloatArray:
-    """Image points (N, 2) of a flat board before a lens or a pinhole."""
-    mapped = apply_homography(homography, board)
-    return mapped if lens is None else lens.project(homogeneous(mapped))
+    """Image points (N, 2) of a flat board before a lens or a pinhole; not finite behind it."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        mapped = apply_homography(homography, board)
+        return mapped if lens is None else lens.project(homogeneous(mapped))
 
 
 def _weighted_homography(board: FloatArray, xy: FloatArray, weight: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from armscan.geometry.rotations import skew
 from armscan.kernels.fusing import N_PARAMETERS, N_SENSOR, fuse_stripes
 from armscan.kernels.naming import mark_beside
 from armscan.models.calibration import SensorCalibration
-from armscan.models.light_sheet import LightSheet
+from armscan.models.light_sheet import BOW_TERMS, MAX_FAN, PLANE_PARAMETER_NAMES, LightSheet
 from armscan.reconstruction.epipolar import (
     N_DRIFT,
     Crossings,
@@ -51,11 +51,16 @@ from armscan.records.profile import Profile
 
 LARGEST_SLANT = 0.6
 """Tangent of the angle at which a ray may run to the sheet's depth axis: line lenses spread light
-by up to 60 degrees. Where the sheet knows its rays, they are followed and half of it is enough."""
+by up to 60 degrees."""
+LEAST_SLANT = 0.3
+"""The same to a ray that the sheet knows, to first order of its bow."""
+FAN_SIGMAS = 2.0
 NEEDED = 0.5
 """A segment is left without rays if fewer than this part of its own width is free around it."""
 STEP_SPACINGS = 3.0
 """Rays are told apart by so many of the spacings between neighbouring points."""
+_U2, _UV, _U2V = (BOW_TERMS.index(term) for term in ((2, 0), (1, 1), (2, 1)))
+_OF_BOW = len(PLANE_PARAMETER_NAMES)
 CONSISTENCY_SIGMAS = 5.0
 """Points whose left and right picture disagree by more are dropped."""
 BESIDE_ROWS = 3
@@ -111,22 +116,45 @@ def _on_sheets(
     is_inside = depths.holds(found.points_mm, found.sheet, sensor)
     status[found.row] = np.where(is_inside, PointStatus.MEASURED, PointStatus.OUT_OF_DEPTH)
     found = found.select(is_inside)
-    for k, calibrated in enumerate(sensor.sheets):
+    for k in range(len(sensor.sheets)):
         of_sheet = np.flatnonzero(found.sheet == k)
         row = found.row[of_sheet]
         is_lost = is_without_ray(
             found.points_mm[of_sheet],
             profile.intensity[row],
             profile.segment[row],
-            calibrated.sheet,
+            *known_rays(sensor, k),
         )
         status[row[is_lost]] = PointStatus.NO_LASER_RAY
     kept = found.select(status[found.row] == PointStatus.MEASURED)
     return MeasuredProfile(replace(labelled, status=status), kept)
 
 
+def known_rays(sensor: SensorCalibration, sheet: int) -> tuple[LightSheet, float]:
+    """The sheet of that number, and the tangent by which a ray may leave the one that its fan says.
+
+    A fan is what the bow's change with depth tells, and as uncertain as that over the bow: of a bow
+    that is hardly known it is anything. Then there is none, and rays run along the depth, by and
+    large.
+    """
+    model = sensor.sheets[sheet].sheet
+    bow = abs(float(model.bow_mm[_U2]))
+    if not model.fan.any() or bow == 0.0:
+        return model, LARGEST_SLANT
+    variance = np.diag(sensor_covariance(sensor, sheet))[N_CAMERA : N_CAMERA + N_SHEET]
+    of_uv, of_u2v = np.sqrt(variance[[_OF_BOW + _UV, _OF_BOW + _U2V]])
+    slant = max(LEAST_SLANT, FAN_SIGMAS * float(np.hypot(0.5 * of_uv, of_u2v)) / bow)
+    if slant < LARGEST_SLANT and np.abs(model.fan).max() < MAX_FAN:
+        return model, slant
+    return replace(model, fan=np.zeros(2)), LARGEST_SLANT
+
+
 def is_without_ray(
-    points_mm: FloatArray, intensity: FloatArray, segment: IntArray, sheet: LightSheet
+    points_mm: FloatArray,
+    intensity: FloatArray,
+    segment: IntArray,
+    sheet: LightSheet,
+    slant: float = LARGEST_SLANT,
 ) -> BoolArray:
     """(N,) True for the points of segments for which brighter ones left no ray of the laser.
 
@@ -140,12 +168,13 @@ def is_without_ray(
         (N,) number of each point's connected segment.
     sheet
         The light sheet.
+    slant
+        Tangent by which rays may leave those of the sheet.
     """
     lost = np.zeros(len(points_mm), dtype=np.bool_)
     if len(np.unique(segment)) < 2:
         return lost
     ray, depth = _rays(points_mm, sheet)
-    slant = LARGEST_SLANT * (0.5 if np.any(sheet.fan != 0.0) else 1.0)
     apart_mm = np.abs(np.diff(ray))[np.diff(segment) == 0]
     step = STEP_SPACINGS * max(float(np.median(apart_mm)) if len(apart_mm) else 0.0, 1e-6)
     bins = np.floor((ray - ray.min()) / step).astype(np.int64)

@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """One ray of the laser lights one point."""
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+import pytest
+
+from armscan.models.calibration import SensorCalibration
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.points import is_without_ray
+from armscan.reconstruction.points import is_without_ray, known_rays
+from rigs.calibration_documents import sensor_calibration
+from rigs.plain_scanner import stored_sheet
 
 SHEET = LightSheet(
     origin_mm=np.array([0.0, 0.0, 300.0]),
@@ -58,3 +64,28 @@ def test_pieces_of_one_broken_line_are_kept() -> None:
 def test_near_the_end_of_the_line_nothing_is_claimed() -> None:
     """Rays past the end of the bright line may have lit what lies in another depth there."""
     assert judged((line(-60, 60, 300.0), 100.0), (line(45, 58, 340.0), 60.0)) == [False, False]
+
+
+def sensor_of(fan: tuple[float, float], of_u2v_mm: float) -> SensorCalibration:
+    """Whose bow of 0.1 mm spreads its light so, and whose change with depth is known so well."""
+    bowed = replace(SHEET, bow_mm=np.array([0.1, 0.0, 0.0, 0.0, 0.0]), fan=np.array(fan))
+    covariance = np.diag([*[1e-6] * 12, *[1e-8] * 4, of_u2v_mm**2])
+    sheets = (stored_sheet("A", bowed, (250.0, 350.0)),)
+    return replace(sensor_calibration(), sheets=sheets, covariance=covariance)
+
+
+@pytest.mark.parametrize("sigma_mm", [0.001, 0.01, 0.02, 0.04])
+def test_rays_are_followed_as_far_as_the_bow_tells_them(sigma_mm: float) -> None:
+    """A spread is the bow's change with depth over the bow, and as uncertain."""
+    sheet, slant = known_rays(sensor_of((0.1, 0.4), sigma_mm), 0)
+    spread = sigma_mm / 0.1
+    if 2.0 * spread < 0.6:
+        assert sheet.fan.tolist() == [0.1, 0.4]
+        assert slant == pytest.approx(max(0.3, 2.0 * spread), rel=1e-3)
+    else:
+        assert (sheet.fan.tolist(), slant) == ([0.0, 0.0], 0.6)
+
+
+def test_a_fan_at_the_end_of_what_is_looked_for_is_none() -> None:
+    sheet, slant = known_rays(sensor_of((0.1, 0.8), 0.001), 0)
+    assert (sheet.fan.tolist(), slant) == ([0.0, 0.0], 0.6)

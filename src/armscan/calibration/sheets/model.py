@@ -31,7 +31,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma
 from armscan.geometry.shapes import Plane, fit_plane
 from armscan.models.calibration import FTest
-from armscan.models.light_sheet import BOW_TERMS, LightSheet
+from armscan.models.light_sheet import BOW_TERMS, MAX_FAN, LightSheet
 
 SHAPE_DEGREE = 3
 N_SHAPE = SHAPE_DEGREE + 1
@@ -311,7 +311,6 @@ FAN_SETTLED = 1e-3
 USUAL_FAN = 0.5
 """Size of a fan's lean and spread where the bow is too small to show them: a source twice as far as
 the calibrated region is wide. It only keeps them finite."""
-MAX_FAN = 0.8
 U2, UV, U2V = (BOW_TERMS.index(term) for term in ((2, 0), (1, 1), (2, 1)))
 
 

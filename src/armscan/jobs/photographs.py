@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -56,13 +57,15 @@ LARGE_MISCLOSURE = 2.0
 def find_stripes(
     job: Job,
     images: Sequence[str],
+    background: Sequence[str] = (),
     *,
     stripes: StripeOptions | None = None,
     image_options: ImageOptions | None = None,
 ) -> Summary:
     """Find the laser lines in images, without any calibration.
 
-    Colour images are all looked at in the colour of the strongest lines of a sample of them.
+    Colour images are all looked at in the colour of the strongest lines of a sample of them, or
+    in its difference from the other colours where that shows more of the sample's lines.
 
     Parameters
     ----------
@@ -71,6 +74,8 @@ def find_stripes(
         folder if nowhere.
     images
         Files, folders or patterns.
+    background
+        The same views without laser, one for each image, as such; none if empty.
     stripes, image_options
         How lines are found, and how pixels are read.
 
@@ -84,20 +89,27 @@ def find_stripes(
     places = job.places(".csv", beside=(".html",))
     paths = expand_paths(images)
     names = source_names(paths)
+    dark = _partners(paths, expand_paths(background) if background else [])
     load_stripe_method(stripes.method)
     if stripes.laser_colour == "auto":
-        stripes = replace(stripes, laser_colour=_common_colour(paths, image_options))
+        colour = _common_colour(paths, image_options)
+        if colour in COLOURS and not background:
+            colour = _clearest(colour, paths, stripes, image_options)
+        stripes = replace(stripes, laser_colour=colour)
     shown = set(evenly_chosen(names, MAX_PICTURES))
     exposures: dict[str, Exposure] = {}
     profiles: list[Profile] = []
     for k, (path, name) in enumerate(zip(paths, names, strict=True)):
         exposure = read_exposure(path, image_options, source=name)
-        profiles.append(extract_stripes(exposure, stripes))
+        partner = dark[k]
+        without = None if partner is None else read_exposure(partner, image_options)
+        profiles.append(extract_stripes(exposure, stripes, without))
         if name in shown:
             exposures[name] = exposure
         job.progress(ProgressEvent("stripes", k + 1, len(paths), name))
     warnings = _without_line(profiles)
-    provenance = job.provenance(paths, (stripes, image_options), warnings=warnings)
+    used = (*paths, *(path for path in dark if path is not None))
+    provenance = job.provenance(used, (stripes, image_options), warnings=warnings)
     is_simulated = are_simulated(paths)
     page = stripe_page(profiles, exposures, warnings, provenance, is_simulated=is_simulated)
     table = stripes_csv(profiles, is_simulated=is_simulated)
@@ -117,8 +129,29 @@ def find_stripes(
     )
 
 
+def _partners(paths: Sequence[Path], dark: Sequence[Path]) -> Sequence[Path | None]:
+    """The view without laser of each image: of the same name, else in order; none if none are."""
+    if not dark:
+        return [None] * len(paths)
+    if len(paths) != len(dark):
+        raise InputError(
+            f"{len(paths)} images with laser, but {len(dark)} without",
+            remedy="give one without laser for each image, in the same order",
+        )
+    by_name = {path.name: path for path in dark}
+    if set(by_name) == {path.name for path in paths} and len(by_name) == len(dark):
+        return [by_name[path.name] for path in paths]
+    return dark
+
+
 VOTERS = 12
 """Images that are asked for the laser's colour."""
+JUDGES = 4
+"""Images that are asked which difference from it shows more."""
+LONG = 40
+"""Points of a segment that is hardly an edge or a blot; in whose number channels are compared."""
+MUCH_MORE = 1.2
+"""Of what the colour itself shows, which is less noisy than a difference."""
 
 
 def _common_colour(paths: Sequence[Path], options: ImageOptions) -> LaserColour:
@@ -136,6 +169,25 @@ def _common_colour(paths: Sequence[Path], options: ImageOptions) -> LaserColour:
             total += np.square(line_strengths(channels))
     strongest = COLOURS[int(np.argmax(total))]
     return strongest if strongest in found else "auto"
+
+
+def _clearest(
+    colour: LaserColour, paths: Sequence[Path], stripes: StripeOptions, options: ImageOptions
+) -> LaserColour:
+    """The colour itself, or that of its differences which shows much more of long lines.
+
+    Light of the room is alike in all colours: on what is white or grey a difference hides it.
+    """
+    channels = [one for one in get_args(LaserColour) if one.partition("-")[0] == colour]
+    n_shown = dict.fromkeys(channels, 0)
+    for path in evenly_chosen(paths, JUDGES):
+        exposure = read_exposure(path, options)
+        for channel in channels if exposure.colour != "mono" else ():
+            profile = extract_stripes(exposure, replace(stripes, laser_colour=channel))
+            counts = np.unique(profile.segment[profile.is_accepted], return_counts=True)[1]
+            n_shown[channel] += int(counts[counts >= LONG].sum())
+    clearest = max(channels, key=lambda channel: n_shown[channel])
+    return clearest if n_shown[clearest] > MUCH_MORE * n_shown[colour] else colour
 
 
 NAMED, LISTED = 5, 40

@@ -93,3 +93,66 @@ def test_one_colour_is_taken_for_all(tmp_path: Path, capsys: pytest.CaptureFixtu
     alone = ["stripes", str(folder / "2.png"), "-o", str(tmp_path / "alone.csv"), "--json"]
     assert main(alone) == 0
     assert json.loads(capsys.readouterr().out)["laser_colour"] == "blue"
+
+
+def bars(rng: np.random.Generator) -> np.ndarray:
+    """(240, 320) levels of a print of light bars, which a line of light may be told from badly."""
+    u = np.arange(320)
+    columns = 60.0 + 70.0 * (np.floor(u / 9.0 + 0.3 * rng.random()) % 2)
+    return np.tile(columns, (240, 1))
+
+
+def written(out: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict, np.ndarray]:
+    """What is told, and the accepted points' distances from the line, px."""
+    report = json.loads(capsys.readouterr().out)
+    with out.open(newline="") as file:
+        good = [row for row in csv.DictReader(file) if row["accepted"] == "1"]
+    points = np.array([[float(row["x_px"]), float(row["y_px"])] for row in good])
+    return report, np.abs(SCENE.errors(points.reshape(-1, 2))[0])
+
+
+def test_light_that_all_colours_have_in_common_is_taken_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A red line over a grey print: red minus green hides the print, red alone does not."""
+    folder, rng = tmp_path / "lit", np.random.default_rng(3)
+    folder.mkdir()
+    for k in range(3):
+        red = SCENE.expose_red(k, 1.0).image.astype(np.float64)
+        image = 0.6 * red + bars(rng)[..., None] + rng.normal(0.0, 1.0, red.shape)
+        cv2.imwrite(str(folder / f"{k}.png"), np.clip(image, 0, 255).astype(np.uint8)[:, :, ::-1])
+    out = tmp_path / "lines.csv"
+    assert main(["stripes", str(folder), "-o", str(out), "--json"]) == 0
+    report, away = written(out, capsys)
+    assert report["laser_colour"] in {"red-green", "red-blue", "red-excess"}
+    assert len(away) > 0.85 * 3 * 320
+    assert np.mean(away < 0.5) > 0.99
+    alone = ["stripes", str(folder), "--laser-colour", "red", "-o", str(out), "--json", "--force"]
+    assert main(alone) == 0
+    assert len(written(out, capsys)[1]) < 0.7 * 3 * 320
+
+
+def test_views_without_laser_are_taken_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the same names, in any order; one for each image."""
+    rng = np.random.default_rng(4)
+    on, off = tmp_path / "on", tmp_path / "off"
+    on.mkdir()
+    off.mkdir()
+    for k in range(2):
+        print_, line_ = bars(rng), SCENE.expose(k).image.astype(np.float64)
+        for folder, levels in ((on, 0.5 * line_ + print_), (off, print_)):
+            noisy = levels + rng.normal(0.0, 1.0, levels.shape)
+            cv2.imwrite(str(folder / f"{k}.png"), np.clip(noisy, 0, 255).astype(np.uint8))
+    out = tmp_path / "lines.csv"
+    words = ["stripes", str(on), "-o", str(out), "--json", "--force"]
+    dark = [text for k in (1, 0) for text in ("--background", str(off / f"{k}.png"))]
+    assert main([*words, *dark]) == 0
+    _, away = written(out, capsys)
+    assert len(away) > 0.9 * 2 * 320
+    assert np.mean(away < 0.5) > 0.99
+    assert main(words) == 0
+    assert len(written(out, capsys)[1]) < 0.7 * 2 * 320
+    assert main([*words, "--background", str(off / "0.png")]) == 2
+    assert "2 images with laser, but 1 without" in capsys.readouterr().err

@@ -465,6 +465,18 @@ _RIDGE = 1e-10
 
 
 @compiled(error_model="numpy", fastmath=FUSED)
+def row_product(rows: Table, i: int, j: int, count: int) -> float:
+    """Sum of products of two rows' first ``count`` elements.
+
+    By itself: with sums in any order beside what is written, results depend on where arrays lie.
+    """
+    total = 0.0
+    for k in range(count):
+        total += rows[i, k] * rows[j, k]
+    return total
+
+
+@compiled(error_model="numpy")
 def crossing_sums(
     pixels: Table,
     n_pixels: int,
@@ -522,15 +534,9 @@ def crossing_sums(
             residuals[first + k] = residual
             square += residual * residual
         for i in range(CROSSING):
-            total = 0.0
-            for k in range(count):
-                total += rows[i, k] * rows[CROSSING, k]
-            gradient[i] += total
+            gradient[i] += row_product(rows, i, CROSSING, count)
             for j in range(i + 1):
-                total = 0.0
-                for k in range(count):
-                    total += rows[i, k] * rows[j, k]
-                normal[i, j] += total
+                normal[i, j] += row_product(rows, i, j, count)
     return square
 
 

@@ -489,8 +489,9 @@ def fit_board_saddles(
     lattice = _lattice(grey, cells, saddles, steps_px)
     if lattice is None:
         return saddles
+    # rounded: linear algebra's last digits depend on where its arrays lie in memory
     board = cells.astype(np.float64)
-    curvature = np.nan_to_num(lattice.curvature(board))
+    curvature = np.nan_to_num(lattice.curvature(board)).round(9)
     radius = window_radius(*steps_px)
     arc_px = 0.5 * radius * radius * np.abs(curvature).max(axis=1)
     is_bent = (arc_px > _BENT_SIGMAS * saddles.sigma_px) & saddles.is_good
@@ -498,7 +499,7 @@ def fit_board_saddles(
         return saddles
     # where the search missed one, local predictions lie up to 40 px off before a fisheye
     steps = clear_cells * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    seen, ahead, below = (lattice.seen(board + step) for step in steps)
+    seen, ahead, below = (lattice.seen(board + step).round(6) for step in steps)
     is_seen = np.isfinite(seen + ahead + below).all(axis=1, keepdims=True)
     lost = np.where(is_seen, seen, corners_px)
     start = np.where(saddles.is_good[:, None], saddles.points_px, lost)

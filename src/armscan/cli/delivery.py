@@ -124,7 +124,23 @@ def run(
                 typer.echo("what was found in images is kept: the same command uses it", err=True)
             raise
     show(summary, as_json=as_json)
+    _tell_compilation()
     return summary
+
+
+LONG_COMPILED_S = 3.0
+
+
+def _tell_compilation() -> None:
+    """Say on a terminal why a first run takes longer than those that follow."""
+    kernels = sys.modules.get("armscan.kernels.arrays")
+    seconds = sum(kernels.COMPILED.values()) if kernels is not None else 0.0
+    if seconds > LONG_COMPILED_S and sys.stderr.isatty():
+        typer.echo(
+            f"{seconds:.0f} s of this were compilation, kept from now on; `armscan doctor --warm` "
+            "compiles all",
+            err=True,
+        )
 
 
 def _with_delivery(job: Job, title_block: Sequence[str], pdf: Path | None) -> Job:

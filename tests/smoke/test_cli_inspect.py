@@ -132,7 +132,7 @@ def test_what_cannot_be_inspected_gets_one_sentence(
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("--uncertainty=-1", "uncertainty of the standard is -1.0 mm"),
+        ("--uncertainty=-1", "--uncertainty: the uncertainty of the standard is -1 mm"),
         ("--uncertainty=nan", "uncertainty of the standard is nan mm"),
         ("--mpe=nan", "the limit is nan mm"),
         ("--mpe=-0.1", "the limit is -0.1 mm"),
@@ -165,8 +165,12 @@ def test_the_daily_check_ends_with_its_verdict(
     assert found["checks"][0]["error"] == pytest.approx(0.02, abs=0.003)
     assert main([*words, "--mpe", "0.02", "--uncertainty", "0.01"]) == 1
     assert "inconclusive" in capsys.readouterr().out
-    assert "either --ball DIAMETER or --plate FILE" in fails("verify", clouds / "ball.ply")
+    assert "one of --ball DIAMETER, --plate FILE and --plane A,B,C,D" in fails(
+        "verify", clouds / "ball.ply"
+    )
     assert "give --scanner" in fails("verify", tmp_path, "--ball", 34.96)
+    said = fails("verify", clouds / "ball.ply", "--ball", 34.96, "--mpe", -1)
+    assert said == "error: --mpe: the limit is -1 mm; give 0 mm or more.\n"
 
 
 def test_a_simulated_cloud_is_called_so_wherever_it_lies(

@@ -75,10 +75,15 @@ class VerifyOptions:
     reference_u_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        lengths = {"limit": self.mpe_mm, "uncertainty of the standard": self.reference_u_mm}
-        for name, length in lengths.items():
+        lengths = {
+            ("limit", "--mpe"): self.mpe_mm,
+            ("uncertainty of the standard", "--uncertainty"): self.reference_u_mm,
+        }
+        for (name, option), length in lengths.items():
             if length is not None and not 0.0 <= length < math.inf:
-                raise OptionError(f"the {name} is {length} mm", remedy="give 0 mm or more")
+                raise OptionError(
+                    f"the {name} is {length:g} mm", where=option, remedy="give 0 mm or more"
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

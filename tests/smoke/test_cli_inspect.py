@@ -173,6 +173,30 @@ def test_the_daily_check_ends_with_its_verdict(
     assert said == "error: --mpe: the limit is -1 mm; give 0 mm or more.\n"
 
 
+def test_a_fused_cloud_says_why_nothing_is_known_of_its_exposures(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = read_ply(clouds / "ball.ply")
+    one = np.zeros(len(cloud), dtype=np.int64)
+    fused = replace(cloud, exposure=one, exposure_sources=("fused",), sheet_names=("fused",))
+    (tmp_path / "fused.ply").write_bytes(ply_bytes(replace(fused, noise_length=None)))
+    assert main(["inspect", "sphere", str(tmp_path / "fused.ply"), "--diameter", "34.96"]) == 0
+    out = capsys.readouterr().out
+    assert "the cloud is fused and no longer tells its exposures apart" in out.replace("The", "the")
+    assert "not known: from what exposures" not in out
+    main(["verify", str(tmp_path / "fused.ply"), "--ball", "34.96", "--mpe", "0.05"])
+    out = capsys.readouterr().out
+    assert "verify the recording, or the cloud from before it was fused" in out
+    assert "oo few exposures" not in out
+
+
+def test_the_sign_of_a_deviation_is_told(clouds: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", "sphere", str(clouds / "ball.ply"), "--diameter", "34.96"]) == 0
+    assert "outside the ball, farther from its centre" in capsys.readouterr().out
+    assert main(["inspect", "plane", str(clouds / "block.ply")]) == 0
+    assert "on the side of +z: the cloud has no normals" in capsys.readouterr().out
+
+
 def test_a_simulated_cloud_is_called_so_wherever_it_lies(
     clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

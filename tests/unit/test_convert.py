@@ -54,6 +54,16 @@ def test_no_such_way(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_only_what_the_source_had_is_said_to_be_lost(tmp_path: Path) -> None:
+    own, plain = tmp_path / "own.csv", tmp_path / "plain.xyz"
+    write_cloud(own, cloud_of(np.eye(3)))
+    assert convert_file(own, tmp_path / "own.ply").losses == ()
+    lost = convert_file(own, plain).losses
+    assert "sigma_mm and covariance" in lost
+    assert "normals" not in lost
+    assert convert_file(plain, tmp_path / "again.xyz").losses == ("digits beyond 0.1 nm",)
+
+
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
 def test_a_model_becomes_the_same_triangles_as_stl(tmp_path: Path, suffix: str) -> None:
     box = trimesh.creation.box((30.0, 20.0, 10.0))

@@ -340,6 +340,7 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         what = f"cloud to {BY_SUFFIX[suffix].name}"
         losses = cloud_losses(cloud, output, kept)
         holds_sigma = SIGMA_LOSS not in losses
+        losses = tuple(words for words in losses if words not in _never_had(found))
         without = (NO_SIGMA,) if holds_sigma and not cloud.covariance_mm2.any() else ()
         conversion = Conversion(what, losses, (*found.remarks, *without), cloud.forced)
     else:
@@ -348,6 +349,21 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         conversion = Conversion("camera to ROS camera_info", YAML_LOSES, (), forced)
     write_files({output: content}, is_overwriting=is_overwriting)
     return conversion
+
+
+def _never_had(source: CloudFile) -> set[str]:
+    """What files may lose, in their words, of which a source has nothing."""
+    cloud = source.cloud
+    has = {
+        "normals": cloud.normals is not None,
+        SIGMA_LOSS: cloud.covariance_mm2.any(),
+        "sheet, exposure and segment": any(cloud.sheet_names),
+        "intensity": cloud.intensity.any(),
+        "where the sensor stood": cloud.seen_from_mm is not None,
+        "which calibration": bool(cloud.calibrations),
+        "n_points of a fused cloud": source.n_points is not None,
+    }
+    return {words for words, it_has in has.items() if not it_has}
 
 
 def _convert_model(source: Path, output: Path, *, is_overwriting: bool) -> Conversion:

@@ -148,6 +148,21 @@ def test_the_daily_check_refuses_what_is_no_length(
     assert said in fails("verify", clouds / "ball.ply", "--ball=34.96", option)
 
 
+def test_points_of_which_nothing_is_said_lie_on_the_surface_and_the_report_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "touches.csv"
+    rows = "\n".join(f"{10 * x},{10 * y},0" for x in range(3) for y in range(3))
+    table.write_text(f"x_mm,y_mm,z_mm\n{rows}\n")
+    assert main(["probe", str(table)]) == 0
+    assert "no tip's radius was taken off" in capsys.readouterr().out
+    table.write_text(f"# point = tip-centre, tip_diameter_mm = 6\nx_mm,y_mm,z_mm\n{rows}\n")
+    assert main(["probe", str(table)]) == 0
+    told = capsys.readouterr().out
+    assert "tip of 6 mm compensated" in told
+    assert "no tip's radius" not in told
+
+
 def test_the_daily_check_ends_with_its_verdict(
     clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Fails
 ) -> None:
@@ -248,6 +263,15 @@ def test_a_mesh_and_what_stands_in_its_way(
     rim_mm2 = 2.0 * np.pi * RADIUS_MM * 0.8
     lune = np.deg2rad(140.0) * 2.0 * np.sin(np.deg2rad(70.0)) * RADIUS_MM**2
     assert abs(found["area_mm2"] - lune) < rim_mm2
+    copy = tmp_path / "copy.ply"
+    copy.write_bytes(whole.read_bytes())
+    for words in (
+        ("mesh", copy, "-o", copy, "--force"),
+        ("clean", copy, "-o", copy, "--force", "--isolated", 2),
+        ("fuse", copy, "--voxel", 1, "-o", copy, "--force"),
+    ):
+        assert "copy.ply is read, and would be replaced" in fails(*words)
+    assert copy.read_bytes() == whole.read_bytes()
     assert "no point has a normal" in fails("mesh", clouds / "ball.ply", "-o", tmp_path / "n.stl")
     assert "ends in '.obj'" in fails("mesh", whole, "-o", tmp_path / "n.obj")
     assert "--cell is -1.0 mm" in fails("mesh", whole, "-o", tmp_path / "n.stl", "--cell", "-1")

@@ -204,6 +204,8 @@ def test_doctor_is_content(capsys: pytest.CaptureFixture[str]) -> None:
     report = json.loads(capsys.readouterr().out)
     assert report["is_ready"] is True
     assert report["found"]["numpy"] == np.__version__
+    extras = ("pye57", "laspy", "scikit-image", "fast-simplification", "weasyprint", "viser")
+    assert set(extras) | {"cadquery-ocp-novtk"} <= set(report["found"])
 
 
 def test_completion_is_offered() -> None:

@@ -58,6 +58,16 @@ def test_two_clouds_become_one(
     assert "why" in output.with_suffix(".html").read_text()
 
 
+def test_a_sigma_that_is_not_known_is_no_zero_on_the_page(folder: Path) -> None:
+    for name in ("a", "b"):
+        assert main(["convert", str(folder / f"{name}.ply"), str(folder / f"{name}.xyz")]) == 0
+    clouds = [str(folder / "a.xyz"), str(folder / "b.xyz")]
+    assert main(["fuse", *clouds, "--voxel", "1.5", "-o", str(folder / "plain.ply")]) == 0
+    page = (folder / "plain.html").read_text(encoding="utf-8")
+    assert "Standard deviations are not known." in page
+    assert "sigma 0 µm" not in page
+
+
 def test_points_that_would_count_twice_are_refused(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -132,7 +132,7 @@ def test_what_cannot_be_inspected_gets_one_sentence(
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("--uncertainty=-1", "uncertainty of the standard is -1.0 mm"),
+        ("--uncertainty=-1", "--uncertainty: the uncertainty of the standard is -1 mm"),
         ("--uncertainty=nan", "uncertainty of the standard is nan mm"),
         ("--mpe=nan", "the limit is nan mm"),
         ("--mpe=-0.1", "the limit is -0.1 mm"),
@@ -146,6 +146,21 @@ def test_the_daily_check_refuses_what_is_no_length(
     clouds: Path, fails: Fails, option: str, said: str
 ) -> None:
     assert said in fails("verify", clouds / "ball.ply", "--ball=34.96", option)
+
+
+def test_points_of_which_nothing_is_said_lie_on_the_surface_and_the_report_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "touches.csv"
+    rows = "\n".join(f"{10 * x},{10 * y},0" for x in range(3) for y in range(3))
+    table.write_text(f"x_mm,y_mm,z_mm\n{rows}\n")
+    assert main(["probe", str(table)]) == 0
+    assert "no tip's radius was taken off" in capsys.readouterr().out
+    table.write_text(f"# point = tip-centre, tip_diameter_mm = 6\nx_mm,y_mm,z_mm\n{rows}\n")
+    assert main(["probe", str(table)]) == 0
+    told = capsys.readouterr().out
+    assert "tip of 6 mm compensated" in told
+    assert "no tip's radius" not in told
 
 
 def test_the_daily_check_ends_with_its_verdict(
@@ -165,8 +180,36 @@ def test_the_daily_check_ends_with_its_verdict(
     assert found["checks"][0]["error"] == pytest.approx(0.02, abs=0.003)
     assert main([*words, "--mpe", "0.02", "--uncertainty", "0.01"]) == 1
     assert "inconclusive" in capsys.readouterr().out
-    assert "either --ball DIAMETER or --plate FILE" in fails("verify", clouds / "ball.ply")
+    assert "one of --ball DIAMETER, --plate FILE and --plane A,B,C,D" in fails(
+        "verify", clouds / "ball.ply"
+    )
     assert "give --scanner" in fails("verify", tmp_path, "--ball", 34.96)
+    said = fails("verify", clouds / "ball.ply", "--ball", 34.96, "--mpe", -1)
+    assert said == "error: --mpe: the limit is -1 mm; give 0 mm or more.\n"
+
+
+def test_a_fused_cloud_says_why_nothing_is_known_of_its_exposures(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = read_ply(clouds / "ball.ply")
+    one = np.zeros(len(cloud), dtype=np.int64)
+    fused = replace(cloud, exposure=one, exposure_sources=("fused",), sheet_names=("fused",))
+    (tmp_path / "fused.ply").write_bytes(ply_bytes(replace(fused, noise_length=None)))
+    assert main(["inspect", "sphere", str(tmp_path / "fused.ply"), "--diameter", "34.96"]) == 0
+    out = capsys.readouterr().out
+    assert "the cloud is fused and no longer tells its exposures apart" in out.replace("The", "the")
+    assert "not known: from what exposures" not in out
+    main(["verify", str(tmp_path / "fused.ply"), "--ball", "34.96", "--mpe", "0.05"])
+    out = capsys.readouterr().out
+    assert "verify the recording, or the cloud from before it was fused" in out
+    assert "oo few exposures" not in out
+
+
+def test_the_sign_of_a_deviation_is_told(clouds: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", "sphere", str(clouds / "ball.ply"), "--diameter", "34.96"]) == 0
+    assert "outside the ball, farther from its centre" in capsys.readouterr().out
+    assert main(["inspect", "plane", str(clouds / "block.ply")]) == 0
+    assert "on the side of +z: the cloud has no normals" in capsys.readouterr().out
 
 
 def test_a_simulated_cloud_is_called_so_wherever_it_lies(
@@ -220,6 +263,15 @@ def test_a_mesh_and_what_stands_in_its_way(
     rim_mm2 = 2.0 * np.pi * RADIUS_MM * 0.8
     lune = np.deg2rad(140.0) * 2.0 * np.sin(np.deg2rad(70.0)) * RADIUS_MM**2
     assert abs(found["area_mm2"] - lune) < rim_mm2
+    copy = tmp_path / "copy.ply"
+    copy.write_bytes(whole.read_bytes())
+    for words in (
+        ("mesh", copy, "-o", copy, "--force"),
+        ("clean", copy, "-o", copy, "--force", "--isolated", 2),
+        ("fuse", copy, "--voxel", 1, "-o", copy, "--force"),
+    ):
+        assert "copy.ply is read, and would be replaced" in fails(*words)
+    assert copy.read_bytes() == whole.read_bytes()
     assert "no point has a normal" in fails("mesh", clouds / "ball.ply", "-o", tmp_path / "n.stl")
     assert "ends in '.obj'" in fails("mesh", whole, "-o", tmp_path / "n.obj")
     assert "--cell is -1.0 mm" in fails("mesh", whole, "-o", tmp_path / "n.stl", "--cell", "-1")

@@ -143,6 +143,15 @@ def test_a_file_is_measured_as_its_folder(
             assert a.exposure_sources == b.exposure_sources
 
 
+def test_photographs_are_not_looked_for_in_a_recording(
+    folders: dict[str, Path], tmp_path: Path, fails: Fails
+) -> None:
+    scan = next(iter(folders.values())).with_suffix(".mcap")
+    said = fails("stripes", scan, "-o", tmp_path / "stripes.csv")
+    assert "this is a recording in one file" in said
+    assert f"armscan convert {scan} FOLDER" in said
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_broken_file_costs_one_sentence(
     name: str, calibrated: Bench, folders: dict[str, Path], tmp_path: Path, fails: Fails

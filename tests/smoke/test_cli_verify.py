@@ -78,6 +78,50 @@ def test_a_recording_without_the_ball_gets_one_sentence(
     assert "no such file" in fails("verify", folder / "nothing", *words[2:], "--scanner", scanner)
 
 
+def test_a_cloud_is_of_the_scanner_that_is_given(
+    folder: Path, tmp_path: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    scanner = scan_fake.scanner()
+    own = replace(scanner.provenance, document_id="own")
+    (tmp_path / "own.json").write_bytes(scanner_document(replace(scanner, provenance=own)))
+    other = replace(scanner.provenance, document_id="other")
+    (tmp_path / "other.json").write_bytes(scanner_document(replace(scanner, provenance=other)))
+    (tmp_path / "cut.json").write_bytes((tmp_path / "own.json").read_bytes()[:500])
+    cloud = tmp_path / "plate.ply"
+    words = ["reconstruct", folder / "plate", "--scanner", tmp_path / "own.json", "-o", cloud]
+    assert main([str(word) for word in words]) == 0
+    capsys.readouterr()
+    check = ["verify", cloud, "--plane", "0,0,1,0", "--scanner"]
+    said = fails(*check, tmp_path / "other.json")
+    assert "the calibration own, and other.json is other" in said
+    assert "cut.json" in fails(*check, tmp_path / "cut.json")
+    assert "no such file" in fails(*check, tmp_path / "nothing.json")
+    main([*map(str, check), str(tmp_path / "own.json"), "--json"])
+    assert not any("taken from you" in text for text in _warnings(capsys))
+    bare = tmp_path / "plate.xyz"
+    assert main(["convert", str(cloud), str(bare)]) == 0
+    capsys.readouterr()
+    check[1] = bare
+    main([*map(str, check), str(tmp_path / "own.json"), "--json"])
+    assert any("own.json is taken from you" in text for text in _warnings(capsys))
+
+
+def _warnings(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    return list(json.loads(capsys.readouterr().out)["warnings"])
+
+
+def test_a_plane_in_words_is_that_of_a_file(
+    folder: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["verify", str(folder / "plate"), "--scanner", str(folder / "good.json"), "--json"]
+    found = []
+    for plate in (("--plane", "0,0,1,0"), ("--plate", str(folder / "plate.csv"))):
+        assert main([*words, *plate]) == 0
+        found.append(json.loads(capsys.readouterr().out)["checks"])
+    assert found[0] == found[1]
+    assert "a check needs one standard" in fails(*words, "--plane", "0,0,1,0", "--ball", 30)
+
+
 ARM = thesis_arm((100.0, 200.0, 200.0, 50.0), (20.0, 30.0, 20.0))
 
 

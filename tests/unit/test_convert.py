@@ -11,7 +11,13 @@ import trimesh
 
 from armscan.errors import ArmscanError, FileFormatError, OptionError, OutputError
 from armscan.storage.clouds import convert_file, write_cloud
-from armscan.storage.documents import read_camera_calibration, read_sensor_calibration
+from armscan.storage.documents import (
+    read_camera_calibration,
+    read_scanner_calibration,
+    read_sensor_calibration,
+    scanner_document,
+)
+from rigs.calibration_documents import scanner_calibration
 from rigs.inspection_clouds import cloud_of
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -52,6 +58,38 @@ def test_no_such_way(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="no conversion"):
         convert_file(documents("camera")[0], tmp_path / "camera.xyz")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_camera_of_a_scanner_is_that_of_its_sensor(tmp_path: Path) -> None:
+    scanner = tmp_path / "scanner.json"
+    scanner.write_bytes(scanner_document(scanner_calibration(has_sensor=True)))
+    convert_file(scanner, tmp_path / "camera.yaml")
+    found = read_camera_calibration(tmp_path / "camera.yaml").camera
+    sensor = read_scanner_calibration(scanner).sensor
+    assert sensor is not None
+    assert found.fx_px == sensor.camera.camera.fx_px
+    scanner.write_bytes(scanner_document(scanner_calibration(has_sensor=False)))
+    with pytest.raises(FileFormatError, match="delivers points"):
+        convert_file(scanner, tmp_path / "none.yaml")
+
+
+def test_no_conversion_replaces_what_it_reads(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.xyz"
+    write_cloud(path, cloud_of(np.eye(3)))
+    before = path.read_bytes()
+    with pytest.raises(OutputError, match="is read, and would be replaced"):
+        convert_file(path, path, is_overwriting=True)
+    assert path.read_bytes() == before
+
+
+def test_only_what_the_source_had_is_said_to_be_lost(tmp_path: Path) -> None:
+    own, plain = tmp_path / "own.csv", tmp_path / "plain.xyz"
+    write_cloud(own, cloud_of(np.eye(3)))
+    assert convert_file(own, tmp_path / "own.ply").losses == ()
+    lost = convert_file(own, plain).losses
+    assert "sigma_mm and covariance" in lost
+    assert "normals" not in lost
+    assert convert_file(plain, tmp_path / "again.xyz").losses == ("digits beyond 0.1 nm",)
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])

@@ -259,6 +259,11 @@ def test_points_on_the_surface_keep_the_tip_that_touched_them() -> None:
     assert plate.tip_diameter_mm == TIP_MM
 
 
+def test_a_feature_that_no_point_names_is_told_so() -> None:
+    with pytest.raises(InputError, match=r"no point names a feature.* called 'plate'"):
+        fit_probed_plate(ProbedPoints(np.eye(3)), None, ProbingOptions(feature="plate"))
+
+
 def test_of_several_features_one_must_be_chosen() -> None:
     both = np.concatenate([touches(8), touches(6) + 50.0])
     probed = ProbedPoints(

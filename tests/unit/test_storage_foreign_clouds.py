@@ -11,6 +11,7 @@ import pytest
 
 from armscan.errors import FileFormatError
 from armscan.storage.clouds import ply_bytes, read_cloud, xyz_bytes
+from armscan.storage.points import read_probed_points
 from rigs.inspection_clouds import cloud_of
 
 POINTS = np.array([[1.5, -2.0, 3.25], [4.0, 5.0, -6.5]])
@@ -61,6 +62,43 @@ def test_text_of_other_programs(tmp_path: Path, text: str) -> None:
     assert found.exposure_sources == ("other.xyz",)
 
 
+@pytest.mark.parametrize(
+    ("heading", "said"),
+    [
+        ("x_m,y_m,z_m", "are in metres; multiply them by 1000 and name them x_mm, y_mm, z_mm"),
+        ("X_in;Y_in;Z_in", "are in inches; multiply them by 25.4"),
+        ("n,x_um,y_um,z_um", "are in micrometres; multiply them by 0.001"),
+    ],
+)
+def test_another_unit_in_the_heading_is_refused_alike_everywhere(
+    tmp_path: Path, heading: str, said: str
+) -> None:
+    path = tmp_path / "cloud.csv"
+    n_columns = len(heading.replace(";", ",").split(","))
+    path.write_text(f"{heading}\n{','.join('1234'[:n_columns])}\n")
+    for read in (read_cloud, read_probed_points):
+        if ";" in heading and read is read_probed_points:
+            continue
+        with pytest.raises(FileFormatError) as caught:
+            read(path)
+        assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["gap.csv", "gap.ply"])
+def test_points_without_a_place_are_counted_and_shown(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    lines = ["1,2,3", "4,5,6", "7,,9", "nan,1,2"]
+    if name == "gap.ply":
+        header = "ply\nformat ascii 1.0\nelement vertex 4\n"
+        header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+        lines = [line.replace(",,", ",nan,").replace(",", " ") for line in lines]
+        path.write_text(header + "\n".join(lines) + "\n")
+    else:
+        path.write_text("x_mm,y_mm,z_mm\n" + "\n".join(lines) + "\n")
+    with pytest.raises(FileFormatError, match=r"2 of 4 points .* the first is point 3"):
+        read_cloud(path)
+
+
 def test_a_ply_file_of_another_program(tmp_path: Path) -> None:
     path = tmp_path / "other.ply"
     fields = "property float x\nproperty float y\nproperty float z\nproperty uchar red\n"
@@ -79,7 +117,7 @@ def test_a_ply_file_of_another_program(tmp_path: Path) -> None:
         ("heads.csv", "x,y,z\n", "holds no points"),
         ("two.xyz", "1 2 3\n4 5\n", "not understood: line 2 is '4 5'"),
         ("words.xyz", "x y z\n\n1 2 3\n4 five 6\n", "not understood: line 4 is '4 five 6'"),
-        ("nan.xyz", "1 2 3\nnan 5 6\n", "not finite"),
+        ("nan.xyz", "1 2 3\nnan 5 6\n", "empty or nan"),
         ("comma.csv", "1,5;2,5;3,5\n4,5;5,5;6,5\n", "commas"),
         ("comma.xyz", "1 2 3\n1,5 2,5 3,5\n", "commas"),
         ("named.csv", "x,y,z\n1,5,2,5,3,5\n", "commas"),

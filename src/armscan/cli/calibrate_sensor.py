@@ -116,7 +116,7 @@ SensorFile = Annotated[
 ]
 PlateFile = Annotated[
     Path | None,
-    typer.Option(help="Probed points of the plate, or its A,B,C,D.", show_default=False),
+    typer.Option(help="Probed points of the plate, or its A,B,C,D in a file.", show_default=False),
 ]
 PlaneText = Annotated[
     str, typer.Option(help="The plate as A,B,C,D in Base, mm, in place of --plate.")

@@ -157,8 +157,13 @@ def verify(
     ] = None,
     plate: Annotated[
         Path | None,
-        typer.Option(help="Probed points of the plate (CSV), or A,B,C,D.", show_default=False),
+        typer.Option(
+            help="The plate: probed points (CSV), or A,B,C,D in a file.", show_default=False
+        ),
     ] = None,
+    plane: Annotated[
+        str, typer.Option(help="The plate as A,B,C,D in Base, D in mm.", show_default=False)
+    ] = "",
     mpe: Annotated[
         float | None,
         typer.Option(
@@ -187,7 +192,7 @@ def verify(
     box = numbers(region, "--region")
     options = given(VerifyOptions, mpe_mm=mpe, reference_u_mm=uncertainty)
     inspection = given(InspectionOptions, feature_mm=feature_mm)
-    standard = Standard(ball, plate, None if side is None else side.value)
+    standard = Standard(ball, plate, None if side is None else side.value, plane)
     return lambda job: verify_scanner(
         job, scan, scanner, standard, arm=arm, region=box, options=options, inspection=inspection
     )

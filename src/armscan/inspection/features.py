@@ -21,6 +21,7 @@ from armscan.inspection.results import (
     describe_deviations,
 )
 from armscan.inspection.search import (
+    NOISE_BAND,
     Sample,
     WantedFeature,
     connected,
@@ -106,6 +107,8 @@ class FeatureInspection(ArrayRecord):
         planes and lines.
     length_mm
         Extent of the points along the axis or line; 0 for others.
+    scatter_mm
+        What neighbouring points scatter by off the faces that they make; NaN where not known.
     """
 
     wanted: WantedFeature
@@ -121,6 +124,7 @@ class FeatureInspection(ArrayRecord):
     centre_sigma_mm: float
     seen_deg: float
     length_mm: float
+    scatter_mm: float = math.nan
 
     @property
     def form_mm(self) -> float:
@@ -180,7 +184,10 @@ def inspect_feature(
     failure = _unlike(selection, chosen, shape, wanted)
     if failure is not None:
         return failure
-    return _described(selection, wanted, shape, chosen, is_fitted)
+    told = _described(selection, wanted, shape, chosen, is_fitted)
+    if isinstance(told, FitFailure):
+        return told
+    return replace(told, scatter_mm=sample.noise_mm / NOISE_BAND)
 
 
 def inspect_points(

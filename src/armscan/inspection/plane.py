@@ -66,7 +66,15 @@ def inspect_plane(
     start = reference if reference is not None else _search(points, middle)
     if isinstance(start, FitFailure):
         return start
+    if reference is None:
+        reference_text = "the face that most points lie near"
     is_near = np.abs(start.distance_mm(points)) <= selection.feature_mm
+    if reference is None and int(is_near.sum()) < MIN_POINTS:
+        return FitFailure(
+            f"there is no flat face: at the best place for one, {int(is_near.sum())} of "
+            f"{len(points)} points lie within {selection.feature_mm:g} mm, {MIN_POINTS} are needed",
+            "show where the face is with --region, or give the plane it should be",
+        )
     if int(is_near.sum()) < MIN_POINTS:
         return FitFailure(
             f"{int(is_near.sum())} of {len(points)} points lie within {selection.feature_mm:g} mm "
@@ -113,25 +121,21 @@ def _inspected(
             f"{SEARCH_BAND_MM:g} mm",
             "show where the face is with --region, or give the plane it should be",
         )
-    if reference is not None:
-        plane = _facing(plane, start.normal)
-    elif cloud.normals is not None:
-        # to the side that was scanned, where the cloud knows it
-        plane = _facing(plane, cloud.normals[feature].mean(axis=0))
-    near_text = reference_text if reference is not None else "the face that most points lie near"
+    towards, side_text = _positive(plane, reference, cloud, feature)
+    plane = _facing(plane, towards)
     counts = PointCounts(
         n_given=len(cloud),
         n_region=len(selection.rows),
         n_feature=len(feature),
         n_fitted=int(is_fitted.sum()),
-        feature_rule=f"points {band} of {near_text}",
+        feature_rule=f"points {band} of {reference_text}",
         fit_rule=OUTLIER_RULE,
     )
-    text = f"all {len(feature)} points {band} of {near_text}"
+    text = f"all {len(feature)} points {band} of {reference_text}"
     fitted = describe_deviations(
         plane.distance_mm(points), "fitted", "the least-squares plane of these points", text
     )
-    nominal, offset, tilt = None, None, math.nan
+    nominal, offset, tilt, n_beyond = None, None, math.nan, 0
     if reference is not None:
         nominal = describe_deviations(
             reference.distance_mm(points), "nominal", reference_text, text
@@ -139,6 +143,8 @@ def _inspected(
         offset = _offset(plane, reference, cloud, feature[is_fitted])
         sine = np.linalg.norm(np.cross(plane.normal, reference.normal))
         tilt = 1000.0 * math.asin(min(1.0, float(sine)))
+        is_on = np.abs(plane.distance_mm(selection.points_mm)) <= SEARCH_BAND_MM
+        n_beyond = int(is_on.sum()) - int(near.sum())
     return PlaneInspection(
         plane=plane,
         reference=reference,
@@ -149,7 +155,24 @@ def _inspected(
         nominal=nominal,
         offset=offset,
         tilt_mrad=tilt,
+        side_text=side_text,
+        n_beyond=n_beyond,
     )
+
+
+def _positive(
+    plane: Plane, reference: Plane | None, cloud: PointCloud, feature: IntArray
+) -> tuple[FloatArray, str]:
+    """A direction (3,) to the side where deviations are positive, and that side in words.
+
+    The scanned side, where nothing is given and the cloud knows it; else the same at every run.
+    """
+    if reference is not None:
+        return reference.normal, "on the side to which the nominal plane's normal points"
+    if cloud.normals is not None and cloud.normals[feature].any():
+        return cloud.normals[feature].mean(axis=0), "on the scanned side, as the normals tell"
+    axis = int(np.argmax(np.abs(plane.normal)))
+    return np.eye(3)[axis], f"on the side of +{'xyz'[axis]}: the cloud has no normals"
 
 
 def _facing(plane: Plane, towards: FloatArray) -> Plane:

@@ -165,6 +165,10 @@ class PlaneInspection(ArrayRecord):
         Height of ``plane`` over ``reference`` at the middle of the points; None without one.
     tilt_mrad
         Angle between the two; NaN without a reference.
+    side_text
+        On which side deviations are positive, in words.
+    n_beyond
+        Points on ``plane`` that are no feature's, as they lie farther than that from ``reference``.
     """
 
     plane: Plane
@@ -176,6 +180,8 @@ class PlaneInspection(ArrayRecord):
     nominal: Deviations | None
     offset: MeasuredLength | None
     tilt_mrad: float
+    side_text: str
+    n_beyond: int
 
 
 class SphereInspection(ArrayRecord):

@@ -60,7 +60,7 @@ def inspect_sphere(
         If there are too few points or the diameter is not positive.
     """
     if not 0.0 < diameter_mm < 1e4:
-        raise InputError(f"a ball of {diameter_mm} mm diameter", remedy="give the diameter in mm")
+        raise InputError(f"a ball of {diameter_mm:g} mm diameter", remedy="give the diameter in mm")
     selection = select(cloud, region, options)
     points = selection.points_mm
     found = find_ball(points, diameter_mm / 2.0, selection.search_band_mm)

@@ -52,7 +52,7 @@ def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
         If a file cannot be read or is given twice, clouds do not fuse, or there is no point;
         nothing is written then.
     """
-    places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
+    places = job.places(*CLOUD_SUFFIXES, beside=(".html",), reads=paths)
     _refuse_twice(paths)
     with scratch_folder(places[0]) as scratch:
         voxels = VoxelMap(size_mm, scratch)

@@ -46,6 +46,7 @@ from armscan.storage.formats.columns import COVARIANCE
 from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import image_format, read_exposure
 from armscan.storage.observations import read_observations
+from armscan.storage.parts.meshes import read_part
 from armscan.storage.points import read_probed_points
 from armscan.storage.recording import FolderRecording, is_recording, read_arm_track, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
@@ -364,7 +365,10 @@ def _line(key: str, value: Any) -> str:
     if key == "what":
         return str(value)
     if isinstance(value, list):
-        return f"{key.replace('_', ' ')}: " + ", ".join(str(item) for item in value)
+        unit = " mm" if key.endswith("_range") else ""
+        return f"{key.replace('_', ' ')}: " + ", ".join(str(item) for item in value) + unit
+    if value is None:
+        return f"{key.replace('_', ' ')}: not known"
     return f"{key.replace('_', ' ')}: {f'{value:.6g}' if isinstance(value, float) else value}"
 
 
@@ -380,6 +384,13 @@ def _file(path: Path) -> dict[str, Any]:
         return _ply(path, data)
     if data.startswith(b"PK"):
         return _observations(path)
+    if path.suffix.lower() == ".stl":
+        part = read_part(path)
+        return {
+            "what": f"model of a part, {plural(len(part.triangles), 'triangle')}, "
+            f"{plural(len(part.vertices_mm), 'corner')}",
+            **_ranges(part.vertices_mm.T),
+        }
     if path.suffix.lower() in CLOUDS or _is_own_table(data):
         return _cloud(read_cloud(path))
     return _text(path, data)
@@ -391,10 +402,16 @@ def _is_own_table(data: bytes) -> bool:
     return not COVARIANCE.keys().isdisjoint(heading.split(","))
 
 
+OWN_PAGE = b'<meta name="generator" content="armscan">'
+
+
 def _text(path: Path, data: bytes) -> dict[str, Any]:
     stripped = data.lstrip(b"\xef\xbb\xbf \t\r\n")
-    if stripped.startswith(b"{") and "schema" in (content := parse_json(data, str(path))):
+    content = parse_json(data, str(path)) if stripped.startswith(b"{") else {}
+    if "schema" in content:
         return DESCRIBE_SCHEMA.get(content["schema"], _calibration)(path)
+    if what := _by_product(path, data, content):
+        return {"what": what}
     if path.name in DESCRIBE_NAMED:
         return DESCRIBE_NAMED[path.name](path)
     if path.suffix.lower() == ".csv":
@@ -409,6 +426,20 @@ def _text(path: Path, data: bytes) -> dict[str, Any]:
         where=str(path),
         remedy="give an image, a calibration, a cloud, probed points, a recording or a folder",
     )
+
+
+def _by_product(path: Path, data: bytes, content: dict[str, Any]) -> str:
+    """What a file is that armscan writes beside its results and does not read; empty for others."""
+    if {"kind", "simulated"} <= content.keys():
+        return f"what `armscan` says with --json ({content['kind']})"
+    if {"head", "preset", "seed", "simulated"} <= content.keys():
+        return f"truth of a simulation ({content['head']})"
+    if OWN_PAGE in data[:2000]:
+        return "page of armscan; open it in a browser"
+    first = data[:1000].decode("utf-8", "replace").splitlines()[:5]
+    if path.name == "files.txt" and all(is_file(path.parent / name) for name in first):
+        return "list of the files that stand beside it"
+    return ""
 
 
 def _image(path: Path) -> dict[str, Any]:
@@ -441,8 +472,11 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
 
 
 def _cloud(cloud: PointCloud) -> dict[str, Any]:
-    ranges = _ranges(cloud.points_mm.T)
-    return {"what": f"point cloud, {len(cloud)} points", **_carried(cloud), **ranges}
+    return {
+        "what": f"point cloud, {len(cloud)} points",
+        **_carried(cloud),
+        **_ranges(cloud.points_mm.T),
+    }
 
 
 def _carried(cloud: PointCloud) -> dict[str, Any]:
@@ -452,7 +486,7 @@ def _carried(cloud: PointCloud) -> dict[str, Any]:
         **({"forced": list(cloud.forced)} if cloud.forced else {}),
         "sheets": list(cloud.sheet_names),
         "exposures": list(cloud.exposure_sources),
-        "median_sigma_mm": float(np.median(cloud.sigma_mm)) if len(cloud) else 0.0,
+        "median_sigma_mm": float(np.median(cloud.sigma_mm)) if cloud.covariance_mm2.any() else None,
     }
 
 

@@ -125,10 +125,12 @@ class Job:
         written = (*files, *(() if self.pdf is None else (self.pdf,)))
         for path in written:
             if path.exists() and any(one.exists() and path.samefile(one) for one in reads):
+                word = "inspection" if self.output.suffix == ".html" else "new"
+                beside_it = " beside the page" if path.suffix != self.output.suffix else ""
                 raise OutputError(
-                    f"{path.name} is read, and would be replaced beside the page",
+                    f"{path.name} is read, and would be replaced{beside_it}",
                     where=f"-o {self.output}",
-                    remedy=f"give another name: -o {self.output.stem}-inspection.html",
+                    remedy=f"give another name: -o {self.output.stem}-{word}{self.output.suffix}",
                 )
         check_outputs(written, is_overwriting=self.is_overwriting)
         if self.pdf is not None:

@@ -53,7 +53,7 @@ def probe(
         If a file is unreadable, an option is wrong, or the touches determine no plate; nothing is
         written then.
     """
-    job.places(".csv")
+    job.places(".csv", reads=(source,))
     touches = read_touches(source, tip)
     fit = fit_probed_plate(touches.points, touches.towards_mm, options or ProbingOptions())
     plate = solved(fit, source)
@@ -112,6 +112,11 @@ def plate_quantities(plate: ProbedPlate) -> tuple[Quantity, ...]:
     points = f"{reference.n_points} of {len(plate.is_used)} touches"
     if reference.tip_diameter_mm:
         points += f", tip of {reference.tip_diameter_mm:g} mm compensated"
+    else:
+        points += (
+            ", taken to be on the surface: no tip's radius was taken off; above centres of a tip "
+            "write '# point = tip-centre, tip_diameter_mm = 6'"
+        )
     text_of_plane = " ".join(f"{value:.9g}" for value in plane.coefficients) + " (D in mm)"
     tilt_1 = tilt_2 = offset = None
     text = ""

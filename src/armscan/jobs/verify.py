@@ -8,9 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.calibration.hand_eye.probed_plate import ProbeSide
-from armscan.errors import OptionError
+from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box, FloatArray
+from armscan.geometry.shapes import plane_from_coefficients
 from armscan.inspection.conformity import RULE, Check, Verdict
 from armscan.inspection.results import SphereInspection
 from armscan.inspection.selection import InspectionOptions
@@ -25,6 +27,7 @@ from armscan.pipeline.verify import (
     verify_on_ball,
     verify_on_plate,
 )
+from armscan.records.cloud import PointCloud
 from armscan.report.inspection.shapes import (
     InspectionReport,
     inspection_page,
@@ -47,8 +50,9 @@ from armscan.report.quantity import (
 from armscan.storage.arm import read_arm_model
 from armscan.storage.clouds import read_cloud
 from armscan.storage.documents import read_scanner_calibration
-from armscan.storage.files import holds_files
+from armscan.storage.files import holds_files, path_text
 from armscan.storage.image_paths import are_simulated
+from armscan.storage.points import parse_plane
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE
 
@@ -69,9 +73,11 @@ class Standard:
     ball_mm
         Diameter of the standard ball; None if a plate was scanned.
     plate
-        Probed points of the plate, or its coefficients; None if a ball was scanned.
+        File of probed points of the plate, or of its coefficients; None for none.
     side
         Side of the plate that was touched; None to take it from where the tool was.
+    plane
+        ``A,B,C,D`` of the plate in Base, D in mm; empty for none.
 
     Raises
     ------
@@ -82,11 +88,13 @@ class Standard:
     ball_mm: float | None = None
     plate: Path | None = None
     side: ProbeSide | None = None
+    plane: str = ""
 
     def __post_init__(self) -> None:
-        if (self.ball_mm is None) == (self.plate is None):
+        if [self.ball_mm is None, self.plate is None, not self.plane].count(False) != 1:
             raise OptionError(
-                "a check needs one standard", remedy="give either --ball DIAMETER or --plate FILE"
+                "a check needs one standard",
+                remedy="give one of --ball DIAMETER, --plate FILE and --plane A,B,C,D",
             )
         if self.side is not None and self.plate is None:
             raise OptionError("a side needs a plate", where="--side", remedy="give --plate")
@@ -116,7 +124,7 @@ def verify(
     scan
         A recording's folder, or a cloud in Base.
     scanner
-        ``scanner.json``; may be None for a cloud only.
+        ``scanner.json``; may be None for a cloud only, which must have been measured with it.
     standard
         What was scanned.
     arm
@@ -141,7 +149,9 @@ def verify(
     inputs = [path for path in (table, scanner, standard.plate, arm) if path is not None]
     measured, is_simulated = _measured(scan, scanner, arm, job.progress)
     is_simulated = is_simulated or are_simulated(inputs)
+    unsaid = () if measured.scan is not None else _of_scanner(measured.cloud, scan, scanner)
     result = _verified(measured, standard, box, options, inspection)
+    result = replace(result, warnings=(*unsaid, *result.warnings))
     report = _report(scan.name, result, measured)
     forced = measured.cloud.forced
     written: tuple[Path, ...] = ()
@@ -200,6 +210,37 @@ def _measured(
     return Measured(found.cloud, found, calibration), source.is_simulated
 
 
+def _of_scanner(cloud: PointCloud, path: Path, scanner: Path | None) -> tuple[str, ...]:
+    """What is not known of whether a cloud was measured with the scanner that is given, in words.
+
+    Raises
+    ------
+    FileFormatError
+        If the document cannot be read.
+    InputError
+        If the cloud names other calibrations.
+    """
+    if scanner is None:
+        return ()
+    own = read_scanner_calibration(scanner).provenance.document_id
+    named = [mark.document_id for mark in cloud.calibrations]
+    if not named:
+        return (
+            "the cloud does not say which calibration it was measured with: that it was "
+            f"{scanner.name} is taken from you",
+        )
+    if own not in named:
+        raise InputError(
+            f"the cloud was measured with the calibration {', '.join(named)}, and {scanner.name} "
+            f"is {own}",
+            where=path_text(path),
+            remedy="give the document that it was measured with, or reconstruct it with this one",
+        )
+    if len(named) > 1:
+        return (f"the cloud was measured with {len(named)} calibrations, not with this one alone",)
+    return ()
+
+
 def _verified(
     measured: Measured,
     standard: Standard,
@@ -207,14 +248,23 @@ def _verified(
     options: VerifyOptions,
     inspection: InspectionOptions,
 ) -> Verification:
-    if standard.plate is None:
-        diameter = standard.ball_mm or math.nan
+    if standard.ball_mm is not None:
+        diameter = standard.ball_mm
         return verify_on_ball(measured, diameter, options, region=region, inspection=inspection)
     middle = measured.cloud.points_mm.mean(axis=0)
-    towards = _tool_places(measured)
-    plate, weak = read_plate(standard.plate, middle, towards_mm=towards, side=standard.side)
+    plate, weak = _plate(standard, middle, _tool_places(measured))
     found = verify_on_plate(measured, plate, options, region=region, inspection=inspection)
     return replace(found, warnings=(*weak, *found.warnings))
+
+
+def _plate(
+    standard: Standard, middle_mm: FloatArray, towards_mm: FloatArray | None
+) -> tuple[PlateReference, tuple[str, ...]]:
+    """The plate, and what is weak about it; ``middle_mm`` (3,) is that of the scanned points."""
+    if standard.plate is not None:
+        return read_plate(standard.plate, middle_mm, towards_mm=towards_mm, side=standard.side)
+    plane = plane_from_coefficients(parse_plane(standard.plane, "--plane"), middle_mm)
+    return PlateReference(plane=plane, source="--plane"), ()
 
 
 def _tool_places(measured: Measured) -> FloatArray | None:

@@ -39,6 +39,8 @@ from armscan.records.points import MarkerSet
 
 CLEAR_LEAD = 2
 """Markers that the best alignment must explain more than any other."""
+MIRROR_LEAD = 1.5
+"""Times as many markers that a mirror image must explain."""
 LINE_SIGMAS = 15.0
 UNIFORM = float(np.sqrt(12.0))
 """Extent of a uniform distribution over its standard deviation."""
@@ -82,7 +84,10 @@ def match_markers(
     are_seen = first.frame == second.frame == "Sensor"
     found = find_alignments(placing, votes, are_seen=are_seen)
     result = _judged(placing, votes, found, options)
-    return _unless_symmetric(result, placing) if isinstance(result, Matched) else result
+    if isinstance(result, Matched):
+        return _unless_symmetric(result, placing)
+    mirrored = _mirrored(a, b, len(found[0]) if found else 0)
+    return result if mirrored is None else mirrored
 
 
 def log10_false_alarms(
@@ -131,6 +136,23 @@ def _judged(
         fact = f"{n} markers agree, and {options.least_common} are asked for"
         return NoMatch(fact, ENOUGH_MARKERS, n)
     return Matched(found[0], rival)
+
+
+def _mirrored(first: LabelledMarkers, second: LabelledMarkers, n_best: int) -> NoMatch | None:
+    """Notice sets of which one is the other's mirror image; None if they are not."""
+    if spread_mm(second.points_mm)[2] < LINE_SIGMAS * float(second.sigma_mm.max()):
+        # in a plane the mirror image is the same set turned over
+        return None
+    mirror = label_points(second.points_mm * np.array([1.0, 1.0, -1.0]), second.sigma_mm)
+    found = find_alignments(MarkerPlacement(first, mirror), vote(first, mirror))
+    n = len(found[0]) if found else 0
+    if n <= LEAST_TO_CHECK or n < MIRROR_LEAD * n_best:
+        return None
+    return NoMatch(
+        f"one list is the mirror image of the other: {n} markers agree so, {n_best} as they are",
+        "look whether an axis of one list is reversed",
+        n_best,
+    )
 
 
 def _ambiguity(

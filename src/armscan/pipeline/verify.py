@@ -40,6 +40,11 @@ NO_POSES = (
     "a cloud does not tell how an error of the hand-eye acts on it, so errors are taken as "
     "independent between blocks of exposures; give the recording for a sharper check"
 )
+FEW_EXPOSURES = "too few exposures to see whether they agree"
+FUSED_EXPOSURES = (
+    "the cloud is fused and no longer tells its exposures apart, so that whether they agree is not "
+    "seen; verify the recording, or the cloud from before it was fused"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,10 +80,15 @@ class VerifyOptions:
     reference_u_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        lengths = {"limit": self.mpe_mm, "uncertainty of the standard": self.reference_u_mm}
-        for name, length in lengths.items():
+        lengths = {
+            ("limit", "--mpe"): self.mpe_mm,
+            ("uncertainty of the standard", "--uncertainty"): self.reference_u_mm,
+        }
+        for (name, option), length in lengths.items():
             if length is not None and not 0.0 <= length < math.inf:
-                raise OptionError(f"the {name} is {length} mm", remedy="give 0 mm or more")
+                raise OptionError(
+                    f"the {name} is {length:g} mm", where=option, remedy="give 0 mm or more"
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,7 +280,7 @@ def _judged(
     sound = None if scan is None else check_contradictions(scan.contradictions)
     checks = tuple(c for c in (size, consistency, spread, off, sound) if c is not None)
     if spread is None or (scan is not None and consistency is None):
-        warnings = (*warnings, "too few exposures to see whether they agree")
+        warnings = (*warnings, FUSED_EXPOSURES if cloud.is_fused else FEW_EXPOSURES)
     if not variance.any():
         warnings = (*warnings, "the cloud carries no standard deviations to compare with")
     return Verification(checks, worst(tuple(c.verdict for c in checks)), found, warnings)

@@ -117,7 +117,11 @@ class ProbedPoints:
         points = frozen_floats(self.points_mm, (None, 3), "probed points (mm)")
         object.__setattr__(self, "points_mm", points)
         if not 0.0 <= self.tip_diameter_mm < 1000.0:
-            raise InputError(f"a tip of {self.tip_diameter_mm} mm diameter", where=self.source)
+            raise InputError(
+                f"a tip of {self.tip_diameter_mm:g} mm diameter",
+                where=self.source,
+                remedy="give the tip's diameter in mm, below 1000",
+            )
         if self.features and len(self.features) != len(points):
             raise InputError(
                 f"{len(self.features)} features for {len(points)} points", where=self.source

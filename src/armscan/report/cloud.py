@@ -331,9 +331,12 @@ def digest_view(digest: CloudDigest) -> Picture:
     is_z_up = cloud.frame != "Sensor"
     scene = scene_markup([dots], [], [], "Measured points in space", is_z_up=is_z_up)
     shown = f" One point in {step} is shown." if step > 1 else ""
+    title = f"Points in space ({cloud.frame} frame)"
+    if not sigma_um.any():
+        return Picture(scene, title=title, caption=f"Standard deviations are not known.{shown}")
     return Picture(
         ramp_markup(f"sigma {significant(low)} µm", f"{significant(high)} µm") + scene,
-        title=f"Points in space ({cloud.frame} frame)",
+        title=title,
         caption="Colour is each point's standard deviation along its worst direction, "
         f"{'stripe noise, arm' if is_z_up else 'stripe noise'} and calibration together."
         f"{shown}",

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -195,8 +197,16 @@ def summary_text(summary: Summary) -> str:
         lines.append("")
     lines += [f"wrote {path}" for path in summary.written]
     if summary.next_step:
-        lines.append(f"next: {summary.next_step}")
+        lines.append(f"next: {_quoted(summary.next_step, summary.written)}")
     return "\n".join(lines)
+
+
+def _quoted(text: str, paths: Sequence[Path]) -> str:
+    """A text with its paths as a shell takes them, where that is another text."""
+    names = sorted((str(path) for path in paths), key=len, reverse=True)
+    if not names:
+        return text
+    return re.sub("|".join(map(re.escape, names)), lambda found: shlex.quote(found[0]), text)
 
 
 def with_sigma(value: float, sigma: float, unit: str = "") -> str:

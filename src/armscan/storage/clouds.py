@@ -7,13 +7,18 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from armscan.errors import FileFormatError, OptionError
+from armscan.errors import FileFormatError, OptionError, OutputError
 from armscan.geometry.arrays import IntArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
 from armscan.records.cloud import PointCloud
-from armscan.storage.codec import parse_json
-from armscan.storage.documents import read_calibration, read_camera_calibration
+from armscan.storage.documents import (
+    SCANNER_SCHEMA,
+    document_schema,
+    read_calibration,
+    read_camera_calibration,
+    read_scanner_calibration,
+)
 from armscan.storage.files import check_outputs, is_file, read_bytes, write_files
 from armscan.storage.foreign import camera_info_yaml
 from armscan.storage.formats import e57, las, meshes, pcd, text
@@ -322,6 +327,12 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         If the output exists or cannot be written.
     """
     suffix = output.suffix.lower()
+    if output.exists() and source.exists() and output.samefile(source):
+        raise OutputError(
+            f"{output.name} is read, and would be replaced",
+            where=str(output),
+            remedy="give another name",
+        )
     if suffix == ".stl" and source.suffix.lower() in (*MESH_SUFFIXES, *STEP_SUFFIXES):
         return _convert_model(source, output, is_overwriting=is_overwriting)
     is_cloud = source.suffix.lower() in BY_SUFFIX
@@ -340,6 +351,7 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         what = f"cloud to {BY_SUFFIX[suffix].name}"
         losses = cloud_losses(cloud, output, kept)
         holds_sigma = SIGMA_LOSS not in losses
+        losses = tuple(words for words in losses if words not in _never_had(found))
         without = (NO_SIGMA,) if holds_sigma and not cloud.covariance_mm2.any() else ()
         conversion = Conversion(what, losses, (*found.remarks, *without), cloud.forced)
     else:
@@ -348,6 +360,21 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         conversion = Conversion("camera to ROS camera_info", YAML_LOSES, (), forced)
     write_files({output: content}, is_overwriting=is_overwriting)
     return conversion
+
+
+def _never_had(source: CloudFile) -> set[str]:
+    """What files may lose, in their words, of which a source has nothing."""
+    cloud = source.cloud
+    has = {
+        "normals": cloud.normals is not None,
+        SIGMA_LOSS: cloud.covariance_mm2.any(),
+        "sheet, exposure and segment": any(cloud.sheet_names),
+        "intensity": cloud.intensity.any(),
+        "where the sensor stood": cloud.seen_from_mm is not None,
+        "which calibration": bool(cloud.calibrations),
+        "n_points of a fused cloud": source.n_points is not None,
+    }
+    return {words for words, it_has in has.items() if not it_has}
 
 
 def _convert_model(source: Path, output: Path, *, is_overwriting: bool) -> Conversion:
@@ -365,8 +392,17 @@ def _convert_model(source: Path, output: Path, *, is_overwriting: bool) -> Conve
 
 
 def _camera(path: Path) -> tuple[CameraModel, tuple[str, ...]]:
-    data = read_bytes(path)
-    is_own = data.lstrip().startswith(b"{") and "schema" in parse_json(data, str(path))
+    schema = document_schema(path)
+    if schema == SCANNER_SCHEMA:
+        sensor = read_scanner_calibration(path).sensor
+        if sensor is None:
+            raise FileFormatError(
+                "the scanner's sensor delivers points, and has no camera",
+                where=str(path),
+                remedy="give a calibration with a camera",
+            )
+        return sensor.camera.camera, sensor.camera.provenance.forced
+    is_own = schema is not None
     calibration = read_calibration(path) if is_own else read_camera_calibration(path)
     if isinstance(calibration, SensorCalibration):
         return calibration.camera.camera, calibration.camera.provenance.forced

@@ -112,6 +112,13 @@ def _found(pattern: str) -> list[Path]:
     path = Path(pattern)
     if holds_files(path):
         images = [item for item in files_in(path) if item.suffix.lower() in IMAGE_SUFFIXES]
+        if not images and path.suffix.lower() == ".mcap":
+            raise FileFormatError(
+                "this is a recording in one file, where images are asked for",
+                where=pattern,
+                remedy=f"write its images with `armscan convert {path} FOLDER`, and name "
+                "FOLDER/images",
+            )
         if not images:
             raise FileFormatError(
                 "the folder holds no image",

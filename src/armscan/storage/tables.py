@@ -8,7 +8,7 @@ import io
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -29,6 +29,15 @@ PLAIN_NUMBERS = re.compile(r"[-+0-9.eE\n]*")
 PLAIN_INTEGERS = re.compile(r"-?[0-9]{1,18}(?:\n-?[0-9]{1,18})*")
 LINE_BREAK = re.compile(r"\r\n|\n|\r")
 COORDINATES = ("x_mm", "y_mm", "z_mm")
+OTHER_UNITS = {
+    "m": ("metres", "1000"),
+    "cm": ("centimetres", "10"),
+    "um": ("micrometres", "0.001"),
+    "µm": ("micrometres", "0.001"),
+    "in": ("inches", "25.4"),
+    "inch": ("inches", "25.4"),
+}
+"""Units that columns of coordinates may have in place of mm, and how many mm they are."""
 MOST_COLUMNS, MOST_CELLS = 500, 20_000_000
 """No table of armscan has more; some gigabytes of memory hold so many cells."""
 MOST_QUOTED = 60
@@ -99,14 +108,9 @@ class CsvTable:
         Raises
         ------
         FileFormatError
-            If columns or rows are missing, a cell is no number, or the points are in metres.
+            If columns or rows are missing, a cell is no number, or the points are in another unit.
         """
-        if {"x_m", "y_m", "z_m"} <= set(self.columns):
-            raise FileFormatError(
-                "the columns x_m, y_m, z_m are in metres",
-                where=self.where,
-                remedy="multiply them by 1000 and name them x_mm, y_mm, z_mm",
-            )
+        refuse_other_units(self.columns, self.where)
         self.require(COORDINATES, noun)
         points = self.floats(COORDINATES)
         extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
@@ -397,6 +401,24 @@ def _wrong_length(
         where=f"{where}, line {number}",
         remedy=remedy,
     )
+
+
+def refuse_other_units(names: Iterable[str], where: str) -> None:
+    """Raise for a heading's columns of coordinates in another unit than mm.
+
+    Raises
+    ------
+    FileFormatError
+        If there are three of them.
+    """
+    for unit, (word, factor) in OTHER_UNITS.items():
+        found = [name for name in names if name.lower() in {f"{axis}_{unit}" for axis in "xyz"}]
+        if len(found) == len(COORDINATES):
+            raise FileFormatError(
+                f"the columns {', '.join(found)} are in {word}",
+                where=where,
+                remedy=f"multiply them by {factor} and name them {', '.join(COORDINATES)}",
+            )
 
 
 def refuse_beyond_reach(points_mm: FloatArray, where: str) -> None:

@@ -26,7 +26,7 @@ from armscan.inspection.results import MeasuredLength
 from armscan.inspection.search import WantedFeature
 from armscan.inspection.selection import InspectionOptions
 from armscan.records.cloud import PointCloud
-from armscan.report.inspection.features import relation_report
+from armscan.report.inspection.features import feature_report, relation_report
 from rigs.feature_clouds import BALL_MM, BORE_MM, BOSS_MM, CONE_DEG, workpiece
 from rigs.inspection_clouds import cloud_of
 
@@ -66,6 +66,25 @@ def test_round_features_are_found_among_others(
     assert one.diameter.value_mm == pytest.approx(truth, abs=4.0 * one.diameter.sigma_mm)
     assert one.diameter.sigma_mm < 0.02
     assert one.seen_deg > 180.0
+    assert not any("may be of no" in text for text in feature_report(one, part).warnings)
+
+
+@pytest.mark.parametrize("shape", ["cone of 25 degrees", "two flat faces"])
+def test_a_cylinder_in_another_shape_is_doubted(shape: str) -> None:
+    rng = np.random.default_rng(1)
+    if shape == "two flat faces":
+        x, y = rng.uniform(0.0, 60.0, 6000), rng.uniform(0.0, 20.0, 6000)
+        points = np.column_stack([x, y, np.where(x > 30.0, 5.0, 0.0)])
+    else:
+        height, turn = rng.uniform(5.0, 30.0, 6000), rng.uniform(0.0, 4.4, 6000)
+        radius = height * math.tan(math.radians(25.0))
+        points = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
+    cloud = cloud_of(points + rng.normal(0.0, 0.01, points.shape))
+    one = inspect_feature(cloud, WantedFeature("cylinder"))
+    doubts: tuple[str, ...] = ("refused",)
+    if not isinstance(one, FitFailure):
+        doubts = feature_report(one, cloud).warnings
+    assert any("may be of no cylinder" in text or text == "refused" for text in doubts)
 
 
 def test_a_cone_and_a_plane(part: PointCloud) -> None:

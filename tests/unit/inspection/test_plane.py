@@ -13,6 +13,7 @@ from armscan.geometry.shapes import Plane, plane_from_coefficients
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection
 from armscan.inspection.selection import InspectionOptions
+from armscan.report.inspection.shapes import plane_report
 from rigs.inspection_clouds import cloud_of, random_motion
 
 GRID = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0), [0.0]), axis=-1).reshape(-1, 3)
@@ -57,6 +58,40 @@ def test_outliers_leave_the_fit_but_not_the_statistics() -> None:
     assert found.fitted.value("within_50_um_percent") == pytest.approx(90.0)
     assert abs(found.plane.normal[2]) == pytest.approx(1.0, abs=1e-6)
     assert len(found.fitted.deviations_mm) == 200
+
+
+def test_without_normals_the_positive_side_is_that_of_the_largest_axis() -> None:
+    points = GRID + np.random.default_rng(3).normal(0.0, 0.01, GRID.shape)
+    for axis in range(3):
+        turned = np.roll(points, axis + 1, axis=1) @ np.diag([1.0, -1.0, 1.0])
+        for order in (slice(None), slice(None, None, -1)):
+            found = inspected(inspect_plane(cloud_of(turned[order])))
+            assert found.plane.normal[axis] == pytest.approx(1.0, abs=1e-3)
+            assert found.side_text == f"on the side of +{'xyz'[axis]}: the cloud has no normals"
+    down = np.tile([0.0, 0.0, -1.0], (len(points), 1))
+    found = inspected(inspect_plane(cloud_of(points, normals=down)))
+    assert found.plane.normal[2] < -0.9
+    assert "scanned side" in found.side_text
+
+
+def test_a_tilted_face_is_said_to_go_on_beyond_the_limit() -> None:
+    points = GRID + np.outer(0.2 * GRID[:, 0], [0.0, 0.0, 1.0])
+    other = GRID + np.array([0.0, 0.0, 8.0])
+    cloud = cloud_of(np.concatenate([points, other]))
+    found = inspected(inspect_plane(cloud, given_plane(0.0, 0.0, 1.0, 0.0)))
+    assert found.counts.n_feature == 60
+    assert found.n_beyond == 140
+    assert any("140 points (70 %)" in text for text in plane_report(found, cloud).warnings)
+    level = inspected(inspect_plane(cloud_of(np.concatenate([GRID, other])), found.reference))
+    assert level.n_beyond == 0
+
+
+def test_too_few_points_for_a_face_name_no_plane_that_nobody_gave() -> None:
+    points = np.random.default_rng(0).uniform(0.0, 500.0, (200, 3))
+    found = inspect_plane(cloud_of(points))
+    assert isinstance(found, FitFailure)
+    assert found.reason.startswith("there is no flat face: at the best place for one, ")
+    assert "check the plane" not in found.remedy
 
 
 def test_moving_points_and_reference_changes_nothing() -> None:

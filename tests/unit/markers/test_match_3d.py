@@ -82,7 +82,8 @@ def test_a_mirror_image_is_no_match() -> None:
     for seed in range(10):
         points = scattered(np.random.default_rng(seed), 10, SOLID)
         found = match_markers(marker_set(points), marker_set(points * [1.0, 1.0, -1.0]))
-        assert not isinstance(found, Matched)
+        assert isinstance(found, NoMatch)
+        assert found.reason.startswith("one list is the mirror image of the other: 10 markers")
 
 
 def test_a_flat_set_is_not_matched_with_its_back_by_two_sensors() -> None:

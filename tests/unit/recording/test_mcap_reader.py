@@ -166,6 +166,7 @@ def test_without_the_end_lost_exposures_are_counted_as_far_as_known(
     assert json.loads(summary_json(summary))["lost_exposures"] is None
     assert summary.data["least_lost_exposures"] == 3 * is_gap
     assert ("lost: at least 3 exposures" in summary.warnings) is is_gap
+    assert not any("lost: 0 bytes" in text for text in summary.warnings)
 
 
 def test_what_is_left_without_its_beginning_has_its_session(

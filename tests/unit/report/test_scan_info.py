@@ -11,13 +11,14 @@ import pytest
 
 from armscan.cli.run import main
 from armscan.errors import FileFormatError
-from armscan.jobs.info import describe_files
+from armscan.jobs.info import OWN_PAGE, describe_files
 from armscan.models.arm import thesis_arm
 from armscan.records.recording import ArmTrack
 from armscan.report.quantity import summary_json, summary_text
 from armscan.storage.arm import ProbeTip, arm_model_toml, write_probing
 from armscan.storage.clouds import read_cloud, write_cloud
 from armscan.storage.documents import scanner_document
+from armscan.storage.parts.meshes import encoded_surface
 from rigs.calibration_documents import scanner_calibration
 from rigs.recording_folders import ARM, EXPOSURES, lab_folder
 
@@ -116,6 +117,35 @@ def test_clouds_as_text_are_described_as_clouds(tmp_path: Path) -> None:
     write_cloud(own, replace(read_cloud(plain), frame="Base"))
     assert described(own)["what"] == "point cloud, 2 points"
     assert described(own)["frame"] == "Base"
+
+
+def test_what_armscan_writes_beside_its_results_is_called_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "summary.json").write_text('{"kind": "demo", "simulated": true}')
+    (tmp_path / "truth.json").write_text(
+        '{"simulated": true, "head": "thesis-single", "preset": "thesis", "seed": 1}'
+    )
+    (tmp_path / "page.html").write_text(f"<html>{OWN_PAGE.decode()}</html>")
+    (tmp_path / "files.txt").write_text("summary.json\ntruth.json\n")
+    corners = np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, 0.0, 9.0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    (tmp_path / "part.stl").write_bytes(encoded_surface(".stl", corners, faces, "part"))
+    for name, what in {
+        "summary.json": "what `armscan` says with --json (demo)",
+        "truth.json": "truth of a simulation (thesis-single)",
+        "page.html": "page of armscan; open it in a browser",
+        "files.txt": "list of the files that stand beside it",
+        "part.stl": "model of a part, 4 triangles, 4 corners",
+    }.items():
+        assert described(tmp_path / name)["what"] == what
+
+
+def test_what_is_not_known_is_no_zero(tmp_path: Path) -> None:
+    plain = tmp_path / "cloud.xyz"
+    plain.write_text("1 2 3\n4 -5 6\n")
+    assert described(plain)["median_sigma_mm"] is None
+    told = describe_files([str(plain)]).quantities[0].text
+    assert "median sigma mm: not known" in told
+    assert "x range: 1.0, 4.0 mm" in told
 
 
 def test_other_tables_are_refused(tmp_path: Path) -> None:

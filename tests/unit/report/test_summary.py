@@ -55,6 +55,16 @@ def test_a_few_digits(value: float, text: str) -> None:
     assert significant(value, "mm") == text
 
 
+def test_a_path_with_a_blank_is_quoted_where_it_is_to_be_typed() -> None:
+    path = Path("a b/page.html")
+    told = summary_text(Summary("Done.", written=(path, Path("a b")), next_step=f"open {path}"))
+    assert told.splitlines()[-3:] == [
+        f"wrote {path}", "wrote a b", f"next: open '{path}'",
+    ]  # fmt: skip
+    plain = Summary("Done.", written=(Path("page.html"),), next_step="open page.html")
+    assert summary_text(plain).endswith("next: open page.html")
+
+
 def test_sentences() -> None:
     assert sentence("all is well") == "All is well."
     assert sentence("Done.") == "Done."

@@ -348,9 +348,15 @@ def _rows_of_feature(probed: ProbedPoints, options: ProbingOptions) -> BoolArray
     names = sorted({name for name in probed.features if name})
     if not options.feature and len(names) <= 1:
         return np.ones(len(probed), dtype=np.bool_)
+    if not names:
+        raise InputError(
+            f"no point names a feature, so there is none called '{options.feature}'",
+            where=probed.source,
+            remedy="name no feature, or give the table a column feature",
+        )
     if options.feature not in names:
         raise InputError(
-            f"the points belong to the features {', '.join(names) or 'of no name'}",
+            f"the points belong to the features {', '.join(names)}",
             where=probed.source,
             remedy="take the one that is the plate: armscan probe POINTS --feature NAME "
             "-o plate.csv",

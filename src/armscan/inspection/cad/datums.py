@@ -53,6 +53,8 @@ from armscan.inspection.search import SAME_SIDE
 from armscan.inspection.selection import MIN_POINTS, fit_robustly
 from armscan.records.cloud import PointCloud
 
+LEAST_SEEN = 0.01
+"""Part of a scan's points that a datum has at least: strays of the faces beside lie on any face."""
 DATUM_HOLDS = 0.02
 """A datum holds a motion that moves its points by this part of their way along their normals (rms):
 a face that leans by a degree on what is left holds nothing of it."""
@@ -186,9 +188,37 @@ def align(
     best = align_best(surface, cloud, errors_known)
     if method == "best" or isinstance(best, FitFailure):
         return best
-    if method == "321":
-        return align_datums(surface, cloud, datums.faces, best, errors_known)
-    return align_features(surface, cloud, datums.features, best, errors_known)
+    if method == "features":
+        return align_features(surface, cloud, datums.features, best, errors_known)
+    return _align_seen(surface, cloud, datums.faces, best, errors_known)
+
+
+def _align_seen(
+    surface: PartSurface,
+    cloud: PointCloud,
+    faces: Sequence[int],
+    best: Alignment,
+    errors_known: bool,
+) -> Alignment | FitFailure:
+    """As `align_datums`, from the pose that shows the datums, of those that fit equally well.
+
+    Of a symmetric part the datums tell which is meant. The best fit stays if it shows them all, or
+    none of the others does.
+    """
+    poses = [best.cad_from_part, *(one.cad_from_part for one in best.rivals if one.is_equal)]
+    rows = spread_rows(cloud.points_mm, MOST_POINTS)
+    seen = []
+    for pose in poses:
+        triangle = measured(surface, cloud, pose, rows).triangle
+        face = surface.part.face[triangle[triangle >= 0]]
+        seen.append(min(float((face == one).sum()) / len(rows) for one in faces))
+    most = 0 if seen[0] >= LEAST_SEEN or max(seen) < LEAST_SEEN else int(np.argmax(seen))
+    start = replace(best, cad_from_part=poses[most])
+    found = align_datums(surface, cloud, faces, start, errors_known)
+    if isinstance(found, FitFailure) and len(poses) > 1:
+        others = f"; it is not better in {len(poses) - 1} other poses that fit as well"
+        return replace(found, reason=found.reason + others)
+    return found
 
 
 def align_datums(

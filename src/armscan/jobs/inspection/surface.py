@@ -65,7 +65,7 @@ def draw_mesh(
     """
     if n_triangles is not None and n_triangles < LEAST_TRIANGLES:
         raise OptionError(f"--triangles is {n_triangles}", remedy="give 4 or more")
-    job.places(*SURFACE_SUFFIXES)
+    job.places(*SURFACE_SUFFIXES, reads=(path,))
     cloud = read_cloud(path)
     try:
         full = draw_surface(cloud, options)
@@ -165,7 +165,7 @@ def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
     """
     if job.output is None:
         raise OptionError("no output is named", where="-o", remedy="name the cloud to write")
-    places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
+    places = job.places(*CLOUD_SUFFIXES, beside=(".html",), reads=(path,))
     source = read_cloud_file(path)
     cloud = source.cloud
     found = clean_cloud(cloud, options)

@@ -56,6 +56,10 @@ OPTIONAL = {
     "scikit-image": "meshes",
     "pye57": "E57 clouds",
     "laspy": "LAS and LAZ clouds",
+    "fast-simplification": "meshes of fewer triangles",
+    "cadquery-ocp-novtk": "STEP files",
+    "weasyprint": "reports as PDF",
+    "viser": "the console",
 }
 
 

@@ -88,6 +88,7 @@ def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...
         ),
         Quantity("points.n_beyond_reach", "", beyond),
         Quantity("reach_mm", "", found.options.reach_mm),
+        fact("Positive", "outside the material; in a bore that is towards its axis"),
         Quantity("faces.n_seen", "Faces seen", seen, meaning=f"of {len(found.faces)}"),
         Quantity("alignment.method", "Alignment", a.method, shown=ALIGNMENTS[a.method]),
         Quantity(
@@ -261,7 +262,8 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
     if found.is_fused:
         texts.append(
             "the cloud is fused, so a single stripe that errs cannot be told from a dent: what "
-            "would fail is undecided"
+            "would fail is undecided; U of a face's mean lacks how far exposures disagree and may "
+            "be too small"
             + (f" ({', '.join(once)})" if once else "")
             + "; inspect the cloud from before it was fused"
         )

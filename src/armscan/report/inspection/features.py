@@ -33,6 +33,10 @@ COVERAGE = 2.0
 """Coverage factor k of U: 95 % of normal errors (GUM 6.3.3)."""
 NARROW_ARC_DEG = 90.0
 """Less of a turn tells radius and place poorly apart: their errors grow as 1 / arc^2."""
+ROUND = ("sphere", "cylinder", "cone")
+OTHER_SHAPE = 8.0
+"""Rms distance from a fitted shape, in scatters of neighbours, beyond which it is doubted: bores
+and bosses have 1, a cylinder in a cone of 25 degrees or in two flat faces 15 and more."""
 ANGLE_NOTE = "near 0 and 90 degrees it is the size of a tilt, which noise never makes negative"
 
 
@@ -41,7 +45,7 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
     kind = found.shape.kind
     main = found.nominal or found.fitted
     told = feature_quantities(found)
-    warnings = list(point_warnings(found.counts, cloud))
+    warnings = [*point_warnings(found.counts, cloud), *_shape_warnings(found)]
     if kind in ("circle", "cylinder", "cone") and found.seen_deg < NARROW_ARC_DEG:
         warnings.append(
             f"the points cover only {found.seen_deg:.0f} degrees of the turn, where radius and "
@@ -69,6 +73,21 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
         views=(feature_view(cloud, found.rows, main),),
         counts=found.counts,
         warnings=tuple(warnings),
+    )
+
+
+def _shape_warnings(found: FeatureInspection, whose: str = "") -> tuple[str, ...]:
+    """Warn of points that lie much farther off the shape than they lie off their neighbours."""
+    deviations = found.fitted.deviations_mm[found.is_fitted]
+    rms = math.sqrt(float(np.mean(deviations**2)))
+    kind = found.shape.kind
+    # written so that a scatter that is not known warns of nothing
+    if kind not in ROUND or not rms > OTHER_SHAPE * found.scatter_mm:
+        return ()
+    return (
+        f"{whose}the points may be of no {kind}: they lie {significant(rms, 'mm', 2)} (rms) off "
+        f"it, {rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, "
+        "and show where it is by a region or a seed",
     )
 
 
@@ -107,6 +126,7 @@ def feature_quantities(found: FeatureInspection) -> tuple[Quantity, ...]:
             meaning=f"{_form_meaning(kind)}, of all points, outliers included",
         )
     )
+    told.append(fact("Positive", POSITIVE[kind]))
     if found.diameter is not None:
         told += sigma_facts(found.diameter, "diameter")
     told += deviation_quantities("fitted", found.fitted)
@@ -178,6 +198,16 @@ def _direction(found: FeatureInspection) -> Quantity:
     )
 
 
+POSITIVE = {
+    "plane": "on the side to which the normal points",
+    "line": "always: distances from the line",
+    "circle": "outside the circle, farther from its centre; in a hole that is in the material",
+    "sphere": "outside the ball, farther from its centre; in a hollow that is in the material",
+    "cylinder": "farther from the axis than the surface; in a bore that is in the material",
+    "cone": "farther from the axis than the surface; in a bore that is in the material",
+}
+"""Which deviations are positive, by the kind of feature."""
+
 SHOWN = (
     "points.n_feature",
     "fitted.diameter",
@@ -234,6 +264,8 @@ def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
     warnings = (
         *point_warnings(found.first.counts, cloud, "first feature"),
         *point_warnings(found.second.counts, cloud, "second feature"),
+        *_shape_warnings(found.first, "first feature: "),
+        *_shape_warnings(found.second, "second feature: "),
     )
     deviations = np.concatenate([one.fitted.deviations_mm for one in both])
     return InspectionReport(

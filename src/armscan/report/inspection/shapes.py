@@ -61,6 +61,12 @@ NO_SIGMA = (
     "the cloud carries no standard deviations and no exposures, so it is not known how well the "
     "fit is determined"
 )
+FUSED_SIGMA = (
+    "the cloud is fused and no longer tells its exposures apart, so that no ± and no U is known; "
+    "inspect the cloud from before it was fused"
+)
+MUCH_BEYOND = 0.05
+"""Part of the points on a fitted plane that may lie too far from the nominal one to count."""
 STILL_SIGMA = fact(
     "Sigma of the height",
     "not known from one exposure: its error is the calibration's, which shifts both faces nearly "
@@ -138,6 +144,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
             shown=f"{a:.7f}, {b:.7f}, {c:.7f}, {d:.4f} mm",
         ),
         fact("Middle of the points", f"{triple(found.plane.point_mm)} mm"),
+        fact("Positive", found.side_text),
         *deviation_quantities("fitted", found.fitted),
     ]
     if found.nominal is None or found.offset is None:
@@ -176,7 +183,19 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         ),
         views=(feature_view(cloud, found.rows, main),),
         counts=found.counts,
-        warnings=point_warnings(found.counts, cloud),
+        warnings=(*point_warnings(found.counts, cloud), *_beyond_warnings(found)),
+    )
+
+
+def _beyond_warnings(found: PlaneInspection) -> tuple[str, ...]:
+    """Warn of a face that goes on where it is too far from the nominal plane to count."""
+    share = found.n_beyond / max(found.counts.n_feature + found.n_beyond, 1)
+    if share <= MUCH_BEYOND:
+        return ()
+    return (
+        f"{found.n_beyond:,} points ({100.0 * share:.0f} %) lie on the fitted plane too, but too "
+        "far from the nominal one to count: what is told is of a strip of the face; see whether "
+        "the nominal plane is the right one, or widen --feature-mm",
     )
 
 
@@ -204,6 +223,7 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
             found.seen_cap_deg,
             shown=f"half opening {found.seen_cap_deg:.0f} degrees; the whole ball is 180",
         ),
+        fact("Positive", "outside the ball, farther from its centre"),
         *sigma_facts(found.diameter, "diameter"),
         *deviation_quantities("fitted", found.fitted),
         *deviation_quantities("nominal", found.nominal),
@@ -349,7 +369,10 @@ def length_text(length: MeasuredLength) -> str:
 
 
 def sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
-    """Where the standard deviation of a length comes from."""
+    """Where the standard deviation of a length comes from; nothing of one that is not known."""
+    if math.isnan(length.sigma_mm):
+        return ()
+    origin = "propagated" if math.isfinite(length.sigma_propagated_mm) else "from scatter"
     return (
         fact(
             f"Sigma of the {name} from scatter",
@@ -359,11 +382,12 @@ def sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
         fact(
             f"Sigma of the {name} propagated",
             f"{significant(length.sigma_propagated_mm, 'mm')}: from the points' covariances, "
-            "common to exposures as far as what these disagree about tells; U is of it if known",
+            "common to exposures as far as what these disagree about tells",
         ),
+        fact("Shown after ±", f"the sigma {origin}"),
         fact(
             "Not in either",
-            "what a wrong calibration does alike to all exposures: `armscan verify` tests it",
+            "what a calibration errs more than it says: `armscan verify` tests it",
         ),
     )
 
@@ -425,6 +449,8 @@ def point_warnings(
     found = []
     if not cloud.covariance_mm2.any():
         found.append(NO_SIGMA)
+    elif cloud.is_fused:
+        found.append(FUSED_SIGMA)
     if counts.n_outliers > MANY_OUTLIERS * counts.n_feature:
         share = 100.0 * counts.n_outliers / counts.n_feature
         found.append(f"{share:.1f} % of the {whose}'s points are outliers: see the pictures")

@@ -219,7 +219,7 @@ def dropped_columns(found: CloudColumns) -> tuple[str, ...]:
         kept |= {"sigma_mm", "sigma_noise_mm", NOISE_LENGTH, *COVARIANCE, *INDICES}
     elif found.sources:
         kept.add("exposure")
-    return (*(name for name in found.columns if name not in kept), *found.passed_over)
+    return tuple(name for name in (*found.columns, *found.passed_over) if name not in kept)
 
 
 def structured(columns: Mapping[str, Column]) -> NDArray[Any]:
@@ -259,6 +259,7 @@ def cloud_of_columns(found: CloudColumns, path: Path) -> PointCloud:
         )
     points = _joined(found.columns, POINT)
     refuse_beyond_reach(points, where)
+    _refuse_gaps(points, where)
     n = len(points)
     zeros = np.zeros(n, dtype=np.int64)
     exposure = found.columns.get("exposure") if found.sources else None
@@ -279,6 +280,18 @@ def cloud_of_columns(found: CloudColumns, path: Path) -> PointCloud:
             is_simulated=SIMULATED in found.notes,
             forced=_names(found.notes, FORCED),
             calibrations=_calibrations(found.notes),
+        )
+
+
+def _refuse_gaps(points_mm: FloatArray, where: str) -> None:
+    """Raise for points (N, 3) without a place."""
+    rows = np.flatnonzero(np.isnan(points_mm).any(axis=1))
+    if len(rows):
+        raise FileFormatError(
+            f"{len(rows)} of {len(points_mm)} points have an x, y or z that is empty or nan, the "
+            f"first is point {int(rows[0]) + 1}",
+            where=where,
+            remedy="leave these points out, or write their values",
         )
 
 
@@ -304,6 +317,7 @@ def own_cloud(found: CloudColumns, where: str) -> PointCloud:
     covariance.setflags(write=False)
     points = _joined(columns, POINT)
     refuse_beyond_reach(points, where)
+    _refuse_gaps(points, where)
     with told_of(where):
         named = _named(found.notes)
         return PointCloud(

@@ -31,6 +31,7 @@ from armscan.storage.formats.columns import (
     cloud_columns,
     structured,
 )
+from armscan.storage.tables import refuse_other_units
 
 SIGMA_LOSS = "sigma_mm and covariance"
 XYZ_LOSES = (
@@ -113,7 +114,7 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
             where=path_text(path),
             remedy="write numbers with points: 1.5,2.5,3.5",
         )
-    named = _named(heading)
+    named = _named(heading, path)
     values = _values("\n".join(body), tuple(named.values()), path, start + 1)
     columns = {name: values[:, k] for k, name in enumerate(named)}
     read = set(named.values())
@@ -122,14 +123,24 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
     return CloudColumns(columns, _notes(lines), passed_over=passed_over if is_table else ())
 
 
-def _named(heading: list[str]) -> dict[str, int]:
-    """Numbers of the columns that are read, by name; without x, y and z in it the first three."""
+def _named(heading: list[str], path: Path) -> dict[str, int]:
+    """Numbers of the columns that are read, by name; without x, y and z in it the first three.
+
+    Raises
+    ------
+    FileFormatError
+        If x, y and z are in another unit.
+    """
     named: dict[str, int] = {}
-    for k, word in enumerate(heading):
-        name = KNOWN.get(word.strip("#/\"'").lower())
+    words = [word.strip("#/\"'").lower() for word in heading]
+    for k, word in enumerate(words):
+        name = KNOWN.get(word)
         if name is not None:
             named.setdefault(name, k)
-    return named if set(POINT) <= set(named) else {name: k for k, name in enumerate(POINT)}
+    if set(POINT) <= set(named):
+        return named
+    refuse_other_units(words, path_text(path))
+    return {name: k for k, name in enumerate(POINT)}
 
 
 def _values(body: str, columns: tuple[int, ...], path: Path, first: int) -> FloatArray:

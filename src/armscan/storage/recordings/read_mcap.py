@@ -204,7 +204,8 @@ class _Folder:
             if self.n_seen[topic] < self.n_said[topic]:
                 said.append(f"at least {self.n_said[topic] - self.n_seen[topic]} {what}")
         for one in self.damages[:LISTED]:
-            said.append(f"{one.n_bytes} bytes from byte {one.place} on ({one.reason})")
+            place = f"{one.n_bytes} bytes from byte {one.place} on ({one.reason})"
+            said.append(place if one.n_bytes else f"no byte that is there, but {one.reason}")
         if len(self.damages) > LISTED:
             rest = self.damages[LISTED:]
             said.append(f"{sum(one.n_bytes for one in rest)} bytes in {len(rest)} further places")

@@ -18,7 +18,13 @@ from armscan.geometry.features import SHAPE_KINDS, fit_shape
 from armscan.geometry.poses import Cad, Part, Pose
 from armscan.inspection.cad.alignment import Alignment, align_none
 from armscan.inspection.cad.comparison import CadComparison, CadOptions, compare_with_part
-from armscan.inspection.cad.datums import DatumFeature, align_features, datum_face
+from armscan.inspection.cad.datums import (
+    DatumFeature,
+    Datums,
+    align,
+    align_features,
+    datum_face,
+)
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import part_of
 from armscan.inspection.cad.reference_points import (
@@ -88,6 +94,34 @@ def test_faces_are_the_features_that_they_are() -> None:
     assert sorted(one.shape.kind for one in bent if isinstance(one, DatumFeature)) == [
         "cone", "cone", "plane", "plane",
     ]  # fmt: skip
+
+
+def test_of_a_symmetric_part_the_datums_tell_which_equal_pose_is_meant() -> None:
+    """A box lies four ways alike; the three faces that were scanned are the datums."""
+    box = part_of(box_corners([0, 0, 0], [40, 30, 10]), source="box")
+    surface, rng = PartSurface(box), np.random.default_rng(4)
+    u, v = rng.uniform(size=(2, 7000))
+    top = np.column_stack([40 * u, 30 * v, np.full(7000, 10.1)])[:4000]
+    front = np.column_stack([40 * u, np.full(7000, -0.05), 10 * v])[4000:5500]
+    side = np.column_stack([np.full(7000, 39.92), 30 * u, 10 * v])[5500:]
+    points = np.concatenate([top, front, side]) + rng.normal(0.0, 0.005, (7000, 3))
+    middles = box.vertices_mm[box.triangles].mean(axis=1)
+    seen = [
+        int(box.face[int(np.linalg.norm(middles - place, axis=1).argmin())])
+        for place in ([20.0, 15.0, 10.0], [20.0, 0.0, 5.0], [40.0, 15.0, 5.0])
+    ]
+    middle = np.array([20.0, 15.0, 5.0])
+    for flips in ([1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, -1.0]):
+        cloud = cloud_of((points - middle) * flips + middle, sigma_mm=0.0)
+        found = align(surface, cloud, "321", Datums(faces=tuple(seen)), False)
+        assert isinstance(found, Alignment), found
+        placed = found.cad_from_part.apply(cloud.points_mm)
+        for rows, k, place in (
+            (slice(0, 4000), 2, 10.0),
+            (slice(4000, 5500), 1, 0.0),
+            (slice(5500, 7000), 0, 40.0),
+        ):
+            assert np.median(placed[rows, k]) == pytest.approx(place, abs=0.002)
 
 
 def test_datums_hold_in_their_order() -> None:

@@ -139,6 +139,9 @@ EulerAngles = Annotated[
         show_default=DefaultOf("armscan.jobs.hand_eye:StripeSource.euler"),
     ),
 ]
+BackgroundImages = Annotated[
+    list[str] | None, typer.Option(help="The same views without laser; repeatable.")
+]
 LaserColourOption = Annotated[
     str | None,
     typer.Option(

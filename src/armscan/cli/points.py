@@ -10,6 +10,7 @@ import typer
 
 from armscan.cli.delivery import Work, job_command
 from armscan.cli.options import (
+    BackgroundImages,
     BitsAlign,
     BitsUsed,
     DefaultOf,
@@ -139,9 +140,7 @@ def stripes(
         typer.Argument(help="Image files, folders, or quoted patterns.", show_default=False),
     ],
     *,
-    background: Annotated[
-        list[str] | None, typer.Option(help="The same views without laser; repeatable.")
-    ] = None,
+    background: BackgroundImages = None,
     laser_colour: LaserColourOption = None,
     stripe_method: StripeMethodOption = None,
     bits_used: BitsUsed = None,
@@ -150,8 +149,8 @@ def stripes(
     """Find laser lines in images, without any calibration.
 
     A first look at photographs: where each line is, how well its centre is known, and why points
-    were flagged. Colour images are all looked at in the colour of their strongest lines, or in its
-    difference from the others where that shows more of them.
+    were flagged. Colour images are all looked at in the colour, or the difference of colours, that
+    shows most of their lines.
     """
     from armscan.jobs.photographs import find_stripes
     from armscan.storage.images import ImageOptions
@@ -159,8 +158,7 @@ def stripes(
 
     options = given(StripeOptions, laser_colour=laser_colour, method=stripe_method)
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
-    dark = background or ()
-    return lambda job: find_stripes(job, images, dark, stripes=options, image_options=pixels)
+    return lambda job: find_stripes(job, images, background, stripes=options, image_options=pixels)
 
 
 @job_command(MarkerFile, None)

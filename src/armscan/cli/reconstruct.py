@@ -11,6 +11,7 @@ import typer
 from armscan.cli.delivery import Work, job_command
 from armscan.cli.options import (
     ArmFile,
+    BackgroundImages,
     BitsAlign,
     BitsUsed,
     EulerAngles,
@@ -123,9 +124,7 @@ def reconstruct(
     *,
     images: Images,
     sensor: Calibration,
-    background: Annotated[
-        list[str] | None, typer.Option(help="The same views without laser; repeatable.")
-    ] = None,
+    background: BackgroundImages = None,
     right: Annotated[
         list[str] | None,
         typer.Option(help="Right camera's images of the same instants; of a stereo head."),

@@ -57,7 +57,7 @@ LARGE_MISCLOSURE = 2.0
 def find_stripes(
     job: Job,
     images: Sequence[str],
-    background: Sequence[str] = (),
+    background: Sequence[str] | None = None,
     *,
     stripes: StripeOptions | None = None,
     image_options: ImageOptions | None = None,
@@ -75,7 +75,7 @@ def find_stripes(
     images
         Files, folders or patterns.
     background
-        The same views without laser, one for each image, as such; none if empty.
+        The same views without laser, one for each image, as such; None for none.
     stripes, image_options
         How lines are found, and how pixels are read.
 

@@ -31,7 +31,7 @@ PROBE_EXAMPLE = (
 STRIPES_EXAMPLE = (
     "\b\nExamples:\n"
     "  armscan stripes 'photos/*.png'\n"
-    "  armscan stripes scan/ --laser-colour green --stripe-method fast -o lines.csv"
+    "  armscan stripes on/ --background off/ --laser-colour green -o lines.csv"
 )
 MARKERS_EXAMPLE = (
     "\b\nExamples:\n"
@@ -44,19 +44,14 @@ REGISTER_EXAMPLE = (
     "  armscan register before.csv --moved after.csv --cloud after.ply -o joined"
 )
 RINGS = "armscan.vision.rings:RingOptions."
+RIM = "Of the outer rim, untilted, px."
 LeastPerimeter = Annotated[
     float | None,
-    typer.Option(
-        help="Of the outer rim, untilted, px.",
-        show_default=DefaultOf(RINGS + "min_perimeter_px"),
-    ),
+    typer.Option(help=RIM, show_default=DefaultOf(RINGS + "min_perimeter_px")),
 ]
 MostPerimeter = Annotated[
     float | None,
-    typer.Option(
-        help="Of the outer rim, untilted, px.",
-        show_default=DefaultOf(RINGS + "max_perimeter_px"),
-    ),
+    typer.Option(help=RIM, show_default=DefaultOf(RINGS + "max_perimeter_px")),
 ]
 Roundness = Annotated[
     float | None,

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from armscan.errors import EstimationError, InputError, OptionError
+from armscan.geometry.arrays import FloatArray
 from armscan.jobs.job import Job
 from armscan.markers.candidates import RingMatchOptions
 from armscan.markers.stereo_matching import StereoMatches, match_rings
@@ -89,7 +91,7 @@ def find_stripes(
     places = job.places(".csv", beside=(".html",))
     paths = expand_paths(images)
     names = source_names(paths)
-    dark = _partners(paths, expand_paths(background) if background else [])
+    dark = _partners(paths, background)
     load_stripe_method(stripes.method)
     if stripes.laser_colour == "auto":
         colour = _common_colour(paths, image_options)
@@ -129,18 +131,31 @@ def find_stripes(
     )
 
 
-def _partners(paths: Sequence[Path], dark: Sequence[Path]) -> Sequence[Path | None]:
-    """The view without laser of each image: of the same name, else in order; none if none are."""
-    if not dark:
+def _partners(paths: Sequence[Path], background: Sequence[str] | None) -> Sequence[Path | None]:
+    """The view without laser of each image: of the same name, in order, or one for all of them."""
+    if not background:
         return [None] * len(paths)
+    dark = expand_paths(background)
+    if len(dark) == 1:
+        dark = dark * len(paths)
     if len(paths) != len(dark):
         raise InputError(
             f"{len(paths)} images with laser, but {len(dark)} without",
-            remedy="give one without laser for each image, in the same order",
+            remedy="give one without laser for each image, in the same order, or one for all",
         )
-    by_name = {path.name: path for path in dark}
-    if set(by_name) == {path.name for path in paths} and len(by_name) == len(dark):
-        return [by_name[path.name] for path in paths]
+    by_name, names = {path.name: path for path in dark}, [path.name for path in paths]
+    if len(by_name) == len(dark) and set(by_name) == set(names):
+        dark = tuple(by_name[name] for name in names)
+    for lit, without in zip(paths, dark, strict=True):
+        if without.name != lit.name and lit.name in by_name:
+            raise InputError(
+                f"{without.name} would be taken for its view without laser, where one of its own "
+                "name is given, too",
+                where=str(lit),
+                remedy="name all views without laser as their images, or none",
+            )
+        if lit.resolve() == without.resolve():
+            raise InputError("this image is given as its own view without laser", where=str(lit))
     return dark
 
 
@@ -150,8 +165,11 @@ JUDGES = 4
 """Images that are asked which difference from it shows more."""
 LONG = 40
 """Points of a segment that is hardly an edge or a blot; in whose number channels are compared."""
-MUCH_MORE = 1.2
-"""Of what the colour itself shows, which is less noisy than a difference."""
+MUCH_MORE, TOO_MUCH = 1.2, 3.0
+"""Of what the colour itself shows, which is less noisy than a difference; beyond, and beyond a line
+across each image, it is coloured print that the difference shows."""
+KEPT, NEAR_PX = 0.8, 2.0
+"""Share of the colour's own points that have one of the difference's beside them."""
 
 
 def _common_colour(paths: Sequence[Path], options: ImageOptions) -> LaserColour:
@@ -174,20 +192,39 @@ def _common_colour(paths: Sequence[Path], options: ImageOptions) -> LaserColour:
 def _clearest(
     colour: LaserColour, paths: Sequence[Path], stripes: StripeOptions, options: ImageOptions
 ) -> LaserColour:
-    """The colour itself, or that of its differences which shows much more of long lines.
+    """The colour itself, or that of its differences which shows much more of the same long lines.
 
     Light of the room is alike in all colours: on what is white or grey a difference hides it.
     """
     channels = [one for one in get_args(LaserColour) if one.partition("-")[0] == colour]
-    n_shown = dict.fromkeys(channels, 0)
+    n_shown, n_kept, n_across = dict.fromkeys(channels, 0), dict.fromkeys(channels, 0), 0
     for path in evenly_chosen(paths, JUDGES):
         exposure = read_exposure(path, options)
+        own: FloatArray | None = None
+        n_across += max(exposure.width_px, exposure.height_px)
         for channel in channels if exposure.colour != "mono" else ():
-            profile = extract_stripes(exposure, replace(stripes, laser_colour=channel))
-            counts = np.unique(profile.segment[profile.is_accepted], return_counts=True)[1]
-            n_shown[channel] += int(counts[counts >= LONG].sum())
-    clearest = max(channels, key=lambda channel: n_shown[channel])
-    return clearest if n_shown[clearest] > MUCH_MORE * n_shown[colour] else colour
+            points = _long_lines(extract_stripes(exposure, replace(stripes, laser_colour=channel)))
+            own = points if own is None else own
+            n_shown[channel] += len(points)
+            if len(points) and len(own):
+                away_px = np.asarray(cKDTree(points).query(own)[0])
+                n_kept[channel] += int(np.count_nonzero(away_px < NEAR_PX))
+    n_own = n_shown[colour]
+    most = max(TOO_MUCH * n_own, n_across)
+    better = [
+        channel
+        for channel in channels
+        if MUCH_MORE * n_own < n_shown[channel] <= most and n_kept[channel] >= KEPT * n_own
+    ]
+    return max(better, key=lambda channel: n_shown[channel], default=colour)
+
+
+def _long_lines(profile: Profile) -> FloatArray:
+    """Accepted points (N, 2) of segments that are hardly edges or blots."""
+    _, number, count = np.unique(
+        profile.segment[profile.is_accepted], return_inverse=True, return_counts=True
+    )
+    return profile.points_px[profile.is_accepted][count[number] >= LONG]
 
 
 NAMED, LISTED = 5, 40

@@ -55,6 +55,7 @@ by up to 60 degrees."""
 LEAST_SLANT = 0.3
 """The same to a ray that the sheet knows, to first order of its bow."""
 FAN_SIGMAS = 2.0
+"""Standard deviations of a fan that rays may differ from it by."""
 NEEDED = 0.5
 """A segment is left without rays if fewer than this part of its own width is free around it."""
 STEP_SPACINGS = 3.0
@@ -134,8 +135,8 @@ def known_rays(sensor: SensorCalibration, sheet: int) -> tuple[LightSheet, float
     """The sheet of that number, and the tangent by which a ray may leave the one that its fan says.
 
     A fan is what the bow's change with depth tells, and as uncertain as that over the bow: of a bow
-    that is hardly known it is anything. Then there is none, and rays run along the depth, by and
-    large.
+    that is hardly known it is anything. Then, as of a sheet without a fan, rays are only taken to
+    run within `LARGEST_SLANT` of the depth.
     """
     model = sensor.sheets[sheet].sheet
     bow = abs(float(model.bow_mm[_U2]))

@@ -154,5 +154,49 @@ def test_views_without_laser_are_taken_off(
     assert np.mean(away < 0.5) > 0.99
     assert main(words) == 0
     assert len(written(out, capsys)[1]) < 0.7 * 2 * 320
-    assert main([*words, "--background", str(off / "0.png")]) == 2
-    assert "2 images with laser, but 1 without" in capsys.readouterr().err
+    three = [*dark, "--background", str(on / "0.png")]
+    assert main([*words, *three]) == 2
+    assert "2 images with laser, but 3 without" in capsys.readouterr().err
+    assert main([*words, "--background", str(on)]) == 2
+    assert "its own view without laser" in capsys.readouterr().err
+    (off / "0.png").rename(off / "2.png")
+    assert main([*words, "--background", str(off)]) == 2
+    assert "of its own name" in capsys.readouterr().err
+
+
+def test_one_view_without_laser_is_that_of_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng, folder = np.random.default_rng(5), tmp_path / "on"
+    folder.mkdir()
+    print_ = bars(rng)
+    for name, line_ in (("on/0", 0.5), ("on/1", 0.5), ("off", 0.0)):
+        levels = line_ * SCENE.expose(0).image + print_ + rng.normal(0.0, 1.0, print_.shape)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.clip(levels, 0, 255).astype(np.uint8))
+    out = tmp_path / "lines.csv"
+    dark = ["--background", str(tmp_path / "off.png")]
+    assert main(["stripes", str(folder), *dark, "-o", str(out), "--json"]) == 0
+    assert len(written(out, capsys)[1]) > 0.9 * 2 * 320
+
+
+def test_print_of_the_lasers_colour_takes_no_difference(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Red pen on white paper shows in red minus blue only; the laser shows whole in red."""
+    folder, rng = tmp_path / "pen", np.random.default_rng(6)
+    folder.mkdir()
+    for k in range(2):
+        image = SCENE.expose_red(k, 1.0).image.astype(np.float64) + 120.0
+        for v in range(8, 240, 16):
+            if abs(v - 120) > 40:
+                image[v : v + 3, :, 1:] -= 90.0
+        image += rng.normal(0.0, 1.0, image.shape)
+        cv2.imwrite(str(folder / f"{k}.png"), np.clip(image, 0, 255).astype(np.uint8)[:, :, ::-1])
+    out = tmp_path / "lines.csv"
+    assert main(["stripes", str(folder), "-o", str(out), "--json"]) == 0
+    report, away = written(out, capsys)
+    assert report["laser_colour"] == "red"
+    assert np.mean(away < 0.5) > 0.99
+    other = ["stripes", str(folder), "--laser-colour", "red-blue", "-o", str(out), "--force"]
+    assert main([*other, "--json"]) == 0
+    assert np.mean(written(out, capsys)[1] < 0.5) < 0.5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chessboards: a lattice of crossings, numbered by count, ends and tone, on raw pixels.
+"""Chessboards: a lattice of crossings, numbered by count, ends and tone, fitted to pixels.
 
 The border squares of a chessboard alternate, and beyond them lies a rim, a carrier or a table: one
 tone. Where that is seen along a side, the outermost corners are the board's own, and the count is
@@ -281,10 +281,14 @@ PRINT_ERROR = 0.02
 _BENT_SIGMAS, _FEW_BENT = 0.5, 0.1
 """An arc's height within reach of a corner's fit, in its sigmas (a third of it is the error of a
 straight edge), and the share of corners that may have more."""
-_FEWEST_FOR_LATTICE = 4
+_MOST_BENT = 0.5
+"""Angle, rad, that an edge turns by within a fit's reach at most: more is no board."""
+_SHORTEST_PX = 2.0
+_FEWEST_FOR_LATTICE, _FEWEST_FOR_BENDS = 4, 9
 _SURE_ENDS = 2
 _LOCAL = 1.0 / 50.0
 """Standard deviation of the weights of a local mean, of the image's longer side."""
+_REDUCED_SIGMA_PX = 4.0
 _LEAST_SCATTER, _PRINTED = 0.25, 0.7
 """Scatter, of the least contrast, that is taken for noise; contrast, of the local scatter, that is
 taken for print: dark and light squares make 2."""
@@ -302,7 +306,7 @@ deviation is smaller than this part of theirs: noise alone changes it by less in
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Corners:
-    """Corners measured on raw pixels, and the cell (N, 2) of each."""
+    """Measured corners, and the cell (N, 2) of each."""
 
     cells: IntArray
     saddles: Saddles
@@ -313,19 +317,38 @@ class _Corners:
 def detect_chessboard(exposure: Exposure, target: Chessboard) -> TargetView | FitFailure:
     """Find a chessboard and measure its corners.
 
-    Returns the view, with the corners that the fit on raw pixels accepted; or why there is none.
+    Returns the view, with the corners that the fit accepted; or why there is none.
     """
     channels = grey_channels(exposure)
-    min_contrast = MIN_CONTRAST * exposure.full_scale
-    why: FitFailure | None = None
     seen: list[Extent] = []
-    for k in range(len(channels) + 1):
-        if k == len(channels):
-            if why is not None or any(_is_board(extent) for extent in seen):
-                break
-            channels.append(_levelled(channels[0], min_contrast))
-        grey, others = channels[k], channels[:k] + channels[k + 1 :]
+    found = _found_in(channels, exposure, target, seen)
+    if found is None and not any(_is_board(extent) for extent in seen):
+        levelled = _levelled(channels[0], MIN_CONTRAST * exposure.full_scale)
+        found = _found_in([levelled], exposure, target, seen, is_whole=True)
+    return _not_found(exposure, target, seen) if found is None else found
+
+
+def _found_in(
+    channels: list[RawGrey],
+    exposure: Exposure,
+    target: Chessboard,
+    seen: list[Extent],
+    *,
+    is_whole: bool = False,
+) -> TargetView | FitFailure | None:
+    """The view, or the first reason against one, or None if no board was found.
+
+    ``seen``: Output, rectangles that are none of the board. ``is_whole``: Only boards of which
+    every row and column is in view, for where their ends are not to be trusted.
+    """
+    why: FitFailure | None = None
+    min_contrast = MIN_CONTRAST * exposure.full_scale
+    for k, grey in enumerate(channels):
+        others = channels[:k] + channels[k + 1 :]
         for numbered in _numbered(grey, target, min_contrast, seen):
+            counts = (np.ptp(numbered.cells, axis=0) + 1).tolist()
+            if is_whole and counts != [target.columns, target.rows]:
+                continue
             corners = _best_measured(grey, others, target, numbered)
             refusal = _refusal(exposure, target, corners)
             if refusal is None:
@@ -334,7 +357,7 @@ def detect_chessboard(exposure: Exposure, target: Chessboard) -> TargetView | Fi
                 found, covariance = found[good], covariance[good]
                 return TargetView.of_image(exposure, target, number, found, covariance)
             why = refusal if why is None else why
-    return _not_found(exposure, target, seen) if why is None else why
+    return why
 
 
 def _levelled(grey: RawGrey, min_contrast: float) -> RawGrey:
@@ -344,10 +367,20 @@ def _levelled(grey: RawGrey, min_contrast: float) -> RawGrey:
     """
     levels = np.ascontiguousarray(grey, dtype=np.float32)
     sigma = _LOCAL * max(levels.shape)
-    away = levels - cv2.GaussianBlur(levels, (0, 0), sigma)
+    away = levels - _local_mean(levels, sigma)
     least = _LEAST_SCATTER * min_contrast
-    scatter = np.sqrt(cv2.GaussianBlur(away * away, (0, 0), sigma) + least * least)
+    scatter = np.sqrt(_local_mean(away * away, sigma) + least * least)
     return np.asarray(away / scatter * (min_contrast / _PRINTED), dtype=np.float64)
+
+
+def _local_mean(levels: Grey32, sigma_px: float) -> Grey32:
+    """Mean under a Gaussian of many pixels, taken on a reduced image, where it costs little."""
+    factor = max(sigma_px / _REDUCED_SIGMA_PX, 1.0)
+    height, width = levels.shape
+    size = max(round(width / factor), 1), max(round(height / factor), 1)
+    small = cv2.resize(levels, size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), sigma_px / factor)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def _numbered(
@@ -483,29 +516,32 @@ def fit_board_saddles(
     """Refine the corners of one board, whose edges bend as the lattice that they make.
 
     ``grey``, ``corners_px``, ``steps_px``: As of `fit_saddles`. ``cells``: (N, 2) column and row.
-    ``clear_cells``: How far along a row a step goes, as of ``steps_px``.
+    ``clear_cells``: Length of the steps, in squares.
     """
     saddles = fit_saddles(grey, corners_px, *steps_px)
+    n_good = int(saddles.is_good.sum())
     lattice = _lattice(grey, cells, saddles, steps_px)
-    if lattice is None:
+    if lattice is None or n_good < _FEWEST_FOR_BENDS:
         return saddles
     # rounded: linear algebra's last digits depend on where its arrays lie in memory
     board = cells.astype(np.float64)
     curvature = np.nan_to_num(lattice.curvature(board)).round(9)
     radius = window_radius(*steps_px)
-    arc_px = 0.5 * radius * radius * np.abs(curvature).max(axis=1)
-    is_bent = (arc_px > _BENT_SIGMAS * saddles.sigma_px) & saddles.is_good
-    if is_bent.sum() <= _FEW_BENT * saddles.is_good.sum():
+    turn = radius * np.abs(curvature).max(axis=1)
+    is_bent = (0.5 * radius * turn > _BENT_SIGMAS * saddles.sigma_px) & saddles.is_good
+    if is_bent.sum() <= _FEW_BENT * n_good or turn[saddles.is_good].max() > _MOST_BENT:
         return saddles
     # where the search missed one, local predictions lie up to 40 px off before a fisheye
     steps = clear_cells * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     seen, ahead, below = (lattice.seen(board + step).round(6) for step in steps)
-    is_seen = np.isfinite(seen + ahead + below).all(axis=1, keepdims=True)
-    lost = np.where(is_seen, seen, corners_px)
-    start = np.where(saddles.is_good[:, None], saddles.points_px, lost)
-    along_x = np.where(is_seen, ahead - seen, steps_px[0])
-    along_y = np.where(is_seen, below - seen, steps_px[1])
-    return fit_saddles(grey, start, along_x, along_y, curvature)
+    along_x, along_y = ahead - seen, below - seen
+    shortest = np.minimum(np.hypot(*along_x.T), np.hypot(*along_y.T))
+    is_seen = ((shortest > _SHORTEST_PX) & np.isfinite(shortest) & (turn < _MOST_BENT))[:, None]
+    start = np.where(is_seen, seen, corners_px)
+    start[saddles.is_good] = saddles.points_px[saddles.is_good]
+    along_x = np.where(is_seen, along_x, steps_px[0])
+    along_y = np.where(is_seen, along_y, steps_px[1])
+    return fit_saddles(grey, start, along_x, along_y, np.where(is_seen, curvature, 0.0))
 
 
 def _lattice(

@@ -498,14 +498,14 @@ _ARC_CELLS = 0.25
 class SmoothLattice:
     """What N corners of a board agree on: a flat board before a lens, and a smooth field about it.
 
-    ``lens``: none is a pinhole without distortion. ``is_off``: (N,) True for corners that are off
-    it. ``scatter_px``: Robust standard deviation, per axis, of the rest; infinite if there is no
-    homography.
+    ``homography``: (3, 3) from squares of the board to X/Z, Y/Z before the ``lens``, or to pixels
+    without one. ``field``: what image points are shifted by about that. ``is_off``: (N,) True for
+    corners that are off it. ``scatter_px``: Robust standard deviation, per axis, of the rest.
     """
 
     homography: FloatArray
     lens: CameraModel | None
-    field: _Field | None
+    field: _Field
     is_off: BoolArray
     scatter_px: float
 
@@ -513,7 +513,7 @@ class SmoothLattice:
         """Image points (M, 2) of places (M, 2) on the board; not finite where none is seen."""
         flat = _through(self.homography, board, self.lens)
         with np.errstate(invalid="ignore", over="ignore"):
-            return flat if self.field is None else flat + self.field.at(flat)
+            return flat + self.field.at(flat)
 
     def curvature(self, board: FloatArray) -> FloatArray:
         """Curvature (M, 2), 1/px, of the board's lines along x and along y, as of `fit_saddles`."""
@@ -558,8 +558,8 @@ def fit_lattice(
     Returns None where no homography maps the board.
     """
     plain = _smooth(board, points_px, least_sigma_px, tolerance_px, None)
-    if plain is None or plain.field is None:
-        return plain
+    if plain is None:
+        return None
     shift = plain.field.at(plain.seen(board))
     is_bent = float(np.sqrt((shift**2).mean())) > tolerance_px
     if not plain.is_off.any() and plain.scatter_px <= tolerance_px and not is_bent:

@@ -136,6 +136,8 @@ def fit_saddles(
     ``curvature_1_px``: (N, 2) curvature of the edges along x and along y, 1/px, positive where
     they turn from u towards v on that way; straight without it.
     """
+    if not len(corners_px):
+        return Saddles(corners_px, np.zeros((0, 2, 2)), np.zeros(0, dtype=np.bool_))
     radius = window_radius(step_x_px, step_y_px)
     origin = np.rint(corners_px)
     levels, offsets, weights = _windows(grey, origin, radius)
@@ -168,8 +170,8 @@ def window_radius(step_x_px: FloatArray, step_y_px: FloatArray) -> FloatArray:
     """Radius (N,) px in which nothing but the two edges of a corner is seen."""
     area = np.abs(step_x_px[:, 0] * step_y_px[:, 1] - step_x_px[:, 1] * step_y_px[:, 0])
     longest = np.maximum(np.hypot(*step_x_px.T), np.hypot(*step_y_px.T))
-    radius: FloatArray = WINDOW_FRACTION * area / longest
-    return np.clip(radius, MIN_WINDOW_PX, MAX_WINDOW_PX)
+    radius: FloatArray = WINDOW_FRACTION * area / np.maximum(longest, 1e-9)
+    return np.clip(np.nan_to_num(radius), MIN_WINDOW_PX, MAX_WINDOW_PX)
 
 
 def _windows(

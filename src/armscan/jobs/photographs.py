@@ -77,7 +77,7 @@ def find_stripes(
     images
         Files, folders or patterns.
     background
-        The same views without laser, one for each image, as such; None for none.
+        The same views without laser, one for each image or one for all; None for none.
     stripes, image_options
         How lines are found, and how pixels are read.
 
@@ -110,7 +110,7 @@ def find_stripes(
             exposures[name] = exposure
         job.progress(ProgressEvent("stripes", k + 1, len(paths), name))
     warnings = _without_line(profiles)
-    used = (*paths, *(path for path in dark if path is not None))
+    used = (*paths, *dict.fromkeys(path for path in dark if path is not None))
     provenance = job.provenance(used, (stripes, image_options), warnings=warnings)
     is_simulated = are_simulated(paths)
     page = stripe_page(profiles, exposures, warnings, provenance, is_simulated=is_simulated)

@@ -8,7 +8,15 @@ import pytest
 
 from armscan.models.calibration import SensorCalibration
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.points import is_without_ray, known_rays
+from armscan.reconstruction.labels import LabelledInstant, LabelledProfile, PointStatus
+from armscan.reconstruction.points import (
+    MeasuredProfile,
+    is_without_ray,
+    known_rays,
+    measure_points,
+)
+from armscan.reconstruction.triangulate import DepthRange
+from armscan.records.profile import Profile
 from rigs.calibration_documents import sensor_calibration
 from rigs.plain_scanner import stored_sheet
 
@@ -66,9 +74,14 @@ def test_near_the_end_of_the_line_nothing_is_claimed() -> None:
     assert judged((line(-60, 60, 300.0), 100.0), (line(45, 58, 340.0), 60.0)) == [False, False]
 
 
+BELOW = np.array([0.0, 100.0, 0.0])
+"""A camera in the sheet would see nothing of its depth."""
+
+
 def sensor_of(fan: tuple[float, float], of_u2v_mm: float) -> SensorCalibration:
     """Whose bow of 0.1 mm spreads its light so, and whose change with depth is known so well."""
-    bowed = replace(SHEET, bow_mm=np.array([0.1, 0.0, 0.0, 0.0, 0.0]), fan=np.array(fan))
+    bow = np.array([0.1, 0.0, 0.0, 0.0, 0.0])
+    bowed = replace(SHEET, origin_mm=SHEET.origin_mm + BELOW, bow_mm=bow, fan=np.array(fan))
     covariance = np.diag([*[1e-6] * 12, *[1e-8] * 4, of_u2v_mm**2])
     sheets = (stored_sheet("A", bowed, (250.0, 350.0)),)
     return replace(sensor_calibration(), sheets=sheets, covariance=covariance)
@@ -89,3 +102,41 @@ def test_rays_are_followed_as_far_as_the_bow_tells_them(sigma_mm: float) -> None
 def test_a_fan_at_the_end_of_what_is_looked_for_is_none() -> None:
     sheet, slant = known_rays(sensor_of((0.1, 0.8), 0.001), 0)
     assert (sheet.fan.tolist(), slant) == ([0.0, 0.0], 0.6)
+
+
+def seen(sensor: SensorCalibration, *pieces: np.ndarray) -> MeasuredProfile:
+    """Pieces on the sheet, the first the brightest, as one image shows them and as measured."""
+    places = np.concatenate(pieces) + BELOW
+    segment = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    n = len(places)
+    profile = Profile(
+        source="one",
+        points_px=sensor.camera.camera.project(places),
+        normals_px=np.tile([0.0, 1.0], (n, 1)),
+        sigma_px=np.full(n, 0.05),
+        width_px=np.full(n, 2.0),
+        intensity=100.0 - 40.0 * segment,
+        segment=segment,
+        flags=np.zeros(n, dtype=np.int64),
+    )
+    labelled = LabelledProfile(
+        profile=profile,
+        sheet=np.zeros(n, dtype=np.int64),
+        status=np.full(n, int(PointStatus.MEASURED)),
+        reason="one",
+    )
+    return measure_points(LabelledInstant((labelled,)), sensor, DepthRange(0.5))[0]
+
+
+def test_measured_points_are_judged_by_what_is_known_of_the_fan() -> None:
+    """A piece behind the line, near its end: by a fan that is known the line has its rays.
+
+    Rays that may run aside by 0.6 pass the line's end.
+    """
+    line_, piece = line(-40, 40, 300.0), line(22, 32, 330.0)
+    lost = []
+    for sigma_mm in (0.001, 0.04):
+        status = seen(sensor_of((0.0, 0.4), sigma_mm), line_, piece).labelled.status
+        assert not (status[: len(line_)] == PointStatus.NO_LASER_RAY).any()
+        lost.append(bool((status[len(line_) :] == PointStatus.NO_LASER_RAY).all()))
+    assert lost == [True, False]

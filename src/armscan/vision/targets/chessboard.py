@@ -284,11 +284,14 @@ straight edge), and the share of corners that may have more."""
 _MOST_BENT = 0.5
 """Angle, rad, that an edge turns by within a fit's reach at most: more is no board."""
 _SHORTEST_PX = 2.0
+"""Step to the next corner that a lattice must have where it is believed."""
 _FEWEST_FOR_LATTICE, _FEWEST_FOR_BENDS = 4, 9
 _SURE_ENDS = 2
+"""Sides on which a rectangle must end in order to be surely a board."""
 _LOCAL = 1.0 / 50.0
 """Standard deviation of the weights of a local mean, of the image's longer side."""
 _REDUCED_SIGMA_PX = 4.0
+"""The same in the reduced image in which it is taken."""
 _LEAST_SCATTER, _PRINTED = 0.25, 0.7
 """Scatter, of the least contrast, that is taken for noise; contrast, of the local scatter, that is
 taken for print: dark and light squares make 2."""

@@ -122,3 +122,74 @@ def test_an_old_layout_is_described_and_an_open_one_stays_open_without_a_board()
     assert "layout" not in describe_target(replace(ODD, layout="new"))
     blank = Exposure(np.full((200, 300), 90, np.uint8), "blank")
     assert settle_target([blank], ODD) == ODD
+
+
+def outlines_px(board: Charuco, corners_px: FloatArray) -> FloatArray:
+    """Corners (M, 4, 2) of the markers' squares, pixels, from where the inner corners lie."""
+    inner = board.points_board_mm[:, :2] / board.square_mm
+    found, _ = cv2.findHomography(inner, corners_px)
+    ring = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    outlines = board.marker_squares[:, None] + ring
+    return apply_homography(np.asarray(found), outlines.reshape(-1, 2)).reshape(-1, 4, 2)
+
+
+def beside(board: Charuco, squares: FloatArray) -> list[int]:
+    """Numbers of the inner corners at the corners of squares (M, 2)."""
+    inner = board.points_board_mm[:, :2] / board.square_mm
+    apart = np.abs(inner[:, None] - squares - 0.5).max(axis=-1).min(axis=1, initial=np.inf)
+    return np.flatnonzero(apart < 0.6).tolist()
+
+
+def test_a_board_that_the_image_cuts_gives_every_corner_beside_a_whole_marker() -> None:
+    board = replace(ODD, layout="new")
+    exposure, corners_px = photograph(board)
+    low, high = np.array([215, 190]), np.array([420, 330])
+    image = np.ascontiguousarray(exposure.image[low[1] : high[1], low[0] : high[0]])
+    view = detect_target(Exposure(image, "cut"), board)
+    assert isinstance(view, TargetView)
+    corners_px = corners_px - low
+    np.testing.assert_allclose(view.points_px, corners_px[view.point_index], atol=0.2)
+    outlines = outlines_px(board, corners_px)
+    is_whole = ((outlines > 0.0) & (outlines < high - low - 1.0)).all(axis=(1, 2))
+    expected = beside(board, board.marker_squares[is_whole])
+    is_clear = ((corners_px > 6.0) & (corners_px < high - low - 7.0)).all(axis=1)
+    assert {k for k in expected if is_clear[k]} <= set(view.point_index.tolist())
+    size = (board.columns, board.rows)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    printed = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary)
+    by_opencv = cv2.aruco.CharucoDetector(printed).detectBoard(image)[1]
+    assert len(view) >= 1.3 * len(by_opencv)
+
+
+def test_corners_beside_a_marker_that_is_covered_are_left_out() -> None:
+    board = replace(ODD, layout="new")
+    exposure, corners_px = photograph(board)
+    image = exposure.image.copy()
+    covered = 12
+    outline = outlines_px(board, corners_px)[covered]
+    centre = outline.mean(axis=0)
+    inside = centre + 0.7 * (outline - centre)
+    cv2.fillPoly(image, [np.rint(inside).astype(np.int32)], 120)
+    whole, view = detect_target(exposure, board), detect_target(Exposure(image, "covered"), board)
+    assert isinstance(whole, TargetView)
+    assert isinstance(view, TargetView)
+    lost = set(whole.point_index.tolist()) - set(view.point_index.tolist())
+    assert lost == set(beside(board, board.marker_squares[[covered]]))
+
+
+@pytest.mark.parametrize("is_covered", [False, True])
+def test_a_marker_beside_the_board_moves_no_corner(*, is_covered: bool) -> None:
+    board, number = replace(ODD, layout="new"), 13
+    exposure, corners_px = photograph(board)
+    image = exposure.image.copy()
+    if is_covered:
+        cv2.fillPoly(image, [np.rint(outlines_px(board, corners_px)[number]).astype(int)], 120)
+    alone = detect_target(Exposure(image.copy(), "alone"), board)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    image[500:560, 20:80] = 220
+    image[508:552, 28:72] = cv2.aruco.generateImageMarker(dictionary, number, 44)
+    both = detect_target(Exposure(image, "with another"), board)
+    assert isinstance(alone, TargetView)
+    assert isinstance(both, TargetView)
+    np.testing.assert_array_equal(both.point_index, alone.point_index)
+    np.testing.assert_allclose(both.points_px, alone.points_px, atol=1e-6)

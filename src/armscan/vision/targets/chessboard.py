@@ -501,7 +501,7 @@ def _measured(grey: RawGrey, target: Chessboard, numbered: NumberedCorners) -> _
     saddles = fit_board_saddles(grey, cells, start, steps)
     is_good = _has_squares_around(grey, target, cells, saddles.points_px, steps)
     is_good &= saddles.is_good
-    lattice = _lattice(grey, cells, saddles._replace(is_good=is_good), steps)
+    lattice = board_lattice(grey, cells, saddles._replace(is_good=is_good), steps)
     scatter = float("inf")
     if lattice is not None:
         scatter = lattice.scatter_px
@@ -523,7 +523,7 @@ def fit_board_saddles(
     """
     saddles = fit_saddles(grey, corners_px, *steps_px)
     n_good = int(saddles.is_good.sum())
-    lattice = _lattice(grey, cells, saddles, steps_px)
+    lattice = board_lattice(grey, cells, saddles, steps_px)
     if lattice is None or n_good < _FEWEST_FOR_BENDS:
         return saddles
     # rounded: linear algebra's last digits depend on where its arrays lie in memory
@@ -547,7 +547,7 @@ def fit_board_saddles(
     return fit_saddles(grey, start, along_x, along_y, np.where(is_seen, curvature, 0.0))
 
 
-def _lattice(
+def board_lattice(
     grey: RawGrey, cells: IntArray, saddles: Saddles, steps_px: Steps
 ) -> SmoothLattice | None:
     """The lattice of the good corners (M,); none where they are too few."""

@@ -224,7 +224,11 @@ def cell_arrays(lattice: Lattice) -> tuple[IntArray, IntArray]:
 
 
 def predict_cells(
-    cells: IntArray, points_px: FloatArray, wanted: IntArray, *, may_bend: bool = True
+    cells: IntArray | FloatArray,
+    points_px: FloatArray,
+    wanted: IntArray | FloatArray,
+    *,
+    may_bend: bool = True,
 ) -> FloatArray:
     """Image points (M, 2) of ``wanted`` cells (M, 2), each from the known cells nearest to it.
 

@@ -14,12 +14,18 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, apply_homography
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.chessboard import Steps, detect_chessboard, fit_board_saddles
+from armscan.vision.targets.chessboard import (
+    Steps,
+    board_lattice,
+    detect_chessboard,
+    fit_board_saddles,
+)
 from armscan.vision.targets.circle_grid import detect_circle_grid
+from armscan.vision.targets.crossings import predict_cells
 from armscan.vision.targets.saddle import (
     WINDOW_FRACTION,
     Grey8,
@@ -58,6 +64,18 @@ class Markers:
     corners_px: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Neighbours:
+    """Pairs of a marker and one of its nearest neighbours on a board, both read.
+
+    ``first``: (P,) numbers of the markers as read. ``agrees``: (P,) Whether the neighbour lies
+    where that marker says.
+    """
+
+    first: IntArray
+    agrees: BoolArray
+
+
 @dataclass(frozen=True, slots=True)
 class _Fit:
     """Neighbours that both were read on a board, and how many of them lie where it says."""
@@ -78,9 +96,8 @@ def detect_charuco(exposure: Exposure, target: Charuco) -> TargetView | FitFailu
     """
     n_most, failure = -1, FitFailure("")
     for grey in grey_channels(exposure):
-        grey8 = to_grey8(grey, exposure.full_scale)
-        markers = _read_markers(grey8, target)
-        found = _detect_in(exposure, target, (grey, grey8), markers)
+        markers = _read_markers(to_grey8(grey, exposure.full_scale), target)
+        found = _detect_in(exposure, target, grey, markers)
         if isinstance(found, TargetView):
             return found
         if len(markers.ids) > n_most:
@@ -129,9 +146,9 @@ def _dictionary(target: Charuco) -> cv2.aruco.Dictionary:
 
 
 def _detect_in(
-    exposure: Exposure, target: Charuco, grey: tuple[RawGrey, Grey8], markers: Markers
+    exposure: Exposure, target: Charuco, grey: RawGrey, markers: Markers
 ) -> TargetView | FitFailure:
-    """The board in one grey image, raw and in 8 bits, whose markers are known."""
+    """The board in one grey image whose markers are known."""
     if len(markers.ids) == 0:
         return FitFailure(
             f"{exposure.source}: no marker of {target.dictionary} in view",
@@ -157,33 +174,20 @@ def _of_layout(boards: list[Charuco], target: Charuco) -> list[Charuco]:
 
 
 def _corners(
-    exposure: Exposure, board: Charuco, grey: tuple[RawGrey, Grey8], markers: Markers
+    exposure: Exposure, board: Charuco, grey: RawGrey, markers: Markers
 ) -> TargetView | FitFailure:
-    printed = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.square_mm, board.marker_mm, _dictionary(board)
-    )
-    printed.setLegacyPattern(board.layout == "old")
-    raw, grey8 = grey
-    corners, ids, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(
-        grey8,
-        markerCorners=list(markers.corners_px.astype(np.float32)[:, None]),
-        markerIds=markers.ids.astype(np.int32)[:, None],
-    )
-    n_corners = 0
-    if ids is not None and len(ids) >= MIN_CORNERS:
-        index = np.asarray(ids, dtype=np.int64).ravel()
-        rough_px = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-        clear_cells = _clear_cells(board)
-        steps = _steps(board, index, rough_px, clear_cells * board.square_mm)
-        if steps is not None:
-            row, column = np.divmod(index, board.columns - 1)
-            cells = np.stack([column, row], axis=-1)
-            saddles = fit_board_saddles(raw, cells, rough_px, steps, clear_cells)
-            refined, covariance, is_good = saddles
-            n_corners = int(is_good.sum())
-            if n_corners >= MIN_CORNERS:
-                found, number = refined[is_good], index[is_good]
-                return TargetView.of_image(exposure, board, number, found, covariance[is_good])
+    clear_cells = _clear_cells(board)
+    cells, start_px, steps = _corners_near(markers, board, clear_cells, grey.shape[:2])
+    saddles = fit_board_saddles(grey, cells, start_px, steps, clear_cells)
+    refined, covariance, is_good = saddles
+    lattice = board_lattice(grey, cells, saddles, steps)
+    if lattice is not None:
+        is_good[np.flatnonzero(is_good)[lattice.is_off]] = False
+    n_corners = int(is_good.sum())
+    if n_corners >= MIN_CORNERS:
+        column, row = (cells[is_good] - 1).T
+        number = row * (board.columns - 1) + column
+        return TargetView.of_image(exposure, board, number, refined[is_good], covariance[is_good])
     return FitFailure(
         f"{exposure.source}: {len(markers.ids)} markers of {board.dictionary} and {n_corners} "
         f"corners were read, at least {MIN_CORNERS} corners are needed",
@@ -191,25 +195,57 @@ def _corners(
     )
 
 
+def _trusted(markers: Markers, board: Charuco) -> IntArray:
+    """Which of the markers (N,) lie where their neighbours say; of one number but one."""
+    neighbours = _neighbours(markers, board)
+    n_agreeing = np.bincount(neighbours.first[neighbours.agrees], minlength=len(markers.ids))
+    n_seen = np.bincount(neighbours.first, minlength=len(markers.ids))
+    known = np.flatnonzero((markers.ids < len(board.marker_squares)) & (2 * n_agreeing >= n_seen))
+    known = known[np.argsort(-n_agreeing[known], kind="stable")]
+    return np.asarray(known[np.unique(markers.ids[known], return_index=True)[1]])
+
+
+def _corners_near(
+    markers: Markers, board: Charuco, clear_cells: float, shape: tuple[int, ...]
+) -> tuple[IntArray, FloatArray, Steps]:
+    """Inner corners (N, 2) beside markers, squares, where they should be seen, and their steps.
+
+    Not beside a marker that is wholly in view and was not read: what hides it, or blurs it, harms
+    the corner too.
+    """
+    none = np.zeros((0, 2))
+    known = _trusted(markers, board)
+    if not len(known):
+        return none.astype(np.int64), none, (none, none)
+    half = 0.5 * board.marker_mm / board.square_mm
+    way = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    outlines = board.marker_squares[:, None] + 0.5 + way
+    seen = outlines[markers.ids[known]].reshape(-1, 2), markers.corners_px[known].reshape(-1, 2)
+    row, column = np.mgrid[1 : board.rows, 1 : board.columns]
+    every = np.stack([column.ravel(), row.ravel()], axis=-1)
+    is_beside = np.abs(every[:, None] - board.marker_squares - 0.5).max(axis=-1) < 1.0
+    is_read = np.isin(np.arange(len(outlines)), markers.ids[known])
+    outline_px = predict_cells(*seen, outlines.reshape(-1, 2)).reshape(-1, 4, 2)
+    is_missed = ~is_read & _is_within(outline_px, shape).all(axis=1)
+    near = every[(is_beside & is_read).any(axis=1) & ~(is_beside & is_missed).any(axis=1)]
+    start, ahead, below = (
+        predict_cells(*seen, near + clear_cells * np.array(step))
+        for step in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+    )
+    along_x, along_y = ahead - start, below - start
+    within = np.isfinite(along_x + along_y).all(axis=1) & _is_within(start, shape)
+    return near[within], start[within], (along_x[within], along_y[within])
+
+
+def _is_within(points_px: FloatArray, shape: tuple[int, ...]) -> BoolArray:
+    size = np.array(shape[::-1])
+    return np.asarray(((points_px > 1.0) & (points_px < size - 2.0)).all(axis=-1))
+
+
 def _clear_cells(target: Charuco) -> float:
     """Part of a square, such that the fit of a corner reaches no marker."""
     gap_mm = (target.square_mm - target.marker_mm) / np.sqrt(2.0)
     return float(min(1.0, _CLEARANCE * gap_mm / (WINDOW_FRACTION * target.square_mm)))
-
-
-def _steps(
-    target: Charuco, index: IntArray, rough_px: FloatArray, length_mm: float
-) -> Steps | None:
-    """Way (N, 2) along x and y of a length on the board."""
-    board: FloatArray = target.points_board_mm[index, :2]
-    found, _ = cv2.findHomography(board, rough_px, cv2.RANSAC, 3.0)
-    if found is None:
-        return None
-    homography = np.asarray(found, dtype=np.float64)
-    centre = apply_homography(homography, board)
-    along_x = apply_homography(homography, board + np.array([length_mm, 0.0])) - centre
-    along_y = apply_homography(homography, board + np.array([0.0, length_mm])) - centre
-    return along_x, along_y
 
 
 def _layouts(target: Charuco) -> tuple[Charuco, ...]:
@@ -227,26 +263,34 @@ def _fitting(markers: Markers, boards: Iterable[Charuco]) -> list[Charuco]:
 
 
 def _fit(markers: Markers, board: Charuco) -> _Fit:
+    neighbours = _neighbours(markers, board)
+    return _Fit(board, int(neighbours.agrees.sum()), len(neighbours.first))
+
+
+def _neighbours(markers: Markers, board: Charuco) -> _Neighbours:
     """Where each marker says that its nearest neighbours lie, and whether they do.
 
     Affine, of one marker alone: that holds under any lens and for boards that are bent.
     """
-    squares = board.marker_squares
-    is_known = markers.ids < len(squares)
-    place = squares[markers.ids[is_known]]
-    corners = markers.corners_px[is_known]
-    right = 0.5 * (corners[:, 1] - corners[:, 0] + corners[:, 2] - corners[:, 3])
-    down = 0.5 * (corners[:, 3] - corners[:, 0] + corners[:, 2] - corners[:, 1])
+    right, down = _ways_along(markers.corners_px)
     per_square = np.stack([right, down], axis=-1) * (board.square_mm / board.marker_mm)
-    is_seen = np.abs(np.linalg.det(per_square)) > 1.0
-    place, centre, per_square = place[is_seen], corners[is_seen].mean(axis=1), per_square[is_seen]
+    is_known = (markers.ids < len(board.marker_squares)) & (np.abs(np.linalg.det(per_square)) > 1.0)
+    known = np.flatnonzero(is_known)
+    place, centre = board.marker_squares[markers.ids[known]], markers.corners_px[known].mean(axis=1)
     apart = place[None, :, :] - place[:, None, :]
     is_neighbour: BoolArray = np.abs(apart).sum(axis=-1) == 2
     first, second = np.nonzero(is_neighbour)
     away = centre[second] - centre[first]
-    squares_away = np.linalg.solve(per_square[first], away[:, :, None])[:, :, 0]
+    squares_away = np.linalg.solve(per_square[known[first]], away[:, :, None])[:, :, 0]
     off = np.hypot(*(squares_away - apart[first, second]).T)
-    return _Fit(board, int((off < _NEAR).sum()), len(first))
+    return _Neighbours(known[first], off < _NEAR)
+
+
+def _ways_along(corners_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Ways (N, 2) along a marker's upper and left sides."""
+    right = 0.5 * (corners_px[:, 1] - corners_px[:, 0] + corners_px[:, 2] - corners_px[:, 3])
+    down = 0.5 * (corners_px[:, 3] - corners_px[:, 0] + corners_px[:, 2] - corners_px[:, 1])
+    return right, down
 
 
 def _misfit(

@@ -18,6 +18,7 @@ from armscan.markers.candidates import RingMatchOptions
 from armscan.markers.stereo_matching import StereoMatches, match_rings
 from armscan.models.calibration import LaserColour
 from armscan.models.two_views import StereoCalibration, TwoViews
+from armscan.pipeline.instants import check_partner, pair_sources
 from armscan.pipeline.progress import Progress, ProgressEvent
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
@@ -104,7 +105,10 @@ def find_stripes(
     for k, (path, name) in enumerate(zip(paths, names, strict=True)):
         exposure = read_exposure(path, image_options, source=name)
         partner = dark[k]
-        without = None if partner is None else read_exposure(partner, image_options)
+        without = None
+        if partner is not None:
+            without = read_exposure(partner, image_options, source=str(partner))
+            check_partner(exposure, without)
         profiles.append(extract_stripes(exposure, stripes, without))
         if name in shown:
             exposures[name] = exposure
@@ -138,25 +142,12 @@ def _partners(paths: Sequence[Path], background: Sequence[str] | None) -> Sequen
     dark = expand_paths(background)
     if len(dark) == 1:
         dark = dark * len(paths)
-    if len(paths) != len(dark):
-        raise InputError(
-            f"{len(paths)} images with laser, but {len(dark)} without",
-            remedy="give one without laser for each image, in the same order, or one for all",
-        )
-    by_name, names = {path.name: path for path in dark}, [path.name for path in paths]
-    if len(by_name) == len(dark) and set(by_name) == set(names):
-        dark = tuple(by_name[name] for name in names)
-    for lit, without in zip(paths, dark, strict=True):
-        if without.name != lit.name and lit.name in by_name:
-            raise InputError(
-                f"{without.name} would be taken for its view without laser, where one of its own "
-                "name is given, too",
-                where=str(lit),
-                remedy="name all views without laser as their images, or none",
-            )
+    chosen = pair_sources([str(path) for path in paths], [str(path) for path in dark])
+    partners = [dark[k] for k in chosen]
+    for lit, without in zip(paths, partners, strict=True):
         if lit.resolve() == without.resolve():
             raise InputError("this image is given as its own view without laser", where=str(lit))
-    return dark
+    return partners
 
 
 VOTERS = 12

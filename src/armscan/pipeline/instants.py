@@ -64,26 +64,55 @@ def pair_exposures(
         raise InputError("no images with the laser on", remedy="give at least one image")
     if not backgrounds:
         return [(exposure, None) for exposure in exposures]
-    if len(exposures) != len(backgrounds):
-        raise InputError(
-            f"{len(exposures)} images with laser ({_listed(exposures)}) but {len(backgrounds)} "
-            f"without ({_listed(backgrounds)})",
-            remedy="give one image without laser for each image with laser, in the same order, "
-            "or none at all",
-        )
-    by_name = {PurePath(background.source).name: background for background in backgrounds}
-    names = [PurePath(exposure.source).name for exposure in exposures]
-    if len(by_name) == len(backgrounds) and set(names) == set(by_name):
-        partners = [by_name[name] for name in names]
-    else:
-        partners = list(backgrounds)
+    chosen = pair_sources([e.source for e in exposures], [b.source for b in backgrounds])
+    partners = [backgrounds[k] for k in chosen]
     for exposure, partner in zip(exposures, partners, strict=True):
         _check_pair(exposure, partner)
     _check_order(exposures, partners)
     for exposure, partner in zip(exposures, partners, strict=True):
-        _check_scene(exposure, partner)
-        _check_laser_side(exposure, partner)
+        check_partner(exposure, partner)
     return list(zip(exposures, partners, strict=True))
+
+
+def pair_sources(lit: Sequence[str], dark: Sequence[str]) -> list[int]:
+    """Place among the images without laser of the partner of each image with laser.
+
+    By file name where the names agree, else by order.
+
+    Raises
+    ------
+    InputError
+        If the counts differ, or an image would get another partner than that of its own name.
+    """
+    if len(lit) != len(dark):
+        raise InputError(
+            f"{len(lit)} images with laser ({_listed(lit)}) but {len(dark)} without "
+            f"({_listed(dark)})",
+            remedy="give one image without laser for each image with laser, in the same order, "
+            "or none at all",
+        )
+    names = [PurePath(source).name for source in lit]
+    place = {PurePath(source).name: k for k, source in enumerate(dark)}
+    if len(place) < len(dark):
+        return list(range(len(dark)))
+    if set(names) == set(place):
+        return [place[name] for name in names]
+    for k, name in enumerate(names):
+        if place.get(name, k) != k:
+            raise InputError(
+                f"{dark[k]} would be taken for its view without laser, where one of its own name "
+                "is given, too",
+                where=lit[k],
+                remedy="name all images without laser as those with it, or none",
+            )
+    return list(range(len(dark)))
+
+
+def check_partner(exposure: Exposure, partner: Exposure) -> None:
+    """Raise `InputError` if a partner is not the same view without laser."""
+    _check_pair(exposure, partner)
+    _check_scene(exposure, partner)
+    _check_laser_side(exposure, partner)
 
 
 def pair_by_view(exposures: Sequence[Exposure]) -> list[ExposurePair]:
@@ -250,9 +279,9 @@ def _structure(exposure: Exposure) -> FloatArray:
     return np.asarray(edges / length if length > 0.0 else edges)
 
 
-def _listed(exposures: Sequence[Exposure]) -> str:
-    names = [PurePath(exposure.source).name for exposure in exposures[:LISTED]]
-    return ", ".join(names) + (", ..." if len(exposures) > LISTED else "")
+def _listed(sources: Sequence[str]) -> str:
+    names = [PurePath(source).name for source in sources[:LISTED]]
+    return ", ".join(names) + (", ..." if len(sources) > LISTED else "")
 
 
 SAME_TIME_NS = 1_000_000

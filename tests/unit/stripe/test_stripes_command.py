@@ -156,7 +156,9 @@ def test_views_without_laser_are_taken_off(
     assert len(written(out, capsys)[1]) < 0.7 * 2 * 320
     three = [*dark, "--background", str(on / "0.png")]
     assert main([*words, *three]) == 2
-    assert "2 images with laser, but 3 without" in capsys.readouterr().err
+    assert "2 images with laser (0.png, 1.png) but 3 without" in capsys.readouterr().err
+    assert main(["stripes", str(off), "-o", str(out), "--force", "--background", str(on)]) == 2
+    assert "swap the images" in capsys.readouterr().err
     assert main([*words, "--background", str(on)]) == 2
     assert "its own view without laser" in capsys.readouterr().err
     (off / "0.png").rename(off / "2.png")

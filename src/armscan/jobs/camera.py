@@ -108,7 +108,7 @@ def calibrate_camera(
     options = replace(options, leave_out=named_by(options.leave_out, sources, "--leave-out"))
     plate = settle_target(read.exposures, plate)
     found = find_targets(read.exposures, plate, cache=job.cache, progress=job.progress)
-    run = calibrate_camera_from_found(found, options, progress=job.progress)
+    run = calibrate_camera_from_found(found, plate, options, progress=job.progress)
     inputs = (*read.paths, *read.tables)
     by_source = dict(zip(sources, read.exposures, strict=True))
     if isinstance(run, FitFailure):

@@ -21,9 +21,12 @@ from armscan.calibration.cameras.result import (
     CameraOptions,
     DistortionModel,
 )
+from armscan.calibration.cameras.robust import agreeing_numberings, missed_places_mm
 from armscan.calibration.cameras.stereo_result import SideFit, StereoFit
 from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import vector_from_rotation
 from armscan.models.calibration import (
     CameraCalibration,
@@ -40,6 +43,7 @@ from armscan.pipeline.targets import FoundTargets, find_targets
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ExposureRow
 from armscan.vision.targets.circle_grid import correct_centres
+from armscan.vision.targets.detect import Numbering, numberings, renumbered
 from armscan.vision.targets.target import Target, TargetView
 
 CENTRE_ROUNDS = 5
@@ -106,11 +110,15 @@ def calibrate_camera_from_exposures(
         As `calibrate_camera`.
     """
     found = find_targets(exposures, target, progress=progress)
-    return calibrate_camera_from_found(found, options, progress=progress)
+    return calibrate_camera_from_found(found, target, options, progress=progress)
 
 
 def calibrate_camera_from_found(
-    found: FoundTargets, options: CameraOptions | None = None, *, progress: Progress = silent
+    found: FoundTargets,
+    target: Target,
+    options: CameraOptions | None = None,
+    *,
+    progress: Progress = silent,
 ) -> CameraRun | FitFailure:
     """As `calibrate_camera_from_exposures`, with the targets looked for already."""
     options = options or CameraOptions()
@@ -120,7 +128,7 @@ def calibrate_camera_from_found(
     if missing is not None:
         return missing
     options = replace(options, leave_out=found.shown_of(options.leave_out))
-    run = calibrate_camera_from_views(found.views, options, progress=progress)
+    run = calibrate_camera_from_views(found.views, options, target=target, progress=progress)
     if isinstance(run, FitFailure):
         return FitFailure(run.reason + found.not_found_text(), run.remedy)
     return CameraRun(run.fit, found.not_found, run.centre_rounds)
@@ -130,11 +138,14 @@ def calibrate_camera_from_views(
     views: Sequence[TargetView],
     options: CameraOptions | None = None,
     *,
+    target: Target | None = None,
     progress: Progress = silent,
 ) -> CameraRun | FitFailure:
     """Calibrate; for circles, correct the centres with the camera and calibrate again.
 
     Parameters, errors and result as `calibrate_camera_from_exposures`, with the target found.
+    Views of a ``target`` that looks alike when turned are numbered alike at the end, if what its
+    points miss their places by tells how.
     """
     options = options or CameraOptions()
     total = MODEL_ROUNDS if any(view.edges is not None for view in views) else 1
@@ -157,7 +168,7 @@ def calibrate_camera_from_views(
         is_same = settled is not None and settled.free_parameters == fit.free_parameters
         if is_same or done == total:
             progress(ProgressEvent("solve", total, total))
-            return CameraRun(fit, (), rounds)
+            return CameraRun(_numbered_alike(views, fit, target), (), rounds)
         progress(ProgressEvent("solve", done, total))
         model = _model_of(fit)
 
@@ -182,6 +193,39 @@ def _with_settled_centres(
         if rounds < CENTRE_ROUNDS - 1:
             views = [_corrected(view, fit) for view in views]
     return views, CENTRE_ROUNDS - 1, before
+
+
+def _numbered_alike(
+    views: Sequence[TargetView], fit: CameraFit, target: Target | None
+) -> CameraFit:
+    """The camera of the same views, numbered alike if the target looks alike when turned."""
+    if target is None or not target.symmetric_turns:
+        return fit
+    used = [view for view in fit.used_views if not view.is_misfit]
+    seen = [(v.view, v.sensor_from_board, v.residuals_px, ~v.is_outlier) for v in used]
+    known = numberings(target)
+    chosen = _agreeing(fit.camera, seen, known)
+    if chosen is None:
+        return fit
+    turn = {view.source: known[k] for view, k in zip(used, chosen, strict=True)}
+    alike = [renumbered(view, target, turn.get(view.source, known[0])) for view in views]
+    again = calibrate_camera(alike, fit.options)
+    return fit if isinstance(again, FitFailure) else again
+
+
+Seen = tuple[TargetView, Pose[Sensor, Board], FloatArray, BoolArray]
+
+
+def _agreeing(
+    camera: CameraModel, seen: Sequence[Seen], known: Sequence[Numbering]
+) -> IntArray | None:
+    """As `agreeing_numberings`, of views with poses, residuals and the points that were used."""
+    places = [view.points_board_mm[kept] for view, _, _, kept in seen]
+    missed = [
+        missed_places_mm(camera, pose, board_mm, residuals_px[kept])
+        for board_mm, (_, pose, residuals_px, kept) in zip(places, seen, strict=True)
+    ]
+    return agreeing_numberings(places, missed, known)
 
 
 def _model_of(fit: CameraFit) -> DistortionModel:
@@ -397,7 +441,37 @@ def calibrate_stereo_from_pairs(
         is_stable = _stereo_moved_sigmas(fit, again) < CENTRES_STABLE
         fit = again
         progress(ProgressEvent("solve", total if is_stable else rounds + 1, total))
-    return StereoRun(fit, (), rounds)
+    alike = _pairs_numbered_alike(pairs, fit, target)
+    again = fit if alike is None else calibrate_stereo(alike, target, options, given)
+    return StereoRun(fit if isinstance(again, FitFailure) else again, (), rounds)
+
+
+def _pairs_numbered_alike(
+    pairs: Sequence[StereoPair], fit: StereoFit, target: Target
+) -> list[StereoPair] | None:
+    """The pairs of a target that looks alike when turned, numbered alike; None where that is not
+    told or changes nothing.
+    """
+    if not target.symmetric_turns:
+        return None
+    seen: list[Seen] = [
+        (fitted.pair.left, own.sensor_from_board, own.residuals_px, ~own.is_outlier)
+        for fitted in fit.pairs
+        if not fitted.is_misfit
+        and fitted.pair.left is not None
+        and (own := fitted.left) is not None
+    ]
+    known = numberings(target)
+    chosen = _agreeing(fit.views.left, seen, known)
+    if chosen is None:
+        return None
+    turn = {view.source: known[k] for (view, *_), k in zip(seen, chosen, strict=True)}
+    alike = {pair.name: pair for pair in pairs}
+    for pair in (fitted.pair for fitted in fit.pairs):
+        if pair.left is not None and (how := turn.get(pair.left.source)) is not None:
+            views = (v and renumbered(v, target, how) for v in pair.views)
+            alike[pair.name] = StereoPair(*views)
+    return list(alike.values())
 
 
 def stereo_calibration(fit: StereoFit, provenance: Provenance) -> StereoCalibration:

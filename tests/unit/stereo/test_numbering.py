@@ -16,6 +16,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import CameraRight, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.two_views import TwoViews
+from armscan.pipeline.cameras import StereoRun, calibrate_stereo_from_pairs
 from armscan.vision.targets.detect import numberings, renumbered
 from armscan.vision.targets.target import Charuco, Chessboard, CircleGrid, Target
 from rigs.stereo_rig import (
@@ -150,3 +151,24 @@ def test_boards_that_lie_alike_do_not_tell() -> None:
     assert "looks the same when it is turned" in fit.reason
     assert "180 degrees" in fit.reason
     assert "chessboard" in fit.remedy
+
+
+@pytest.mark.parametrize(("scene", "turns"), [(SCENE, (0, 2)), (SQUARE, (0, 1, 2, 3))])
+def test_pairs_numbered_apart_state_what_pairs_numbered_alike_do(
+    scene: StereoScene, turns: tuple[int, ...]
+) -> None:
+    """Errors of the print turn with it: taken for others in each pair, they would average out."""
+    scene = replace(scene, n_pairs=12, missed_mm=0.01)
+    rng = np.random.default_rng(3)
+    pairs, _ = make_pairs(scene, 3)
+    chosen = [(int(rng.choice(turns)), int(rng.choice(turns))) for _ in pairs]
+    mixed = [turned(pair, scene.target, *of) for pair, of in zip(pairs, chosen, strict=True)]
+    alike, again = (
+        calibrate_stereo_from_pairs(given, scene.target, OPTIONS) for given in (pairs, mixed)
+    )
+    assert isinstance(alike, StereoRun)
+    assert isinstance(again, StereoRun)
+    assert len({left for left, _ in chosen}) > 1
+    assert alike.fit.target_error_mm == pytest.approx(0.01, rel=0.25)
+    sigma, expected = (np.sqrt(np.diag(run.fit.covariance)) for run in (again, alike))
+    np.testing.assert_allclose(sigma, expected, rtol=1e-4)

@@ -428,7 +428,9 @@ def calibrate_camera(
     chi2 / degrees of freedom: the point covariances give the weights, the residuals the level.
 
     A target of wrong size in mm cannot be noticed here: it scales the poses and leaves the camera
-    as it is. A numbering that starts at the opposite corner of a symmetric target is harmless.
+    as it is. So does a numbering that starts at the opposite corner of a symmetric target; but
+    what is stated of the camera asks for views that are numbered alike, see
+    `armscan.calibration.cameras.robust.agreeing_numberings`.
 
     Parameters
     ----------

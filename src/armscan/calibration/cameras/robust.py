@@ -23,6 +23,9 @@ from armscan.calibration.cameras.adjustment import (
 from armscan.calibration.cameras.result import BOW_P, BoardWarp
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.models.camera import CameraModel
+from armscan.vision.targets.detect import Numbering
 
 SIGNIFICANT_SIGMAS = 4.0
 
@@ -383,6 +386,89 @@ def estimate_target_error(found: BoardResiduals | None) -> TargetError:
     explained = variance * float(np.mean(np.sum(by_board**2, axis=(1, 2))))
     share = 1.0 - explained / float(np.mean(np.sum(residuals**2, axis=1)))
     return TargetError(float(np.sqrt(variance)), max(share, LEAST_INDEPENDENT))
+
+
+_TURNED_SIGMAS = 2.0
+"""Agreement, over the root of the count of views, that no choice of numberings makes of chance: the
+best choice makes 1.1 of it."""
+_ROUNDS_OF_TURNS = 10
+
+
+def missed_places_mm(
+    camera: CameraModel, pose: Pose[Sensor, Board], board_mm: FloatArray, residuals_px: FloatArray
+) -> FloatArray:
+    """(M, 2) what points (M, 3) of a board miss their places by, along its axes."""
+    _, by_point, _ = camera.project_with_jacobian(pose.apply(board_mm))
+    by_board = by_point @ pose.rotation[:, :2]
+    return np.asarray(np.linalg.solve(by_board, residuals_px[:, :, None])[:, :, 0])
+
+
+def agreeing_numberings(
+    places_mm: Sequence[FloatArray], missed_mm: Sequence[FloatArray], known: Sequence[Numbering]
+) -> IntArray | None:
+    """Which numbering each view has of a target that looks alike when turned.
+
+    These turn with the print: where the views are numbered alike, points miss their places alike.
+
+    Parameters
+    ----------
+    places_mm, missed_mm
+        (M, 3) places on the board of the points of each of V views as found numbered, and (M, 2)
+        what each misses its place by.
+    known
+        Numberings that no single view can tell apart, the one as found first.
+
+    Returns
+    -------
+    chosen
+        (V,) places among ``known``; the first view keeps its own. None where the views tell
+        nothing, or all are numbered alike.
+    """
+    if len(known) < 2 or len(places_mm) < FEWEST_VIEWS:
+        return None
+    turned = [
+        [numbering.new_from_found.apply(places)[:, :2] for numbering in known]
+        for places in places_mm
+    ]
+    every = np.rint(np.concatenate([p for view in turned for p in view]) / SAME_POINT_MM)
+    number = np.unique(every.astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
+    n_points = int(number.max()) + 1
+    lengths = [len(places) for places in places_mm for _ in known]
+    patterns = np.zeros((len(places_mm), len(known), n_points, 2))
+    for k, of in enumerate(np.split(number, np.cumsum(lengths)[:-1])):
+        view, turn = divmod(k, len(known))
+        rotation = known[turn].new_from_found.rotation[:2, :2]
+        patterns[view, turn, of] = missed_mm[view] @ rotation.T
+    chosen = _most_alike(patterns)
+    own = patterns[np.arange(len(chosen)), chosen]
+    total, squares = own.sum(axis=0), np.sum(own**2)
+    agreement = float(np.sum(total**2) - squares)
+    scatter = float(squares) / (2.0 * sum(len(places) for places in places_mm))
+    seen = (own**2).sum(axis=2) > 0.0
+    pairs = float(np.sum(seen.sum(axis=0) * (seen.sum(axis=0) - 1.0)))
+    least = SIGNIFICANT_SIGMAS + _TURNED_SIGMAS * np.sqrt(len(chosen))
+    if not chosen.any() or not agreement > least * 2.0 * scatter * np.sqrt(pairs):
+        return None
+    return chosen
+
+
+def _most_alike(patterns: FloatArray) -> IntArray:
+    """Choice (V,) among K patterns (V, K, P, 2) of each view such that their sum is the longest."""
+    every = np.arange(len(patterns))
+    chosen = np.zeros(len(patterns), dtype=np.int64)
+    total = patterns[0, 0].copy()
+    for view in every[1:]:
+        chosen[view] = int(np.argmax(np.sum(patterns[view] * total, axis=(1, 2))))
+        total += patterns[view, chosen[view]]
+    for _ in range(_ROUNDS_OF_TURNS):
+        before = chosen.copy()
+        for view in every[1:]:
+            total -= patterns[view, chosen[view]]
+            chosen[view] = int(np.argmax(np.sum(patterns[view] * total, axis=(1, 2))))
+            total += patterns[view, chosen[view]]
+        if np.array_equal(before, chosen):
+            break
+    return chosen
 
 
 def covariance_with_target_error(

@@ -39,7 +39,9 @@ from armscan.vision.targets.crossings import (
     predict_cells,
 )
 from armscan.vision.targets.saddle import (
+    MAX_WINDOW_PX,
     MIN_CONTRAST,
+    WINDOW_FRACTION,
     Grey32,
     RawGrey,
     Saddles,
@@ -283,6 +285,9 @@ _BENT_SIGMAS, _FEW_BENT = 0.5, 0.1
 straight edge), and the share of corners that may have more."""
 _MOST_BENT = 0.5
 """Angle, rad, that an edge turns by within a fit's reach at most: more is no board."""
+_LEAST_REDUCED, _CLEAR_PX = 1.5, 0.05
+"""Reduction of an image below which corners are not measured in it again, and their median standard
+deviation, px, below which there is no need to."""
 _SHORTEST_PX = 2.0
 """Step to the next corner that a lattice must have where it is believed."""
 _FEWEST_FOR_LATTICE, _FEWEST_FOR_BENDS = 4, 9
@@ -518,9 +523,40 @@ def fit_board_saddles(
 ) -> Saddles:
     """Refine the corners of one board, whose edges bend as the lattice that they make.
 
+    In an image so large and blurred that edges are as wide as a fit's window, they are measured
+    again in one that is reduced as far as squares allow, and the better of the two is taken.
+
     ``grey``, ``corners_px``, ``steps_px``: As of `fit_saddles`. ``cells``: (N, 2) column and row.
     ``clear_cells``: Length of the steps, in squares.
     """
+    saddles = _fit_bent_saddles(grey, cells, corners_px, steps_px, clear_cells)
+    room = WINDOW_FRACTION * _typical_step(steps_px) / MAX_WINDOW_PX if len(cells) else 0.0
+    if room < _LEAST_REDUCED or _median_sigma(saddles) < _CLEAR_PX:
+        return saddles
+    width, height = (round(size / room) for size in grey.shape[1::-1])
+    image = np.ascontiguousarray(grey, dtype=np.float32)
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    scale = np.array([grey.shape[1] / width, grey.shape[0] / height])
+    steps = steps_px[0] / scale, steps_px[1] / scale
+    start = (corners_px + 0.5) / scale - 0.5
+    reduced = _fit_bent_saddles(small.astype(np.float64), cells, start, steps, clear_cells)
+    covariance = reduced.covariance_px2 * np.outer(scale, scale)
+    reduced = Saddles((reduced.points_px + 0.5) * scale - 0.5, covariance, reduced.is_good)
+    return reduced if _median_sigma(reduced) < _median_sigma(saddles) else saddles
+
+
+def _median_sigma(saddles: Saddles) -> float:
+    """Of all corners, those that were not measured counting as endless."""
+    return float(np.median(np.where(saddles.is_good, saddles.sigma_px, np.inf)))
+
+
+def _fit_bent_saddles(
+    grey: RawGrey,
+    cells: IntArray,
+    corners_px: FloatArray,
+    steps_px: Steps,
+    clear_cells: float,
+) -> Saddles:
     saddles = fit_saddles(grey, corners_px, *steps_px)
     n_good = int(saddles.is_good.sum())
     lattice = board_lattice(grey, cells, saddles, steps_px)

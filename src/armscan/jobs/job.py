@@ -42,7 +42,8 @@ from armscan.vision.targets.target import Charuco, Target, describe_target
 T = TypeVar("T")
 
 FORCE_REMEDY = (
-    "take better photographs, or give --force-bad to have it written and marked in all that uses it"
+    "mend that or take other photographs, or give --force-bad to have it written and marked in "
+    "all that uses it"
 )
 
 

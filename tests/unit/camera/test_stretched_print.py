@@ -59,7 +59,16 @@ def test_a_print_that_is_given_as_it_is_leaves_nothing() -> None:
 @pytest.mark.parametrize("stretch", [1.0, 1.1])
 def test_a_print_that_is_far_off_is_refused_and_can_be_forced(stretch: float) -> None:
     reasons = reasons_to_refuse(solved(views_of(stretch, 2)))
-    assert any("1.10 times as far apart" in reason for reason in reasons) is (stretch > 1.0)
+    if stretch == 1.0:
+        assert reasons == ()
+        return
+    (reason,) = reasons
+    told = float(reason.split(" times as far apart")[0].split()[-1])
+    assert told == pytest.approx(stretch, abs=0.01)
+    x, y = (np.diff(np.unique(GRID.points_board_mm[:, k])).min() for k in range(2))
+    one, other = (float(text) for text in reason.split("write ")[1].split()[0].split("x"))
+    assert one == pytest.approx(x)
+    assert other == pytest.approx(y * told, rel=1e-3), "the specification that fits"
 
 
 def test_with_a_fixed_aspect_nothing_is_told() -> None:

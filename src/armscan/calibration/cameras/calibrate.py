@@ -39,6 +39,7 @@ from armscan.calibration.cameras.result import (
     RefusedView,
     ViewFit,
     advise,
+    as_two_lengths,
     largest_angle_deg,
     measure_coverage,
     rms_reasons,
@@ -485,8 +486,9 @@ def _of_other_cells(views: Sequence[TargetView], prepared: PreparedViews) -> Fit
     return FitFailure(
         "no camera fits the target as it is described, and one does if rows lie "
         f"{stretch:.2f} times as far apart as columns",
-        "measure the print both ways and give both lengths, as in chessboard:6x5:28x44.3; print "
-        "without fitting to the page",
+        "measure the print both ways and give both lengths, "
+        f"{as_two_lengths(views[0].points_board_mm, stretch - 1.0)}; print without fitting to the "
+        "page",
     )
 
 

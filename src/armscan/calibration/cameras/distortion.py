@@ -265,8 +265,9 @@ def choose_lens(
     factor = float(np.exp(fall))
     if fall < LENS_SIGMAS * error:
         doubt = (
-            f"the lens is wide, and a fisheye predicts unseen views {factor:.2f} times as well as "
-            "this pinhole: where no target points lie the two may differ by many pixels; compare "
+            "the lens is wide, and unseen views do not tell this pinhole from a fisheye, which "
+            f"predicts them {factor:.3f} times as well: where no target points lie the two may "
+            "differ by many pixels; compare "
             "--distortion fisheye, and do not measure outside the covered part"
         )
         return replace(pinhole, doubt=doubt)

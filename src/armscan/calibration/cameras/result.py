@@ -615,9 +615,18 @@ def about_stretch(stretch: float, sigma: float, points_board_mm: FloatArray) -> 
     return [
         f"the print seems {100.0 * abs(stretch):.2f} % {way} from row to row than is said of it "
         f"(± {100.0 * sigma:.2f} %, beside its length from column to column): measure it both "
-        f"ways, {x:.5g} mm and {y * (1.0 + stretch):.5g} mm from first to last would fit; give the "
-        "target both lengths, as in chessboard:9x6:25x25.15, or print it anew"
+        f"ways, {x:.5g} mm and {y * (1.0 + stretch):.5g} mm from first to last would fit; "
+        f"{as_two_lengths(points_board_mm, stretch)}, or print it anew"
     ]
+
+
+def as_two_lengths(points_board_mm: FloatArray, stretch: float) -> str:
+    """How to describe a target with these points (N, 3) whose rows lie further apart than said."""
+    x, y = (np.diff(np.unique(points_board_mm[:, k].round(6))).min() for k in range(2))
+    return (
+        f"write {x:.6g}x{y * (1.0 + stretch):.5g} for its pitch or square (of ChArUco, which has "
+        "one length, print another)"
+    )
 
 
 def is_much_bowed(bow_mm: FloatArray, points_board_mm: FloatArray) -> bool:
@@ -642,21 +651,16 @@ def reasons_to_refuse(fit: CameraFit) -> tuple[str, ...]:
     """
     held_out = fit.cross_validation
     rms_px = fit.rms_px if held_out is None else max(fit.rms_px, held_out.rms_px)
+    if abs(fit.stretch) >= max(LARGEST_STRETCH, STRETCH_SIGMAS * fit.stretch_sigma):
+        # which would worsen the others
+        return (
+            f"the target's rows seem to lie {1.0 + fit.stretch:.4f} times as far apart as is said, "
+            f"beside its columns: measure the print both ways and give both lengths, "
+            f"{as_two_lengths(_board_points(fit), fit.stretch)}; print without fitting to the page",
+        )
     return (
         *focal_reasons(fit.camera, float(fit.sigma[0]), float(fit.sigma[1]), _n_misfits(fit)),
         *rms_reasons(fit.camera, rms_px),
-        *stretch_reasons(fit.stretch, fit.stretch_sigma),
-    )
-
-
-def stretch_reasons(stretch: float, sigma: float) -> tuple[str, ...]:
-    """Why a target is not as described; empty where its rows may lie as far apart as is said."""
-    if abs(stretch) < max(LARGEST_STRETCH, STRETCH_SIGMAS * sigma):
-        return ()
-    return (
-        f"the target's rows seem to lie {1.0 + stretch:.2f} times as far apart as is said of them, "
-        "beside its columns: measure the print both ways and give both lengths, as in "
-        "chessboard:6x5:28x44.3, or print it without fitting it to the page",
     )
 
 

@@ -19,6 +19,7 @@ from armscan.calibration.hand_eye.estimate import (
 )
 from armscan.calibration.hand_eye.noise import (
     arm_noise,
+    covariance_over_noise,
     estimate_noise,
     solve_linear,
     total_covariance,
@@ -45,8 +46,9 @@ RADIUS_COLUMN, SCALE_COLUMN = N_HAND_EYE + 3, N_HAND_EYE + 4
 OUTLYING = 3.0
 """A posture whose pose errs by this many standard deviations is named."""
 WRONG_DIAMETER, NO_DIAMETER = 4.0, 10.0
-"""A diameter given that lies this many standard deviations off what the points ask for is named;
-that lies so many off is refused, if it is off by `NO_DIAMETER_PART` of it, too."""
+"""A diameter given that lies this many standard deviations off what the points ask for is named,
+the scatters being as estimated; that lies so many off is refused, if it is off by
+`NO_DIAMETER_PART` of it and by `WRONG_DIAMETER` of what is stated, too."""
 NO_DIAMETER_PART = 0.01
 REJECTED_SHARE = 0.015
 """A stripe that loses more than this part of its points is named."""
@@ -333,16 +335,20 @@ def _signed(value: float, digits: int = 6) -> str:
 
 @dataclass(frozen=True, slots=True)
 class AskedDiameter:
-    """Diameter that the points themselves ask for; ``sigma_mm`` takes the scatters as known."""
+    """Diameter that the points themselves ask for, as if it were solved along.
+
+    ``sigma_mm``: As stated then. ``if_known_mm``: The same, the scatters taken as estimated.
+    """
 
     diameter_mm: float
     sigma_mm: float
+    if_known_mm: float
 
     def __str__(self) -> str:
         """In words."""
         return (
-            f"{self.diameter_mm:.3f} mm, standard deviation {self.sigma_mm:.3f} mm if all scatters "
-            "are as estimated"
+            f"{self.diameter_mm:.3f} mm, standard deviation {self.sigma_mm:.3f} mm "
+            f"({self.if_known_mm:.3f} mm if all scatters are as estimated)"
         )
 
 
@@ -388,22 +394,29 @@ def diameter_asked(fit: HandEyeSolution) -> AskedDiameter | None:
     scatter = total_covariance(fit.components, noise.sigmas)
     freed = minimise_distances(fit.problem, fit.state, scatter, columns)
     if freed is None:
-        return AskedDiameter(2.0 * float(fit.state.surface[3]), float("inf"))
+        return AskedDiameter(2.0 * float(fit.state.surface[3]), float("inf"), float("inf"))
     placed = fit.problem.place(freed.state)
-    total = scatter + fit.problem.sensor_covariance(placed)
-    linear = solve_linear(placed.residual_mm, placed.jacobian[:, columns], total)
+    known = fit.problem.sensor_covariance(placed)
+    whole = covariance_over_noise(
+        placed.residual_mm, placed.jacobian[:, columns], fit.components, known, noise
+    )
     diameter_mm = 2.0 * float(freed.state.surface[3])
+    linear = solve_linear(placed.residual_mm, placed.jacobian[:, columns], scatter + known)
     if linear is None:
-        return AskedDiameter(diameter_mm, float("inf"))
+        return AskedDiameter(diameter_mm, float("inf"), float("inf"))
     k = int(np.flatnonzero(columns == RADIUS_COLUMN)[0])
-    return AskedDiameter(diameter_mm, 2.0 * float(np.sqrt(linear.covariance[k, k])))
+    sigma_mm, if_known_mm = (
+        2.0 * float(np.sqrt(matrix[k, k])) for matrix in (whole.matrix, linear.covariance)
+    )
+    return AskedDiameter(diameter_mm, sigma_mm, if_known_mm)
 
 
 def refuse_diameter(asked: AskedDiameter, fit: HandEyeSolution) -> FitFailure | None:
     """Refuse a sphere of which the points say that it has quite another diameter."""
     given_mm = 2.0 * float(fit.problem.surface.start[3])
     off_mm = abs(asked.diameter_mm - given_mm)
-    if off_mm < max(NO_DIAMETER_PART * given_mm, NO_DIAMETER * asked.sigma_mm):
+    least_mm = max(NO_DIAMETER * asked.if_known_mm, WRONG_DIAMETER * asked.sigma_mm)
+    if off_mm < max(NO_DIAMETER_PART * given_mm, least_mm):
         return None
     return FitFailure(
         f"the points ask for a diameter of {asked}, not of {given_mm:g} mm",
@@ -443,7 +456,7 @@ def sphere_warnings(
                 f"short, {usual_deg:.0f} are usual"
             )
     given_mm = 2.0 * float(fit.problem.surface.start[3])
-    if asked and abs(asked.diameter_mm - given_mm) > WRONG_DIAMETER * asked.sigma_mm:
+    if asked and abs(asked.diameter_mm - given_mm) > WRONG_DIAMETER * asked.if_known_mm:
         found.append(
             f"the points ask for a diameter of {asked}, not of {given_mm:g} mm: check the diameter "
             "and the sensor's scale"

@@ -285,9 +285,9 @@ _BENT_SIGMAS, _FEW_BENT = 0.5, 0.1
 straight edge), and the share of corners that may have more."""
 _MOST_BENT = 0.5
 """Angle, rad, that an edge turns by within a fit's reach at most: more is no board."""
-_LEAST_REDUCED, _CLEAR_PX = 1.5, 0.05
-"""Reduction of an image below which corners are not measured in it again, and their median standard
-deviation, px, below which there is no need to."""
+_LEAST_REDUCED, _CLEAR_PX, _MUCH_CLEARER = 1.5, 0.05, 0.5
+"""Reduction of an image below which corners are not measured in it again; their median standard
+deviation, px, below which there is no need to; and the part of it below which they are taken."""
 _SHORTEST_PX = 2.0
 """Step to the next corner that a lattice must have where it is believed."""
 _FEWEST_FOR_LATTICE, _FEWEST_FOR_BENDS = 4, 9
@@ -542,7 +542,8 @@ def fit_board_saddles(
     reduced = _fit_bent_saddles(small.astype(np.float64), cells, start, steps, clear_cells)
     covariance = reduced.covariance_px2 * np.outer(scale, scale)
     reduced = Saddles((reduced.points_px + 0.5) * scale - 0.5, covariance, reduced.is_good)
-    return reduced if _median_sigma(reduced) < _median_sigma(saddles) else saddles
+    is_clearer = _median_sigma(reduced) < _MUCH_CLEARER * _median_sigma(saddles)
+    return reduced if is_clearer else saddles
 
 
 def _median_sigma(saddles: Saddles) -> float:

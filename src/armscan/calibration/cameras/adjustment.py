@@ -427,8 +427,8 @@ def descend(
 
 
 _SETTLED = 1e-10
-"""Part of chi2 by which a step must lower it: 2e-6 of 20,000 coordinates, a thousandth of a standard
-deviation. Boards that fit badly are approached by ever smaller steps; 1e-12 takes twice as long."""
+"""Part of chi2 by which a step must lower it: 2e-6 of 20,000 coordinates, a thousandth of their
+sigma. Boards that fit badly are approached by ever smaller steps; 1e-12 takes twice as long."""
 SINGULAR_CONDITION = 1e13
 
 

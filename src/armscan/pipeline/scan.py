@@ -363,8 +363,7 @@ def measure_long_scan(
     pose_rows = [first_row[found.rows[k]] for k in kept]
     if not len(points):
         raise _nothing_placed(found, exposures, options)
-    extra = doubt_times(source, scanner)
-    cameras = _looking(points, pose_rows, poses, transform)
+    cameras, extra = _looking(points, pose_rows, poses, transform), doubt_times(source, scanner)
     if options.has_normals:
         with clock.stage("normals", is_alone=True):
             extra += _add_normals(points, cameras, progress)

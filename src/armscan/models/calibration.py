@@ -191,6 +191,8 @@ class Provenance:
     forced
         Why it was refused, where it was written all the same on request (``--force-bad``), with
         the reasons of the documents on which it rests; empty for a document that was not refused.
+    is_simulated
+        True if it was made of rendered images; documents from before do not tell.
     """
 
     document_id: str
@@ -202,6 +204,7 @@ class Provenance:
     options: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
     forced: tuple[str, ...] = ()
+    is_simulated: bool = False
 
     @property
     def mark(self) -> CalibrationMark:

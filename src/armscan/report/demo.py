@@ -422,8 +422,8 @@ def _cards(head: Figures) -> tuple[Quantity, ...]:
     return (
         fact(
             "Plate",
-            f"{_share(plate, '05')} within 0.05 mm",
-            f"std {1000.0 * plate['std_mm']:.1f} µm, {plate['n_points']:,} points",
+            _share(plate, "05"),
+            f"within 0.05 mm; std {1000.0 * plate['std_mm']:.1f} µm, {plate['n_points']:,} points",
         ),
         fact(
             "Ball",

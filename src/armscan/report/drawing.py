@@ -265,6 +265,8 @@ STILL_PX, STILL_DPI = (1100, 560), 130.0
 """Of the picture of a scene, for paper and where scripts do not run; in the canvas's shape."""
 STILL_DOT = 1.6
 """Area of a dot in square points."""
+STILL_LETTER = 10.0
+"""Width of a letter, px."""
 TURN_HINT = "Drag to turn; click, then scroll to zoom"
 VALUE_HINT = "; a click on a point tells its values."
 YAW, PITCH = -0.65, 0.42
@@ -451,14 +453,27 @@ def _still(
         colours = np.concatenate([item.colours for item in dots])[order] / 255.0
         right, down, _ = seen[order].T
         axes.scatter(right, down, c=colours, s=STILL_DOT, marker="s", linewidths=0)
+        drawn: list[tuple[float, float, float]] = []
         for text, position in labels:
-            x, y, _ = place(np.array([position]))[0]
-            axes.text(x, y, text, color=MUTED)
+            x, y, _ = place(np.array([position]))[0].tolist()
+            if not _is_covered(x, y, STILL_LETTER * len(text), drawn):
+                drawn.append((x, y, STILL_LETTER * len(text)))
+                axes.text(x, y, text, color=MUTED)
         bar_mm = round_below(0.15 * wide / scale)
         axes.plot([wide - 18.0 - scale * bar_mm, wide - 18.0], [high - 16.0] * 2, color=MUTED)
         axes.text(wide - 18.0, high - 24.0, f"{bar_mm:g} mm", ha="right", color=MUTED)
         _draw_triad(axes, is_z_up=is_z_up)
     return raster_markup(figure, alt, dpi=round(STILL_DPI))
+
+
+def _is_covered(
+    x: float, y: float, width: float, drawn: Sequence[tuple[float, float, float]]
+) -> bool:
+    """Whether a label would lie on one that is drawn: place and width of each, px."""
+    return any(
+        x < left + size and left < x + width and abs(y - top) < 2.0 * STILL_LETTER
+        for left, top, size in drawn
+    )
 
 
 def _draw_triad(axes: Axes, *, is_z_up: bool) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,15 @@ from armscan.report.drawing import (
 )
 from armscan.report.page import Block, Facts, Gallery, Page, Picture, Section, Text, page_of
 from armscan.report.photographs import stripe_gallery
-from armscan.report.quantity import Quantity, Table, fact, for_people, significant, with_sigma
+from armscan.report.quantity import (
+    Quantity,
+    Table,
+    fact,
+    for_people,
+    only,
+    significant,
+    with_sigma,
+)
 
 TITLE = "Hand-eye calibration"
 EULER_NAMES = ("θ (about X)", "γ (about Y)", "φ (about Z)")
@@ -267,14 +276,18 @@ def hand_eye_page(
         sections.append(Section("The stripes", stripe_gallery(images, names, exposures or {})))
     hand_eye = fit.calibration
     told = hand_eye_quantities(scanner)
-    of_result = ("Residual", "Condition", "Arm's scatter", "Fits the noise model")
+    of_result = ("Residual", "Condition", "Fits the noise model")
     return page_of(
         scanner.provenance,
         TITLE,
         f"Where the sensor sits on the arm, from {hand_eye.n_postures} postures, "
         f"{hand_eye.n_exposures} exposures and {hand_eye.n_points:,} points",
         sections,
-        cards=(*_sigma_cards(scanner), *(item for item in told if item.label in of_result)),
+        cards=(
+            *_sigma_cards(scanner),
+            *(replace(one, meaning="an axis") for one in only(told, "arm_position_mm")),
+            *(item for item in told if item.label in of_result),
+        ),
         warnings=fit.warnings,
         is_simulated=is_simulated,
     )

@@ -68,6 +68,8 @@ def test_no_parameter_is_known_worse_than_what_is_called_known_least(seed: int) 
     fit = _fitted(*rig.draw(seed), HandEyeOptions(plate_flatness_mm=NOISE.flatness_mm))
     known = fit.calibration.diagnostics
     assert known is not None and known.is_noise_estimated and not known.is_arm_given
+    for label, text in fit.reference:
+        assert label[0].isupper() and " rad" not in text
     told = re.search(r"known to (\S+) mm", known.weakest)
     assert told is not None
     scale = np.array([LEVER_MM] * 3 + [1.0] * 3)

@@ -62,15 +62,15 @@ SHORT_ARC = 0.6
 
 _DEGREES = ("°", float(np.degrees(1.0)))
 SCATTER_NAMES = {
-    "arm": ("arm's shift of a posture", "mm", 1.0),
+    "arm": ("arm's shift of a posture", " mm", 1.0),
     f"arm {TURNS[0]}": ("arm's turn about Tool of a posture", *_DEGREES),
     f"arm {TURNS[1]}": ("arm's turn about the scan point of a posture", *_DEGREES),
-    "exposure": ("arm's shift of an exposure", "mm", 1.0),
+    "exposure": ("arm's shift of an exposure", " mm", 1.0),
     f"exposure {TURNS[0]}": ("arm's turn about Tool of an exposure", *_DEGREES),
     f"exposure {TURNS[1]}": ("arm's turn about the scan point of an exposure", *_DEGREES),
-    "flatness": ("plate's flatness", "mm", 1.0),
-    "sheet shape": ("shape of the sheets", "mm", 1.0),
-    "stripe": ("noise of the stripes", "times its own sigma", 1.0),
+    "flatness": ("plate's flatness", " mm", 1.0),
+    "sheet shape": ("shape of the sheets", " mm", 1.0),
+    "stripe": ("noise of the stripes", " times its own sigma", 1.0),
 }
 """Causes of scatter on a plate as people read them: name, unit, and that unit's number of one."""
 
@@ -329,7 +329,7 @@ def plate_facts(checked: CheckedFit, plate: PlateSurface) -> tuple[tuple[str, st
     for component, sigma in zip(fit.components, fit.noise.sigmas, strict=True):
         label, unit, factor = SCATTER_NAMES[component.name]
         origin = "estimated" if component.is_estimated else "given"
-        facts.append((f"Scatter, {label}", f"{factor * sigma:.3g} {unit} ({origin})"))
+        facts.append((f"Scatter, {label}", f"{factor * sigma:.3g}{unit} ({origin})"))
     return tuple(facts)
 
 

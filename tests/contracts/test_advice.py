@@ -52,7 +52,8 @@ def options_of(path: tuple[str, ...]) -> set[str]:
     node: Any = root()
     for word in path:
         node = node.commands[word]
-    return {name for parameter in node.params for name in parameter.opts} | {"--help"}
+    pairs = ((*parameter.opts, *parameter.secondary_opts) for parameter in node.params)
+    return {name for pair in pairs for name in pair} | {"--help"}
 
 
 @cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -139,3 +140,9 @@ def test_rendered_images_are_called_simulated(
     assert main([*words, "-o", str(tmp_path / "camera.json")]) == 0
     assert "from simulated images" in capsys.readouterr().out
     assert "simulated data" in (tmp_path / "camera.html").read_text("utf-8")
+    # wherever it is solved again, and whatever became of the images
+    shutil.rmtree(tmp_path / "set")
+    for before, after in (("camera.json", "again.json"), ("again.json", "once more.json")):
+        words = ["calibrate", "camera", "--from", str(tmp_path / before)]
+        assert main([*words, "-o", str(tmp_path / after)]) == 0
+        assert "from simulated images" in capsys.readouterr().out

@@ -5,17 +5,23 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from armscan.cli.run import main
+from armscan.reconstruction.sync import poses_by_time
 from armscan.storage.arm import ARM_FILE
 from armscan.storage.clouds import read_ply
 from armscan.storage.recording import read_recording
-from armscan.storage.recordings.read_mcap import record_folder
+from armscan.storage.recording_session import SESSION_FILE, session_toml
+from armscan.storage.recordings import write_mcap
+from armscan.storage.recordings.read_mcap import extract_recording, record_folder
 from armscan.storage.recordings.write_mcap import RecordingWriter
 from armscan.storage.tables import read_csv
 from rigs.drawn_arm import PLANE, draw_bounce, draw_postures
@@ -164,3 +170,56 @@ def test_a_broken_file_costs_one_sentence(
     for content, said in ((data[:-30], "armscan recover"), (b"", "empty"), (b"text", "no MCAP")):
         broken.write_bytes(content)
         assert said in fails(*filled, writes=tmp_path)
+
+
+@pytest.mark.parametrize("clock", ["shared", "separate"])
+def test_a_converted_file_that_is_cut_keeps_the_poses_of_what_is_left(
+    folders: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    clock: Literal["shared", "separate"],
+) -> None:
+    """Samples stand among the exposures; at the end they were all lost with it."""
+    monkeypatch.setattr(write_mcap, "CHUNK_BYTES", 1 << 14)
+    folder = tmp_path / "moved"
+    shutil.copytree(folders["moved"], folder)
+    session = read_recording(folder).session
+    (folder / SESSION_FILE).write_bytes(session_toml(replace(session, clock=clock)))
+    record_folder(folder, tmp_path / "moved.mcap")
+    content = (tmp_path / "moved.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(content[: int(0.6 * len(content))])
+    found = extract_recording(tmp_path / "cut.mcap", tmp_path / "back", is_recovering=True)
+    whole, back = read_recording(folder), read_recording(tmp_path / "back")
+    assert 5 < found.n_exposures < len(whole.rows) - 5
+    poses = poses_by_time(back.rows, back.arm) if back.arm is not None else None
+    assert poses is not None and poses.has_pose.all()
+    assert whole.arm is not None and found.n_samples < len(whole.arm)
+
+
+def test_recover_says_that_poses_are_lost_and_info_that_a_file_is_damaged(
+    folders: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, path = read_recording(folders["moved"]), tmp_path / "late.mcap"
+    with RecordingWriter(path) as writer:
+        writer.begin(source.session)
+        for k, row in enumerate(source.rows):
+            writer.add_exposure(row, source.exposure(k).image)
+        while writer.status().n_written < len(source.rows):
+            time.sleep(0.05)
+        n_bytes = writer.status().n_bytes
+        assert source.arm is not None
+        writer.add_arm_samples(source.arm)
+    content = path.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(content[:n_bytes])
+    assert main(["recover", str(tmp_path / "cut.mcap"), "-o", str(tmp_path / "back")]) == 0
+    assert "NO POSES" in capsys.readouterr().out
+    assert main(["recover", str(path), "-o", str(tmp_path / "whole")]) == 0
+    assert "POSES" not in capsys.readouterr().out
+
+    assert main(["info", str(path)]) == 0
+    assert "damaged" not in capsys.readouterr().out
+    path.write_bytes(content[:100_000] + bytes(200) + content[100_200:])
+    assert main(["info", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert ", damaged" in said
+    assert "armscan recover" in said

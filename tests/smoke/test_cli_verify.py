@@ -64,6 +64,23 @@ def test_a_good_head_passes_and_a_moved_one_does_not(
     assert any(of_recording[0][1:] in text for text in found["good"]["warnings"])
 
 
+def test_a_recording_is_known_as_well_as_the_cloud_of_it(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What the calibration errs is in both; `verify` left it out of the recording's."""
+    standard = ("--plate", str(folder / "plate.csv"))
+    scanner, cloud = str(folder / "good.json"), folder / "same.ply"
+    recording = ["verify", str(folder / "plate"), "--scanner", scanner, *standard, "--json"]
+    assert main(recording) == 0
+    verified = json.loads(capsys.readouterr().out)["inspection"]["nominal"]["offset"]
+    assert main(["reconstruct", str(folder / "plate"), "--scanner", scanner, "-o", str(cloud)]) == 0
+    capsys.readouterr()
+    assert main(["inspect", "plane", str(cloud), *standard, "--json"]) == 0
+    inspected = json.loads(capsys.readouterr().out)["nominal"]["offset"]
+    for key in ("sigma_mm", "sigma_scatter_mm", "sigma_propagated_mm"):
+        assert verified[key] == pytest.approx(inspected[key], rel=1e-3)
+
+
 def test_a_recording_without_the_ball_gets_one_sentence(
     folder: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str]
 ) -> None:

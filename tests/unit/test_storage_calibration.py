@@ -280,7 +280,7 @@ def test_a_scanner_without_a_turn_about_tool_is_read(tmp_path: Path) -> None:
 def test_a_scanner_keeps_the_factor_of_its_region(tmp_path: Path) -> None:
     scanner = scanner_calibration()
     assert scanner.hand_eye.diagnostics is not None
-    few = replace(scanner.hand_eye.diagnostics, region_factor=1.5)
+    few = replace(scanner.hand_eye.diagnostics, region_factor=1.5, is_arm_given=True)
     scanner = replace(scanner, hand_eye=replace(scanner.hand_eye, diagnostics=few))
     path = tmp_path / "scanner.json"
     path.write_bytes(scanner_document(scanner))

@@ -8,7 +8,7 @@ from html import escape
 from typing import cast
 
 from armscan.calibration.cameras.pairs import SIDES
-from armscan.console.journey import Status, StepResult, StepState
+from armscan.console.journey import WORDS, Status, StepResult, StepState
 from armscan.console.quality import ModelWatch
 from armscan.console.scan import LiveScan
 from armscan.console.scene import paragraph
@@ -18,15 +18,6 @@ from armscan.report.quantity import sentence
 
 GOOD, WRONG = "#3f7d2b", "#b3261e"
 TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": WRONG, "old": "#b07d12"}
-WORDS = {
-    "waiting": "waits",
-    "open": "to do",
-    "ready": "can be calculated",
-    "good": "good",
-    "doubtful": "with remarks",
-    "not good": "not good",
-    "old": "out of date",
-}
 
 
 def overview(session: str, rig: str, states: Mapping[str, tuple[Status, bool]], link: str) -> str:

@@ -59,6 +59,16 @@ Filling = Literal["placements", "touches", "motion", "nothing"]
 """How a step's recording comes about: one by one, touch by touch, or while the hand moves."""
 Verdict = Literal["good", "doubtful", "not good"]
 Status = Literal["waiting", "open", "ready", "good", "doubtful", "not good", "old"]
+WORDS: Mapping[str, str] = {
+    "waiting": "waits",
+    "open": "to do",
+    "ready": "can be calculated",
+    "good": "good",
+    "doubtful": "with remarks",
+    "not good": "not good",
+    "old": "out of date",
+}
+"""What people read of a status."""
 
 
 @dataclass(frozen=True, slots=True)

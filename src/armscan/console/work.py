@@ -27,6 +27,7 @@ from armscan.console.journey import (
     RESULTS,
     SETTINGS_FILE,
     STEPS,
+    WORDS,
     Journey,
     SessionSettings,
     StepName,
@@ -515,7 +516,8 @@ def _advice(journey: Journey, step: StepName, result: StepResult) -> str:
         rest = f" If they do not matter: {following[0].lower()}{following[1:]}" if following else ""
         left = len(BY_NAME[step].placements) - journey.n_taken(step)
         if step is StepName.CHECK:
-            return f"Scan the ball once more, from more sides.{rest}"
+            again = "Read the remarks above and scan the ball once more, from more sides."
+            return f"{again}{rest.replace('they', 'the remarks', 1)}"
         if left > 0:
             others = "the other one" if left == 1 else f"the other {left}"
             return f"Take {others} and calculate again: few leave most remarks.{rest}"
@@ -539,7 +541,8 @@ def write_report(journey: Journey) -> Path:
             if result is None:
                 continue
             title = f"{step.title} {scan}".strip()
-            heading = fact("Result", "old" if state.status == "old" else result.verdict, state.why)
+            verdict = "old" if state.status == "old" else result.verdict
+            heading = fact("Result", WORDS[verdict], state.why)
             facts = (heading, *(fact(label, text) for label, text in result.values))
             why = tuple(fact("Remark", text) for text in result.reasons)
             blocks: list[Block] = [Facts((*facts, *why))]

@@ -136,7 +136,12 @@ class MeasuredLength:
 
     @property
     def sigma_mm(self) -> float:
-        """The propagated one, which the scatter is in; else that of scatter; NaN without either."""
+        """The propagated one, else that of scatter; NaN without either.
+
+        Not the larger of the two: what exposures disagree about has weighed in the propagated one,
+        and the jackknife's is the largest of three of it, by chance or where exposures err alike
+        up to twice the true one.
+        """
         if math.isfinite(self.sigma_propagated_mm):
             return self.sigma_propagated_mm
         return self.sigma_scatter_mm

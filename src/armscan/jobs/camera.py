@@ -12,7 +12,7 @@ from armscan.calibration.cameras.calibrate import calibrate_camera as solve_came
 from armscan.calibration.cameras.result import CameraOptions, reasons_to_refuse
 from armscan.errors import FileFormatError, OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.jobs.job import Job, solved
+from armscan.jobs.job import Job, solved, was_simulated
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.pipeline.cameras import (
     CameraRun,
@@ -125,6 +125,7 @@ def calibrate_camera(
         (plate, fit.options, image_options),
         warnings=(*read.warnings, *fit.warnings),
         forced=nonsense,
+        is_simulated=read.is_simulated,
     )
     page = camera_page(fit, run.not_found, by_source, provenance, is_simulated=read.is_simulated)
     job.refuse_nonsense(page, nonsense)
@@ -200,15 +201,17 @@ def calibrate_camera_from_file(
     target = targets[0]
     fit = solved(solve_camera(found.views, options), camera_file)
     nonsense = reasons_to_refuse(fit)
+    is_simulated = was_simulated(before.provenance, camera_file)
     provenance = job.provenance(
         (camera_file, observations_file),
         (target, fit.options),
+        is_simulated=is_simulated,
         parents=(before.provenance,),
         warnings=fit.warnings,
         forced=nonsense,
     )
     inputs = tuple(Path(item.path) for item in before.provenance.inputs)
-    read = _Images((), inputs, are_simulated(inputs))
+    read = _Images((), inputs, is_simulated)
     page = camera_page(fit, (), {}, provenance, is_simulated=read.is_simulated)
     job.refuse_nonsense(page, nonsense)
     observations = pack_observations([view.view for view in fit.views], (), found.sha256)

@@ -280,13 +280,9 @@ def calibrate_hand_eye(
     if isinstance(fit, FitFailure):
         provenance = job.provenance(inputs.files, used, parents=parents, warnings=inputs.warnings)
         page = refused_page(
-            TITLE,
-            [_tried(image) for image in inputs.images],
-            _shown_exposures(inputs),
-            provenance,
-            warnings=inputs.warnings,
-            is_simulated=inputs.is_simulated,
-        )
+            TITLE, [_tried(image) for image in inputs.images], _shown_exposures(inputs),
+            provenance, warnings=inputs.warnings, is_simulated=inputs.is_simulated,
+        )  # fmt: skip
         job.refuse(page, _with_assumptions(fit, inputs))
     repeats: tuple[Table, Text] | None = None
     if len(inputs.groups) > 1:
@@ -301,6 +297,7 @@ def calibrate_hand_eye(
     job.progress(ProgressEvent("solve", n_steps, n_steps))
     fit = replace(fit, warnings=(*inputs.warnings, *fit.warnings))
     provenance = job.provenance(inputs.files, used, parents=parents, warnings=fit.warnings)
+    provenance = replace(provenance, is_simulated=inputs.is_simulated)
     scanner = fit.scanner(inputs.sensor, provenance)
     stripes = tuple(stripe.beside(fit.sensor_step) for stripe in stripes)
     page = hand_eye_page(
@@ -424,6 +421,7 @@ def calibrate_latency(
         (stripe_options,),
         parents=(before.provenance,),
         warnings=odd,
+        is_simulated=is_simulated,
     )
     written: tuple[Path, ...] = ()
     if is_shared:

@@ -41,7 +41,7 @@ from armscan.storage.documents import (
     read_scanner_calibration,
     read_stereo_calibration,
 )
-from armscan.storage.files import files_in, holds_files, is_file, read_bytes
+from armscan.storage.files import damaged_images, files_in, holds_files, is_file, read_bytes
 from armscan.storage.formats.columns import COVARIANCE
 from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import image_format, read_exposure
@@ -102,6 +102,8 @@ def describe_stereo(path: Path) -> dict[str, Any]:
 
 NS_PER_S = 1e9
 NS_PER_MS = 1e6
+LISTED = 5
+"""Damaged images told by name."""
 
 
 def describe_recording(folder: Path) -> dict[str, Any]:
@@ -109,8 +111,10 @@ def describe_recording(folder: Path) -> dict[str, Any]:
     scan = read_recording(folder)
     times = [row.t_ns for row in scan.rows]
     lasers = sorted({name for row in scan.rows for name in row.lasers})
+    damaged = damaged_images(folder)
     content: dict[str, Any] = {
         "what": f"recording ({scan.session.kind}), {len(scan.rows)} exposures"
+        + (", damaged" if damaged else "")
         + (", simulated" if scan.is_simulated else ""),
         "kind": scan.session.kind,
         "simulated": scan.is_simulated,
@@ -126,7 +130,17 @@ def describe_recording(folder: Path) -> dict[str, Any]:
     if scan.arm is not None:
         content |= {"pose_form": scan.session.pose_form, "clock": scan.session.clock}
         content |= _track(scan.arm) | _poses(scan, scan.arm)
-    return content | _notes(scan.session.assumed, scan.warnings)
+    return content | _notes(scan.session.assumed, (*_damage(damaged, folder), *scan.warnings))
+
+
+def _damage(images: tuple[str, ...], path: Path) -> tuple[str, ...]:
+    if not images:
+        return ()
+    rest = f" and {len(images) - LISTED} more" if len(images) > LISTED else ""
+    return (
+        f"the file is damaged: {plural(len(images), 'image')} cannot be read "
+        f"({', '.join(images[:LISTED])}{rest}): armscan recover {path} -o FOLDER",
+    )
 
 
 def describe_touches(folder: Path) -> dict[str, Any]:

@@ -37,6 +37,7 @@ from armscan.storage.files import (
     sole_writer,
     write_files,
 )
+from armscan.storage.image_paths import are_simulated
 from armscan.vision.targets.target import Charuco, Target, describe_target
 
 T = TypeVar("T")
@@ -151,9 +152,10 @@ class Job:
         parents: Sequence[Provenance] = (),
         warnings: Sequence[str] = (),
         forced: Sequence[str] = (),
+        is_simulated: bool = False,
     ) -> Provenance:
         """Record of this run, as `armscan.storage.provenance.new_provenance`."""
-        return new_provenance(
+        made = new_provenance(
             inputs,
             command=self.command,
             options=options,
@@ -161,6 +163,7 @@ class Job:
             warnings=warnings,
             forced=forced,
         )
+        return replace(made, is_simulated=is_simulated)
 
     def write(self, contents: Mapping[Path, Content | Page]) -> tuple[Path, ...]:
         """Write all files or none, and remove the page of an earlier refusal.
@@ -407,3 +410,14 @@ def with_old_layout(summary: Summary, target: Target) -> Summary:
         return summary
     told = fact("target", describe_target(target))
     return replace(summary, quantities=(*summary.quantities, told))
+
+
+def was_simulated(before: Provenance, document: Path) -> bool:
+    """True if a document was made of rendered images.
+
+    One from before does not tell: what lies beside its inputs does, as they are named from here or
+    from its folder.
+    """
+    named = [Path(item.path) for item in before.inputs]
+    beside = [document.parent / path for path in named]
+    return before.is_simulated or are_simulated([*named, *beside])

@@ -429,7 +429,7 @@ def _scan(
     cluster: ClusterAddress | None,
     voxel_mm: float | None,
 ) -> Summary:
-    clock = StageClock()
+    clock, cache = StageClock(), job.cache
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     recording = read_recording(folder, None if arm is None else read_arm_model(arm))
@@ -437,16 +437,17 @@ def _scan(
     if scanner.sensor is not None:
         cameras = cameras_of(scanner.sensor)
         seen = ScanInstants(recording, len(cameras))
-        measure, about = scan_as_seen(seen, scanner.sensor, options.measure, job.cache)
+        measure, about = scan_as_seen(seen, scanner.sensor, options.measure, cache)
         options = replace(options, measure=measure)
         if cluster is not None:
             stripes = stripes_for(scanner.sensor, measure.stripes)
-            reader = ClusterReader(cluster, recording, cameras, stripes, job.cache)
+            reader = ClusterReader(cluster, recording, cameras, stripes, cache)
     with scratch_folder(places[0]) as scratch, scan_spool(scanner, scratch) as points:
         scan = measure_long_scan(
             recording, scanner, points, options,
-            progress=job.progress, cache=job.cache, clock=clock, reader=reader,
+            progress=job.progress, cache=cache, clock=clock, reader=reader,
         )  # fmt: skip
+        clock.n_cached = 0 if cache is None else cache.n_earlier
         warnings = (
             *recording.warnings,
             *recording.session.assumed,

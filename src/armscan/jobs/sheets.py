@@ -17,7 +17,7 @@ from armscan.calibration.sheets.result import (
 )
 from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.jobs.job import Job, solved, with_old_layout
+from armscan.jobs.job import Job, solved, was_simulated, with_old_layout
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, pair_by_view, pair_exposures
@@ -158,6 +158,7 @@ def calibrate_sheets(
         parents=(camera.provenance,),
         warnings=(*read.warnings, *sheet_warnings(fit)),
         forced=nonsense,
+        is_simulated=is_simulated,
     )
     page = laser_page(fit, by_source, provenance, is_simulated=is_simulated)
     job.refuse_nonsense(page, nonsense)
@@ -198,9 +199,11 @@ def calibrate_sheets_from_file(
     options = SheetOptions(**{**recorded, **(changes or {})})
     fit = solved(calibrate_sheets_again(found, sensor, options), sensor_file)
     nonsense = reasons_to_refuse(fit)
+    is_simulated = was_simulated(sensor.provenance, sensor_file)
     provenance = job.provenance(
         (sensor_file, observations_file),
         (options,),
+        is_simulated=is_simulated,
         parents=(sensor.provenance,),
         warnings=sheet_warnings(fit),
         forced=nonsense,
@@ -208,7 +211,6 @@ def calibrate_sheets_from_file(
     # the stripes are the old document's: how they were found goes on word for word
     found_by = (entry for entry in sensor.provenance.options if entry[0].startswith(STRIPES))
     provenance = replace(provenance, options=(*found_by, *provenance.options))
-    is_simulated = are_simulated([Path(item.path) for item in sensor.provenance.inputs])
     page = laser_page(fit, {}, provenance, is_simulated=is_simulated)
     job.refuse_nonsense(page, nonsense)
     observations = pack_board_stripes(fit, found.sha256)

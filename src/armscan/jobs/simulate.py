@@ -11,6 +11,9 @@ from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.simulate import SimulatedScene, SimulateOptions, simulate_scene
 from armscan.report.quantity import Summary, fact, sentences
 
+OF_TARGET = ("camera", "laser")
+"""Scenes in which a calibration target stands."""
+
 
 @dataclass(frozen=True, slots=True)
 class SimulateRequest:
@@ -43,10 +46,12 @@ def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Sum
     found = simulate_scene(request.folder, request.head, request.scene, request.options, progress)
     counts = [fact("images", str(found.n_images))] if found.n_images else []
     counts += [fact("arm samples", str(found.n_arm_samples))] if found.n_arm_samples else []
+    target = found.target if request.scene in OF_TARGET else None
+    counts += [fact("target", target)] if target else []
     return Summary(
         title=f"Simulated: head {request.head}, scene {request.scene}, preset "
         f"{request.options.preset}, seed {request.options.seed}",
-        quantities=(*counts, fact("target", found.target)),
+        quantities=tuple(counts),
         warnings=sentences(found.notes),
         written=(found.folder, found.truth),
         next_step=_next_step(request.scene, found),
@@ -58,7 +63,7 @@ def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Sum
             **asdict(request.options),
             "images": found.n_images,
             "arm_samples": found.n_arm_samples,
-            "target": found.target,
+            "target": target,
             "folder": found.folder.as_posix(),
             "truth": found.truth.as_posix(),
         },
@@ -67,7 +72,7 @@ def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Sum
 
 def _next_step(scene: TwinScene, found: SimulatedScene) -> str:
     folder = found.folder
-    if scene in ("camera", "laser"):
+    if scene in OF_TARGET:
         return f"{_next_calibration(scene, found)} --target {found.target} -o " + (
             "sensor.json" if scene == "laser" else _cameras_document(found)
         )

@@ -121,7 +121,12 @@ def calibrate_stereo(
         job.refuse(page, run)
     fit, nonsense = run.fit, reasons_to_refuse(run.fit)
     provenance = job.provenance(
-        inputs, used, parents=parents, warnings=fit.warnings, forced=nonsense
+        inputs,
+        used,
+        parents=parents,
+        warnings=fit.warnings,
+        forced=nonsense,
+        is_simulated=read.is_simulated,
     )
     page = stereo_page(fit, run.not_found, by_source, provenance, is_simulated=read.is_simulated)
     job.refuse_nonsense(page, nonsense)

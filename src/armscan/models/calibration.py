@@ -191,6 +191,8 @@ class Provenance:
     forced
         Why it was refused, where it was written all the same on request (``--force-bad``), with
         the reasons of the documents on which it rests; empty for a document that was not refused.
+    is_simulated
+        True if it was made of rendered images; documents from before do not tell.
     """
 
     document_id: str
@@ -202,6 +204,7 @@ class Provenance:
     options: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
     forced: tuple[str, ...] = ()
+    is_simulated: bool = False
 
     @property
     def mark(self) -> CalibrationMark:
@@ -481,7 +484,9 @@ class HandEyeDiagnostics:
     plate_flatness_mm, flatness_length_mm
         Standard deviation and correlation length of the plate's flatness in the noise model.
     is_noise_estimated
-        True if the variances came from the data, not from the user.
+        True if variances came from the data, not from the user.
+    is_arm_given
+        True if that of the arm's shift came from the user; not told by documents from before.
     left_out_rotation_deg, left_out_translation_mm
         Largest change when one posture is left out.
     chi2_probability
@@ -502,6 +507,7 @@ class HandEyeDiagnostics:
     left_out_translation_mm: float
     chi2_probability: float
     region_factor: float = 1.0
+    is_arm_given: bool = False
 
 
 class HandEyeCalibration(ArrayRecord):

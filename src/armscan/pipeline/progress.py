@@ -46,18 +46,28 @@ class ChainProfile:
         Of all, with what belongs to no stage.
     peak_mb
         Most memory that the process has held; None where the system does not tell.
+    n_cached
+        Images whose points an earlier run had found: finding them is in no stage.
     """
 
     stages: tuple[tuple[str, float], ...]
     wall_s: float
     processor_s: float
     peak_mb: float | None
+    n_cached: int = 0
 
 
 @dataclass(slots=True)
 class StageClock:
-    """Adds up processor time by stage, of all threads that work for it."""
+    """Adds up processor time by stage, of all threads that work for it.
 
+    Parameters
+    ----------
+    n_cached
+        As of `ChainProfile`.
+    """
+
+    n_cached: int = 0
     _seconds: dict[str, float] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _start: tuple[float, float] = field(
@@ -95,6 +105,7 @@ class StageClock:
             time.perf_counter() - wall,
             time.process_time() - processor,
             peak_memory_mb(),
+            self.n_cached,
         )
 
 

@@ -363,10 +363,10 @@ def measure_long_scan(
     pose_rows = [first_row[found.rows[k]] for k in kept]
     if not len(points):
         raise _nothing_placed(found, exposures, options)
-    extra = doubt_times(source, scanner)
+    cameras, extra = _looking(points, pose_rows, poses, transform), doubt_times(source, scanner)
     if options.has_normals:
         with clock.stage("normals", is_alone=True):
-            extra += _add_normals(points, pose_rows, poses, transform, progress)
+            extra += _add_normals(points, cameras, progress)
     with clock.stage("passes", is_alone=True):
         doubt = doubt_scan(source, scanner, poses, points=points, pose_rows=pose_rows)
     counts = tuple(found.counts[k] for k in kept)
@@ -542,19 +542,19 @@ def _nothing_placed(
     return nothing_measured(found.counts, is_by_thesis=options.measure.is_by_thesis)
 
 
-def _add_normals(
-    points: PointSpool,
-    pose_rows: Sequence[int],
-    poses: ExposurePoses,
-    transform: BaseTransform,
-    progress: Progress,
-) -> tuple[str, ...]:
-    """Give the points normals towards the sensor of each exposure; what is weak about these."""
+def _looking(
+    points: PointSpool, pose_rows: list[int], poses: ExposurePoses, transform: BaseTransform
+) -> FloatArray:
+    """(E, 3) where the sensor stood, told to the points with what its calibration may err by."""
     hand_eye = transform.scanner.hand_eye.tool_from_sensor
-    rows = list(pose_rows)
-    cameras = poses.rotations[rows] @ hand_eye.translation_mm + poses.translations_mm[rows]
-    turns = poses.rotations[rows] @ hand_eye.rotation
-    points.look_from(cameras, errors_of_calibration(transform.scanner, turns))
+    turns = poses.rotations[pose_rows]
+    cameras = turns @ hand_eye.translation_mm + poses.translations_mm[pose_rows]
+    points.look_from(cameras, errors_of_calibration(transform.scanner, turns @ hand_eye.rotation))
+    return cameras
+
+
+def _add_normals(points: PointSpool, cameras: FloatArray, progress: Progress) -> tuple[str, ...]:
+    """Give the points normals towards the sensor of each exposure; what is weak about these."""
     radius_mm = choose_scan_radius_mm(points)
     n_done = n_without = 0
     n_threads = count_cores()
@@ -656,7 +656,7 @@ def place_profiles(
             f"no point lies in the volume {volume}",
             remedy="give limits in mm in the arm's base frame, or none",
         )
-    extra = _add_normals(points, kept, found, transform, silent)
+    extra = _add_normals(points, _looking(points, kept, found, transform), silent)
     return ScanReconstruction(
         cloud=replace(
             points.cloud(),

@@ -274,6 +274,13 @@ def profile_quantities(
             shown="not told by this system" if peak is None else f"{peak:.0f} MB",
         ),
         Quantity("stages_s", "", dict(profile.stages)),
+        Quantity(
+            "n_cached",
+            "From the cache" if profile.n_cached else "",
+            profile.n_cached,
+            meaning="images whose points an earlier run found, which is in no stage; --no-cache "
+            "finds all anew",
+        ),
     )
 
 

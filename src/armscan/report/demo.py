@@ -63,9 +63,9 @@ THESIS: Mapping[str, Mapping[str, str]] = {
     "ball of 34.96 mm: diameter": {"thesis-single": "34.94 mm, 0.02 mm off"},
     "ball within 0.05 mm": {"thesis-single": "95.54 % of 179,427 points"},
     "step, one exposure at rest": {
-        "thesis-single": "20 mm: 19.989 ± 0.006 mm (its cross-line head)",
-        "thesis-cross": "20 mm: 19.989 ± 0.006 mm",
-        "thesis-multi": "5 mm: 5.002 ± 0.02 mm (five lines)",
+        "thesis-single": "20 mm: 19.989 mm, 0.006 mm (its cross-line head)",
+        "thesis-cross": "20 mm: 19.989 mm, 0.006 mm",
+        "thesis-multi": "5 mm: 5.002 mm, 0.02 mm (five lines)",
     },
     "hand-eye, rotation": {"thesis-single": "0.053°, 0.048°, 0.024° (spread of five)"},
     "hand-eye, translation": {"thesis-single": "0.068, 0.027, 0.060 mm (spread of five)"},
@@ -203,8 +203,8 @@ def _share(figures: Figures, limit: str) -> str:
 
 def _steps(head: Figures, frame: str) -> str:
     return "; ".join(
-        f"{step['nominal_mm']:g} mm: {step['mean_mm']:.4f} ± {step['std_mm']:.4f} mm "
-        f"({_points(step)})"
+        f"{step['nominal_mm']:g} mm: {step['mean_mm']:.4f} mm, points' standard deviation "
+        f"{step['std_mm']:.4f} mm ({_points(step)})"
         for step in head["steps"]
         if step["frame"] == frame
     )
@@ -422,8 +422,8 @@ def _cards(head: Figures) -> tuple[Quantity, ...]:
     return (
         fact(
             "Plate",
-            f"{_share(plate, '05')} within 0.05 mm",
-            f"std {1000.0 * plate['std_mm']:.1f} µm, {plate['n_points']:,} points",
+            _share(plate, "05"),
+            f"within 0.05 mm; std {1000.0 * plate['std_mm']:.1f} µm, {plate['n_points']:,} points",
         ),
         fact(
             "Ball",

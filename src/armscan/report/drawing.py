@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.poses import Pose, Sensor
 from armscan.records.exposure import Exposure
 
 ACCENT = "#0b6e87"
@@ -33,6 +34,10 @@ LINE = "#d5dce2"
 ALERT = "#c8541b"
 PALETTE = ("#0b6e87", "#c8541b", "#7a5195", "#5b8c2a", "#b07d12", "#3f6fb5", "#a83a5b", "#4d4d4d")
 """Colours that stay apart, also for colour-blind readers; sheets take them in order."""
+
+HALF_ANGLE = 0.28
+"""Of a drawn sensor: half its width over its depth."""
+AXIS_COLOURS = (PALETTE[1], PALETTE[3], PALETTE[5])
 
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -260,6 +265,8 @@ STILL_PX, STILL_DPI = (1100, 560), 130.0
 """Of the picture of a scene, for paper and where scripts do not run; in the canvas's shape."""
 STILL_DOT = 1.6
 """Area of a dot in square points."""
+STILL_LETTER = 10.0
+"""Width of a letter, px."""
 TURN_HINT = "Drag to turn; click, then scroll to zoom"
 VALUE_HINT = "; a click on a point tells its values."
 YAW, PITCH = -0.65, 0.42
@@ -313,6 +320,28 @@ def pyramid(rim_mm: FloatArray) -> FloatArray:
     """(4 N, 3) ends of the edges of a pyramid from the origin to a rim of N corners."""
     spokes = np.stack([np.zeros_like(rim_mm), rim_mm], axis=1).reshape(-1, 3)
     return np.concatenate([closed_outline(rim_mm), spokes])
+
+
+def held_sensors(
+    sensors: Mapping[str, tuple[Pose[Any, Sensor], float]],
+) -> tuple[list[SceneLines], list[tuple[str, tuple[float, float, float]]]]:
+    """Pyramids of sensors with their axes, and where each name stands: pose and depth, mm."""
+    edges: list[FloatArray] = []
+    axes: list[FloatArray] = []
+    labels: list[tuple[str, tuple[float, float, float]]] = []
+    for name, (pose, depth) in sensors.items():
+        half = HALF_ANGLE * depth
+        corners = ((-half, -half), (half, -half), (half, half), (-half, half))
+        rim = np.array([(x, y, depth) for x, y in corners])
+        triad = np.stack([np.zeros((3, 3)), 0.6 * depth * np.eye(3)], axis=1)
+        edges.append(pose.apply(pyramid(rim)))
+        axes.append(pose.apply(triad))
+        x, y, z = pose.translation_mm.tolist()
+        labels.append((name, (x, y, z)))
+    lines = [SceneLines(np.concatenate(edges), LINE)] if edges else []
+    for k, colour in enumerate(AXIS_COLOURS if axes else ()):
+        lines.append(SceneLines(np.concatenate([item[k] for item in axes]), colour))
+    return lines, labels
 
 
 def ramp_colours(values: FloatArray, low: float, high: float) -> NDArray[np.uint8]:
@@ -424,14 +453,27 @@ def _still(
         colours = np.concatenate([item.colours for item in dots])[order] / 255.0
         right, down, _ = seen[order].T
         axes.scatter(right, down, c=colours, s=STILL_DOT, marker="s", linewidths=0)
+        drawn: list[tuple[float, float, float]] = []
         for text, position in labels:
-            x, y, _ = place(np.array([position]))[0]
-            axes.text(x, y, text, color=MUTED)
+            x, y, _ = place(np.array([position]))[0].tolist()
+            if not _is_covered(x, y, STILL_LETTER * len(text), drawn):
+                drawn.append((x, y, STILL_LETTER * len(text)))
+                axes.text(x, y, text, color=MUTED)
         bar_mm = round_below(0.15 * wide / scale)
         axes.plot([wide - 18.0 - scale * bar_mm, wide - 18.0], [high - 16.0] * 2, color=MUTED)
         axes.text(wide - 18.0, high - 24.0, f"{bar_mm:g} mm", ha="right", color=MUTED)
         _draw_triad(axes, is_z_up=is_z_up)
     return raster_markup(figure, alt, dpi=round(STILL_DPI))
+
+
+def _is_covered(
+    x: float, y: float, width: float, drawn: Sequence[tuple[float, float, float]]
+) -> bool:
+    """Whether a label would lie on one that is drawn: place and width of each, px."""
+    return any(
+        x < left + size and left < x + width and abs(y - top) < 2.0 * STILL_LETTER
+        for left, top, size in drawn
+    )
 
 
 def _draw_triad(axes: Axes, *, is_z_up: bool) -> None:

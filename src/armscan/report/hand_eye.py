@@ -4,19 +4,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from armscan.calibration.hand_eye.observations import PosedStripe
-from armscan.calibration.hand_eye.result import HandEyeFit, PostureResult, study_repeats
+from armscan.calibration.hand_eye.result import (
+    HandEyeFit,
+    PostureResult,
+    hand_eye_numbers,
+    study_repeats,
+)
 from armscan.calibration.latency import LatencyFit
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.rotations import euler_from_rotations, rotation_from_vector
 from armscan.geometry.shapes import Plane
-from armscan.models.calibration import HandEyeCalibration, Provenance, ScannerCalibration
+from armscan.models.calibration import (
+    HandEyeCalibration,
+    HandEyeDiagnostics,
+    Provenance,
+    ScannerCalibration,
+)
 from armscan.reconstruction.labels import LabelledProfile
 from armscan.records.exposure import Exposure
 from armscan.report.charts import (
@@ -34,13 +43,12 @@ from armscan.report.drawing import (
     ALERT,
     LINE,
     MUTED,
-    PALETTE,
     SceneDots,
     SceneLines,
     chart_markup,
     closed_outline,
+    held_sensors,
     new_figure,
-    pyramid,
     ramp_colours,
     ramp_markup,
     raster_markup,
@@ -49,18 +57,23 @@ from armscan.report.drawing import (
 )
 from armscan.report.page import Block, Facts, Gallery, Page, Picture, Section, Text, page_of
 from armscan.report.photographs import stripe_gallery
-from armscan.report.quantity import Quantity, Table, fact, for_people, significant, with_sigma
+from armscan.report.quantity import (
+    Quantity,
+    Table,
+    fact,
+    for_people,
+    only,
+    significant,
+    with_sigma,
+)
 
 TITLE = "Hand-eye calibration"
-ANGLE_STEP_RAD = 1e-6
 EULER_NAMES = ("θ (about X)", "γ (about Y)", "φ (about Z)")
 SHORT_NAMES = ("rot X", "rot Y", "rot Z", "X", "Y", "Z")
 MAX_DOTS_OF_POSTURE = 400
 MAX_DOTS = 12_000
 FRUSTUM_SHARE = 0.3
 """Length of a drawn camera as a share of its distance from the points."""
-HALF_ANGLE = 0.28
-AXIS_COLOURS = (PALETTE[1], PALETTE[3], PALETTE[5])
 NOISE_TEXT = (
     "The reported pose of a posture is off by a shift, a turn about the origin of Tool and a turn "
     "about the scan point that all exposures of the posture share; a smaller part is new in every "
@@ -70,48 +83,18 @@ NOISE_TEXT = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEyeNumbers:
-    """What is printed of a hand-eye.
-
-    Parameters
-    ----------
-    euler_deg, euler_sigma_deg
-        (3,) angles of eq. 2.69, ``R = Rx(theta) Ry(gamma) Rz(phi)``, and standard deviations.
-    translation_mm, translation_sigma_mm
-        (3,) origin of Sensor in Tool.
-    rotation_sigma_deg
-        Root mean square standard deviation of a rotation about an axis of Tool.
-    size_sigma_mm
-        Root mean square standard deviation of a component of the translation.
-    """
-
-    euler_deg: FloatArray
-    euler_sigma_deg: FloatArray
-    translation_mm: FloatArray
-    translation_sigma_mm: FloatArray
-    rotation_sigma_deg: float
-    size_sigma_mm: float
-
-
-def hand_eye_numbers(hand_eye: HandEyeCalibration, covariance: FloatArray) -> HandEyeNumbers:
-    """Numbers of a hand-eye under a covariance (6, 6), in the order of its own."""
-    rotation = hand_eye.tool_from_sensor.rotation
-    steps = np.stack([rotation_from_vector(ANGLE_STEP_RAD * axis) @ rotation for axis in np.eye(3)])
-    angles = euler_from_rotations(rotation[None], "intrinsic-xyz")[0]
-    difference = euler_from_rotations(steps, "intrinsic-xyz") - angles
-    wrapped = (difference + np.pi) % (2.0 * np.pi) - np.pi
-    deuler_drotation = wrapped.T / ANGLE_STEP_RAD
-    euler_variance = np.diag(deuler_drotation @ covariance[:3, :3] @ deuler_drotation.T)
-    variance = np.diag(covariance)
-    return HandEyeNumbers(
-        euler_deg=np.degrees(angles),
-        euler_sigma_deg=np.degrees(np.sqrt(euler_variance)),
-        translation_mm=np.asarray(hand_eye.tool_from_sensor.translation_mm),
-        translation_sigma_mm=np.sqrt(variance[3:]),
-        rotation_sigma_deg=float(np.degrees(np.sqrt(variance[:3].mean()))),
-        size_sigma_mm=float(np.sqrt(variance[3:].mean())),
-    )
+ARM_FROM = {
+    (
+        False,
+        True,
+    ): "estimated from the residuals, which therefore test nothing: compare it with the "
+    "arm's certificate",
+    (True, True): "the shift as given; what was not given is estimated from the residuals, which "
+    "therefore test little",
+    (False, False): "as given",
+    (True, False): "as given",
+}
+"""Where the scatter is from, by whether the arm's shift was given and others were estimated."""
 
 
 def total_covariance(scanner: ScannerCalibration) -> FloatArray:
@@ -127,8 +110,6 @@ def hand_eye_quantities(scanner: ScannerCalibration) -> tuple[Quantity, ...]:
     matrix = "\n".join("  ".join(f"{v:+.6f}" for v in row) for row in np.round(rotation, 6))
     angles = zip(EULER_NAMES, numbers.euler_deg, numbers.euler_sigma_deg, strict=True)
     lengths = zip("XYZ", numbers.translation_mm, numbers.translation_sigma_mm, strict=True)
-    arm = hand_eye.arm_noise
-    turn_deg = float(np.degrees(np.hypot(arm.rotation_rad, arm.tool_rotation_rad)))
     size = (
         f"{hand_eye.n_postures} postures, {hand_eye.n_exposures} exposures, "
         f"{hand_eye.n_points:,} points"
@@ -154,8 +135,7 @@ def hand_eye_quantities(scanner: ScannerCalibration) -> tuple[Quantity, ...]:
         ),
         Quantity("euler_sigma_deg", "", numbers.euler_sigma_deg.tolist()),
         Quantity("translation_sigma_mm", "", numbers.translation_sigma_mm.tolist()),
-        Quantity("arm_position_mm", "", arm.position_mm),
-        Quantity("arm_rotation_deg", "", turn_deg),
+        *_arm_quantities(hand_eye),
         Quantity("n_postures", "Rests on", hand_eye.n_postures, shown=size),
         Quantity("n_exposures", "", hand_eye.n_exposures),
         Quantity("n_points", "", hand_eye.n_points),
@@ -170,27 +150,51 @@ def hand_eye_quantities(scanner: ScannerCalibration) -> tuple[Quantity, ...]:
     )
 
 
+def _arm_quantities(hand_eye: HandEyeCalibration) -> tuple[Quantity, Quantity]:
+    """Scatter of the arm in one exposure, an axis, and where it was taken from."""
+    position_mm, at_scan_point, at_tool = np.sqrt(hand_eye.arm_noise.variances).tolist()
+    turn_deg = float(np.degrees(np.hypot(at_scan_point, at_tool)))
+    origin, known = "", hand_eye.diagnostics
+    if known is not None:
+        origin = f", {_origin(known)}"
+    turns = f"{significant(turn_deg, digits=2)}° ({_turns(at_scan_point, at_tool, digits=2)})"
+    return (
+        Quantity(
+            "arm_position_mm",
+            "Arm's scatter",
+            position_mm,
+            meaning=f"{turns}, an axis in one exposure{origin}",
+            shown=significant(position_mm, "mm", 2),
+        ),
+        Quantity("arm_rotation_deg", "", turn_deg),
+    )
+
+
+def _origin(known: HandEyeDiagnostics) -> str:
+    if not known.is_noise_estimated:
+        return "as given"
+    if known.is_arm_given:
+        return "the shift as given, what was not given estimated from the residuals"
+    return (
+        "estimated from the residuals, which therefore test nothing: compare it with the arm's "
+        "certificate"
+    )
+
+
 def _evidence(hand_eye: HandEyeCalibration) -> tuple[Quantity, ...]:
     """How well the postures determine the hand-eye; nothing where that was not kept."""
-    known, arm = hand_eye.diagnostics, hand_eye.arm_noise
+    known = hand_eye.diagnostics
     if known is None:
         return ()
     change = (
         f"{significant(known.left_out_rotation_deg)}°, "
         f"{significant(known.left_out_translation_mm)} mm"
     )
-    if known.is_noise_estimated:
-        position, at_scan_point, at_tool = np.sqrt(arm.variances).tolist()
-        noise = fact(
-            "Arm's scatter",
-            significant(position, "mm", 2),
-            f"{_turns(at_scan_point, at_tool, digits=2)}, an axis, estimated from the residuals, "
-            "which therefore test nothing: compare it with the arm's certificate",
-        )
-    else:
+    noise = []
+    if not known.is_noise_estimated:
         fits = "no" if known.chi2_probability < 0.001 else "yes"
         verdict = f"residuals {chi2_verdict(known.chi2_probability)}"
-        noise = fact("Fits the noise model", fits, verdict)
+        noise = [fact("Fits the noise model", fits, verdict)]
     return (
         Quantity("method", "", known.method),
         Quantity("rank", "", known.rank),
@@ -203,13 +207,14 @@ def _evidence(hand_eye: HandEyeCalibration) -> tuple[Quantity, ...]:
         ),
         Quantity("weakest", "Known least", known.weakest),
         fact("Largest change without one posture", change),
-        noise,
+        *noise,
         Quantity(
             "region_factor",
             "Joint 95 % region",
             known.region_factor,
-            shown=f"{np.sqrt(known.region_factor):.2f} times the usual one of the covariance",
-            meaning="errors have longer tails where the scatter is known from few postures",
+            shown=f"{known.region_factor:.2f} times the usual limit of e' C⁻¹ e",
+            meaning=f"{np.sqrt(known.region_factor):.2f} times as wide: errors have longer tails "
+            "where the scatter is known from few postures",
         ),
         Quantity("chi2_probability", "", known.chi2_probability),
         Quantity("plate_flatness_mm", "", known.plate_flatness_mm),
@@ -271,14 +276,18 @@ def hand_eye_page(
         sections.append(Section("The stripes", stripe_gallery(images, names, exposures or {})))
     hand_eye = fit.calibration
     told = hand_eye_quantities(scanner)
-    of_result = ("Residual", "Condition", "Arm's scatter", "Fits the noise model")
+    of_result = ("Residual", "Condition", "Fits the noise model")
     return page_of(
         scanner.provenance,
         TITLE,
         f"Where the sensor sits on the arm, from {hand_eye.n_postures} postures, "
         f"{hand_eye.n_exposures} exposures and {hand_eye.n_points:,} points",
         sections,
-        cards=(*_sigma_cards(scanner), *(item for item in told if item.label in of_result)),
+        cards=(
+            *_sigma_cards(scanner),
+            *(replace(one, meaning="an axis") for one in only(told, "arm_position_mm")),
+            *(item for item in told if item.label in of_result),
+        ),
         warnings=fit.warnings,
         is_simulated=is_simulated,
     )
@@ -387,8 +396,7 @@ def _noise_facts(fit: HandEyeFit) -> tuple[Quantity, ...]:
         alike = f"alike within {known.flatness_length_mm:.0f} mm"
         facts.append(fact("Plate's flatness", f"{flatness} mm, {alike}"))
     if known is not None:
-        origin = "estimated from the residuals" if known.is_noise_estimated else "as given"
-        facts.append(fact("These standard deviations are", origin))
+        facts.append(fact("These standard deviations are", _origin(known)))
     return tuple(facts)
 
 
@@ -575,24 +583,15 @@ def _cameras(
     for stripe in stripes:
         if stripe.source in used and len(stripe):
             first.setdefault(stripe.posture, stripe)
-    edges: list[FloatArray] = []
-    axes: list[FloatArray] = []
-    labels: list[tuple[str, tuple[float, float, float]]] = []
-    for posture, stripe in first.items():
-        pose = stripe.base_from_tool @ fit.calibration.tool_from_sensor
-        size = FRUSTUM_SHARE * float(np.linalg.norm(stripe.points_mm.mean(axis=0)))
-        half = HALF_ANGLE * size
-        corners = ((-half, -half), (half, -half), (half, half), (-half, half))
-        rim = np.array([(x, y, size) for x, y in corners])
-        triad = np.stack([np.zeros((3, 3)), 0.6 * size * np.eye(3)], axis=1)
-        edges.append(pose.apply(pyramid(rim)))
-        axes.append(pose.apply(triad))
-        x, y, z = pose.translation_mm.tolist()
-        labels.append((posture, (x, y, z)))
-    lines = [SceneLines(np.concatenate(edges), LINE)] if edges else []
-    for k, colour in enumerate(AXIS_COLOURS if axes else ()):
-        lines.append(SceneLines(np.concatenate([item[k] for item in axes]), colour))
-    return lines, labels
+    return held_sensors(
+        {
+            posture: (
+                stripe.base_from_tool @ fit.calibration.tool_from_sensor,
+                FRUSTUM_SHARE * float(np.linalg.norm(stripe.points_mm.mean(axis=0))),
+            )
+            for posture, stripe in first.items()
+        }
+    )
 
 
 def _plate_edges(plate: Plane, points_mm: FloatArray) -> FloatArray:

@@ -301,7 +301,9 @@ def stripe_table(profiles: Sequence[Profile]) -> Table:
                 said.append(f"{n} {label.removeprefix('flagged: ')}")
         n_good = len(profile) - len(rejected)
         rows.append((profile.source, str(n_good), str(len(rejected)), ", ".join(said)))
-    return Table(("image", "accepted", "flagged", "flagged for"), tuple(rows), "", (3,))
+    return Table(
+        ("image", "accepted", "flagged", "flagged for (one or more each)"), tuple(rows), "", (3,)
+    )
 
 
 def stripe_picture(

@@ -402,6 +402,9 @@ def _residuals_along(fit: LaserFit, index: int) -> Picture:
     reach = 1.15 * max(
         float(np.percentile(np.abs(image.residual_mm[_used(image, index)]), 98)) for image in images
     )
+    beyond = sum(
+        int((np.abs(image.residual_mm[_used(image, index)]) > reach).sum()) for image in images[:n]
+    )
     with styled():
         figure = new_figure(PAGE_WIDTH, 1.9 * rows + 0.5)
         grid: Any = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
@@ -415,7 +418,8 @@ def _residuals_along(fit: LaserFit, index: int) -> Picture:
             axes.set_axis_off()
         figure.supxlabel("along the stripe, mm", fontsize=9, color=MUTED)
         figure.supylabel("off the sheet, mm", fontsize=9, color=MUTED)
-    more = f" {len(images) - n} more boards are not shown." if len(images) > n else ""
+    more = f" Beyond the pictures: {plural(beyond, 'point')}." if beyond else ""
+    more += f" {len(images) - n} more boards are not shown." if len(images) > n else ""
     return Picture(
         raster_markup(figure, "Residuals along the stripe"),
         title=f"Sheet {fit.sheets[index].name}: residuals along the stripe",

@@ -17,7 +17,7 @@ import time
 import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -62,9 +62,18 @@ class DetectionCache:
     ----------
     folder
         Where they lie.
+    reused, made
+        Names of the entries that this object gave, and that it kept.
     """
 
     folder: Path
+    reused: set[str] = field(default_factory=set, compare=False, repr=False)
+    made: set[str] = field(default_factory=set, compare=False, repr=False)
+
+    @property
+    def n_earlier(self) -> int:
+        """Entries given that an earlier run had kept."""
+        return len(self.reused - self.made)
 
     @classmethod
     def beside(cls, document: Path) -> DetectionCache:
@@ -79,12 +88,14 @@ class DetectionCache:
         except OSError:
             return None
         if found is not None:
+            self.reused.add(key)
             with suppress(OSError):
                 os.utime(path)
         return found
 
     def put(self, key: str, found: Found) -> None:
         """Keep an entry; where the disk refuses, the next run looks again."""
+        self.made.add(key)
         content = _packed(found, key)
         if content is None:
             return

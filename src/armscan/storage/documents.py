@@ -327,10 +327,12 @@ LAYOUTS: Mapping[type, Layout] = {
     CameraDiagnostics: EVIDENCE,
     SheetDiagnostics: EVIDENCE,
     SensorDiagnostics: EVIDENCE,
-    HandEyeDiagnostics: Layout(is_evidence=True, optional=("region_factor",)),
+    HandEyeDiagnostics: Layout(is_evidence=True, optional=("region_factor", "is_arm_given")),
     FTest: EVIDENCE,
     ScanTransform: Layout(covariance_names=lambda _: REGISTRATION_PARAMETERS),
-    Provenance: Layout(codecs={"options": FieldCodec(dict, _texts)}, optional=("forced",)),
+    Provenance: Layout(
+        codecs={"options": FieldCodec(dict, _texts)}, optional=("forced", "is_simulated")
+    ),
 }
 CODEC = RecordCodec(LAYOUTS)
 

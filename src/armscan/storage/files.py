@@ -132,6 +132,18 @@ def packed_notes(path: Path) -> tuple[str, ...]:
     return () if packed is None else _packed_folder(packed[0]).notes
 
 
+def damaged_images(path: Path) -> tuple[str, ...]:
+    """Images of a recording in one file that cannot be read; nothing of any other path.
+
+    Raises
+    ------
+    FileFormatError
+        If the recording is unfinished, or its tables are damaged.
+    """
+    packed = packed_place(path)
+    return () if packed is None else _packed_folder(packed[0]).damaged_images
+
+
 def is_folder(path: Path) -> bool:
     """True for a folder; False also for a path that no system takes."""
     try:

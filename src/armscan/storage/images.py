@@ -479,7 +479,8 @@ def read_exposure(
         raise OptionError(
             f"pixels reach {int(image.max())}, more than {bits} bits hold",
             where=str(path),
-            remedy="state the bits that the camera uses",
+            remedy="state the bits that the camera uses (--bits-used), and --bits-align high where "
+            "they are the upper ones of 16",
         )
     return Exposure(image, name, bits_used=bits, lasers=lasers)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.devices.sources import ScanSource
-from armscan.errors import ArmscanError, FileFormatError, InputError
+from armscan.errors import ArmscanError, FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import BoolArray, ImageArray, IntArray
 from armscan.models.arm import ArmModel
 from armscan.records.exposure import Exposure
@@ -188,6 +188,12 @@ PNG_WAY = (
 and are no larger."""
 
 
+BITS_REMEDY = (
+    'correct bits_used of the [[camera]] in session.toml, and align ("high" where the bits are the '
+    "upper ones of 16)"
+)
+
+
 def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposure:
     """Read the image of a row; a Bayer pattern is turned into red, green and blue.
 
@@ -203,7 +209,10 @@ def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposur
     """
     path = folder / row.source
     options = ImageOptions(setup.bits_used, setup.align)
-    image = read_exposure(path, options, source=row.source)
+    try:
+        image = read_exposure(path, options, source=row.source)
+    except OptionError as error:
+        raise OptionError(error.what, where=error.where, remedy=BITS_REMEDY) from error
     _check_layout(image, setup, path)
     _check_size(image, setup, path)
     pixels = image.image if setup.colour != "bayer_rggb" else demosaiced(image.image)

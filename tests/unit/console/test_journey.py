@@ -6,11 +6,14 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from armscan.console import work
 from armscan.console.journey import (
     LOCK_FILE,
     SETTINGS_FILE,
@@ -24,7 +27,7 @@ from armscan.console.journey import (
 )
 from armscan.console.rig import open_bench, take_back
 from armscan.console.scan import GrowingRecording
-from armscan.console.work import run_step
+from armscan.console.work import run_step, write_report
 from armscan.errors import (
     ArmscanError,
     EstimationError,
@@ -35,6 +38,7 @@ from armscan.errors import (
 from armscan.geometry.poses import Pose
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.report.quantity import Summary
 from armscan.storage.arm import ProbeTip, write_probing
 from armscan.storage.recording import read_arm_track, read_recording
 
@@ -159,6 +163,27 @@ def test_what_to_do_after_a_refusal_can_be_done_on_the_page(
     result = run_step(journey.folder, StepName.PROBING)
     assert result.reasons == ("The arm would have to scatter by 0.55 mm an axis; check the plate.",)
     assert "Start over" in result.next_step
+
+
+def test_advice_after_a_doubtful_check_says_what_it_means_and_the_report_reads_as_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journey = open_journey(tmp_path / "s", SETTINGS)
+    touch_plate(journey, 12)
+    probed = work.probe
+
+    def with_remark(*given: Any, **how: Any) -> Summary:
+        return replace(probed(*given, **how), warnings=("The touches are few.",))
+
+    monkeypatch.setattr("armscan.console.work.probe", with_remark)
+    result = run_step(journey.folder, StepName.PROBING)
+    assert result.verdict == "doubtful"
+    advice = work._advice(journey, StepName.CHECK, result)
+    assert "remarks" in advice.split(".")[0]
+    assert " they " not in advice
+    page = write_report(open_journey(journey.folder)).read_text("utf-8")
+    assert "with remarks" in page
+    assert "doubtful" not in page
 
 
 def test_a_refusal_is_a_result_with_its_sentence(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.estimate import Problem, estimate
+from armscan.calibration.hand_eye.estimate import LEVER_MM, Problem, estimate
 from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
     PlateReference,
@@ -58,6 +59,24 @@ def test_exact_stripes_give_the_exact_hand_eye(count: int) -> None:
     fit = _fitted(*_rig(count, noise=SILENT).draw(0), HandEyeOptions())
     assert np.abs(_error(fit)).max() < 1e-9
     assert fit.calibration.rms_mm < 1e-9
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_parameter_is_known_worse_than_what_is_called_known_least(seed: int) -> None:
+    """It is the worst direction of the stated covariance, in which the scatter's doubt is."""
+    rig = _rig(6, seed=seed)
+    fit = _fitted(*rig.draw(seed), HandEyeOptions(plate_flatness_mm=NOISE.flatness_mm))
+    known = fit.calibration.diagnostics
+    assert known is not None and known.is_noise_estimated and not known.is_arm_given
+    for label, text in fit.reference:
+        assert label[0].isupper() and " rad" not in text
+    told = re.search(r"known to (\S+) mm", known.weakest)
+    assert told is not None
+    scale = np.array([LEVER_MM] * 3 + [1.0] * 3)
+    stated = np.sqrt(np.diag(fit.calibration.covariance)) * scale
+    worst = np.linalg.eigvalsh(fit.calibration.covariance * np.outer(scale, scale))[-1]
+    assert float(told[1]) >= 0.995 * stated.max()
+    assert float(told[1]) == pytest.approx(np.sqrt(worst), rel=0.01)
 
 
 def test_a_bowed_sheet_spoils_the_start_but_not_the_result() -> None:

@@ -239,7 +239,7 @@ def test_a_moved_plate_that_is_solved_along_is_held_by_the_stated_covariance(by_
     fit = calibrate_on_plate(stripes, _raised(plate, by_mm), HandEyeOptions(solve_plate=True))
     assert isinstance(fit, HandEyeFit)
     given = np.array(plate.plane.coefficients)
-    shown = dict(fit.reference)["plate"].replace("- ", "-").replace("+ ", "+").split()
+    shown = dict(fit.reference)["Plate"].replace("- ", "-").replace("+ ", "+").split()
     assert [float(shown[k]) for k in (0, 2, 4, 6)] == pytest.approx(given, abs=0.2)
     error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
     assert error @ np.linalg.solve(fit.calibration.covariance, error) < CHI2_999
@@ -350,8 +350,8 @@ def test_words_about_the_plane_follow_its_test() -> None:
     tilted = replace(plate, plane=Plane(plate.plane.point_mm, plate.plane.axes @ turn.T))
     off = calibrate_on_plate(stripes, tilted)
     assert isinstance(clean, HandEyeFit) and isinstance(off, HandEyeFit)
-    assert "agree with it" in dict(clean.reference)["plane, checked"]
-    assert "contradict it" in dict(off.reference)["plane, checked"]
+    assert "agree with it" in dict(clean.reference)["Plane, checked"]
+    assert "contradict it" in dict(off.reference)["Plane, checked"]
 
 
 def test_a_plate_without_covariance_is_not_said_to_be_coefficients() -> None:
@@ -360,7 +360,7 @@ def test_a_plate_without_covariance_is_not_said_to_be_coefficients() -> None:
     for n_points in (0, plate.n_points):
         fit = calibrate_on_plate(stripes, replace(plate, covariance=None, n_points=n_points))
         assert isinstance(fit, HandEyeFit)
-        said[n_points] = dict(fit.reference)["plane"]
+        said[n_points] = dict(fit.reference)["Plane"]
     assert "only A, B, C, D were given" in said[0]
     assert "probed plate's uncertainty is not known" in said[plate.n_points]
 

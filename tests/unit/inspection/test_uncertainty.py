@@ -20,6 +20,7 @@ from armscan.inspection.sphere import inspect_sphere, linearised_sphere
 from armscan.inspection.step import inspect_step
 from armscan.inspection.uncertainty import measured_length
 from armscan.records.cloud import FIELD_POWERS, CalibrationErrors, PointCloud
+from armscan.report.inspection.shapes import sigma_facts
 from armscan.vision.stripe.smooth import Polyline, smooth
 from rigs.inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
 
@@ -156,6 +157,10 @@ def test_strokes_that_each_see_all_of_a_ball_and_err_as_a_whole_leave_its_size_a
     scatter = float(np.std([item.value_mm for item in found], ddof=1))
     stated = float(np.sqrt(np.mean([item.sigma_mm**2 for item in found])))
     assert 1.0 / SPREAD_LIMIT < scatter / stated < SPREAD_LIMIT
+    # the jackknife takes them for new, so that the larger of the two would be twice too large
+    larger = float(np.sqrt(np.mean([item.sigma_scatter_mm**2 for item in found])))
+    assert larger > SPREAD_LIMIT * scatter
+    assert any("largest of three" in item.line for item in sigma_facts(found[0], "diameter"))
 
 
 def test_exposures_that_disagree_by_more_than_the_cloud_says_have_a_larger_sigma() -> None:

@@ -200,6 +200,19 @@ def test_a_folder_that_may_not_be_written_costs_time_only(
     assert (tmp_path / "cache").read_text() == "a file"
 
 
+def test_what_an_earlier_run_found_is_counted_apart(tmp_path: Path) -> None:
+    """A run that asks twice for what it found itself has saved no time."""
+    first = DetectionCache(tmp_path)
+    first.put("a", FitFailure("none"))
+    assert first.get("a") is not None
+    assert first.n_earlier == 0
+    second = DetectionCache(tmp_path)
+    second.put("b", FitFailure("none"))
+    assert all(second.get(name) is not None for name in ("a", "a", "b"))
+    assert second.get("c") is None
+    assert second.n_earlier == 1
+
+
 def test_the_folder_stays_below_its_limit(tmp_path: Path) -> None:
     """What was used last stays; other files are left alone."""
     cache = DetectionCache(tmp_path)

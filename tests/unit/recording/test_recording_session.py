@@ -221,8 +221,10 @@ def test_high_aligned_bits_are_shifted_and_too_many_are_refused(tmp_path: Path) 
     np.testing.assert_array_equal(exposure.image, levels)
     assert exposure.bits_used == 12
     (folder / "session.toml").write_text(session.replace("high", "low"))
-    with pytest.raises(OptionError, match="more than 12 bits hold"):
+    with pytest.raises(OptionError, match="more than 12 bits hold") as refused:
         read_recording(folder).exposure(0)
+    for key in ("bits_used", "align", "session.toml"):
+        assert key in refused.value.remedy
 
 
 @pytest.mark.parametrize("said", ["mono", "rgb", "bayer_rggb"])

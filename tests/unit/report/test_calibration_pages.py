@@ -150,6 +150,21 @@ def test_laser_page_shows_every_point_and_the_bow() -> None:
     assert dots >= sum(len(image.profile) for image in fit.images)
 
 
+def test_residuals_that_the_picture_cuts_off_are_counted() -> None:
+    """It ends at 1.15 times what holds 98 % of a board's points."""
+    fit = laser_fit()
+    used = [one.residual_mm[np.isfinite(one.residual_mm)] for one in fit.images]
+    residual_mm = np.copy(fit.images[0].residual_mm)
+    inside = np.flatnonzero(np.abs(residual_mm) < 0.5 * np.nanstd(residual_mm))[:3]
+    residual_mm[inside] = 100.0 * max(np.abs(one).max() for one in used)
+    odd = replace(fit, images=(replace(fit.images[0], residual_mm=residual_mm), *fit.images[1:]))
+    before, after = (
+        sum(int(n) for n in re.findall(r"Beyond the pictures: (\d+) point", page))
+        for page in (text_of(render_page(laser_page(one, {}, PROVENANCE))) for one in (fit, odd))
+    )
+    assert before + 1 <= after <= before + 3
+
+
 def test_laser_page_names_the_points_along_an_edge_and_gives_every_status_a_colour() -> None:
     """The first half of one stripe runs on an edge of the target."""
     rig = thesis_rig()

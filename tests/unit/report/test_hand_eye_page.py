@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye.result import angle_covariance
+from armscan.calibration.hand_eye.result import angle_covariance, hand_eye_numbers
 from armscan.geometry.rotations import rotations_from_euler
 from armscan.jobs.hand_eye import hand_eye_summary
-from armscan.models.calibration import HandEyeCalibration, ScannerCalibration
-from armscan.report.hand_eye import chi2_verdict, hand_eye_numbers, hand_eye_page, repeat_blocks
+from armscan.models.calibration import ArmNoise, HandEyeCalibration, ScannerCalibration
+from armscan.report.hand_eye import chi2_verdict, hand_eye_page, hand_eye_quantities, repeat_blocks
 from armscan.report.page import render_page
 from rigs.hand_eye_fake import N_POSTURES, TOOL_FROM_SENSOR, fake_fit
 from rigs.sheet_rig import PROVENANCE
@@ -65,6 +65,39 @@ def test_the_page_shows_result_postures_noise_and_warnings(method: str) -> None:
     assert ("Residuals over the plate" in text) == (method == "plate")
     assert ("alike within 40 mm" in text) == (method == "plate")
     assert page.count(b"<canvas") == 1
+
+
+def test_programs_read_the_scatter_and_the_region_that_people_read() -> None:
+    """Of one exposure, posture's and exposure's own part together, whoever asks."""
+    fit, _ = fake_fit()
+    noise = ArmNoise(0.003, 3e-5, 0.004, 4e-5, 6e-5, 8e-5)
+    known = fit.calibration.diagnostics
+    assert known is not None
+    told = replace(fit.calibration, arm_noise=noise, diagnostics=replace(known, region_factor=1.44))
+    scanner = ScannerCalibration(sensor=None, hand_eye=told, provenance=PROVENANCE)
+    quantities = {item.key: item for item in hand_eye_quantities(scanner)}
+    arm, region = quantities["arm_position_mm"], quantities["region_factor"]
+    assert (arm.label, arm.value) == ("Arm's scatter", pytest.approx(0.005))
+    assert arm.text == "0.0050 mm"
+    turn_deg = np.degrees(np.hypot(5e-5, 1e-4))
+    assert quantities["arm_rotation_deg"].value == pytest.approx(turn_deg)
+    assert f"{turn_deg:.4f}°" in arm.line
+    assert region.text.startswith("1.44 times")
+    assert "1.20 times as wide" in region.line
+
+
+@pytest.mark.parametrize("is_arm_given", [False, True])
+def test_a_scatter_that_was_given_is_not_called_estimated(is_arm_given: bool) -> None:
+    """The plate's flatness, which was not, is still estimated."""
+    fit, _ = fake_fit()
+    known = fit.calibration.diagnostics
+    assert known is not None
+    told = replace(known, is_noise_estimated=True, is_arm_given=is_arm_given)
+    hand_eye = replace(fit.calibration, diagnostics=told)
+    scanner = ScannerCalibration(sensor=None, hand_eye=hand_eye, provenance=PROVENANCE)
+    line = next(q.line for q in hand_eye_quantities(scanner) if q.key == "arm_position_mm")
+    assert ("the shift as given" in line) == is_arm_given
+    assert ("test nothing" in line) != is_arm_given
 
 
 def test_residuals_that_the_noise_model_does_not_allow_are_called_so() -> None:

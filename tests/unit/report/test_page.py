@@ -6,10 +6,12 @@ from __future__ import annotations
 import base64
 import re
 import shlex
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.report.drawing import (
@@ -89,6 +91,23 @@ def test_simulated_data_are_called_so() -> None:
 def exposure(level: int, window: SensorWindow | None = None) -> Exposure:
     image = np.full((60, 90, 3), level, np.uint8)
     return Exposure(image, 'a"b.png', window=window or SensorWindow())
+
+
+def test_labels_that_would_lie_on_each_other_are_drawn_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn: list[str] = []
+    plain = Axes.text
+
+    def text(axes: Axes, x: float, y: float, s: str, **how: Any) -> Any:
+        drawn.append(s)
+        return plain(axes, x, y, s, **how)
+
+    monkeypatch.setattr(Axes, "text", text)
+    dots = uniform_dots(np.array([[0.0, 0.0, 0.0], [100.0, 50.0, 0.0]]), "#000000")
+    labels = [("p1", (0.0, 0.0, 0.0)), ("p2", (0.5, 0.0, 0.0)), ("p3", (90.0, 40.0, 0.0))]
+    scene_markup([dots], [], labels, "three postures")
+    assert [name for name in drawn if name.startswith("p")] == ["p1", "p3"]
 
 
 def test_photographs_are_reduced_and_marks_stay_where_they_are() -> None:

@@ -194,6 +194,7 @@ def _fit_on_plate(
     if refused is not None:
         return refused
     rows, joint = [np.flatnonzero(mark) for mark in kept], joint_covariance(fit)
+    conditioning = conditioning.under(joint.hand_eye + checked.widening)
     found = _evidence(
         checked,
         joint,
@@ -440,7 +441,8 @@ def _fit_on_sphere(
     for section in sections:
         stripe, before = rows.get(id(section.stripe), (section.stripe, np.zeros(0, np.int64)))
         rows[id(stripe)] = (stripe, np.concatenate([before, section.rows]))
-    conditioning, left, joint = _conditioning(fit), leave_each_out(fit), joint_covariance(fit)
+    left, joint = leave_each_out(fit), joint_covariance(fit)
+    conditioning = _conditioning(fit).under(joint.hand_eye)
     found = _evidence(
         CheckedFit(fit),
         joint,

@@ -414,6 +414,11 @@ class JointCovariance:
     dhand_eye_dsensor: FloatArray | None
     sensor: FloatArray | None
 
+    @property
+    def hand_eye(self) -> FloatArray:
+        """(6, 6) covariance of the hand-eye with what the sensor's uncertainty does to it."""
+        return np.asarray(self.unknowns[:N_HAND_EYE, :N_HAND_EYE])
+
 
 def joint_covariance(solution: HandEyeSolution) -> JointCovariance:
     """Covariance of hand-eye and sensor as one least squares has moved both."""
@@ -570,6 +575,18 @@ class Conditioning:
     rank: int
     condition: float
     weakest: str
+
+    def under(self, covariance: FloatArray) -> Conditioning:
+        """With the least known combination by a covariance (6, 6) of the hand-eye.
+
+        The system is whitened by the likeliest scatter and knows no sensor that errs; what is
+        stated of a hand-eye is its covariance, and no parameter may be known worse than the worst
+        combination.
+        """
+        scale = np.array([LEVER_MM] * 3 + [1.0] * 3)
+        values, vectors = np.linalg.eigh(covariance * scale[:, None] * scale)
+        sigma_mm = float(np.sqrt(max(values[-1], 0.0)))
+        return replace(self, weakest=_weakest(vectors[:, -1], sigma_mm))
 
 
 def conditioning_at(

@@ -18,6 +18,7 @@ from armscan.calibration.hand_eye.estimate import (
     minimise_distances,
 )
 from armscan.calibration.hand_eye.noise import (
+    TURNS,
     arm_noise,
     covariance_over_noise,
     estimate_noise,
@@ -30,7 +31,11 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, RowRecord, floats
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool
-from armscan.geometry.rotations import euler_from_rotations, nearest_rotation
+from armscan.geometry.rotations import (
+    euler_from_rotations,
+    nearest_rotation,
+    rotation_from_vector,
+)
 from armscan.geometry.shapes import Plane
 from armscan.models.calibration import (
     HandEyeCalibration,
@@ -41,6 +46,7 @@ from armscan.models.calibration import (
 )
 
 FINITE_CONDITION = 1e12
+ANGLE_STEP_RAD = 1e-6
 RADIUS_COLUMN, SCALE_COLUMN = N_HAND_EYE + 3, N_HAND_EYE + 4
 """Of a step on a sphere."""
 OUTLYING = 3.0
@@ -54,6 +60,21 @@ REJECTED_SHARE = 0.015
 """A stripe that loses more than this part of its points is named."""
 SHORT_ARC = 0.6
 """A stripe whose arc is shorter than this part of the usual one is named."""
+
+
+_DEGREES = ("°", float(np.degrees(1.0)))
+SCATTER_NAMES = {
+    "arm": ("arm's shift of a posture", " mm", 1.0),
+    f"arm {TURNS[0]}": ("arm's turn about Tool of a posture", *_DEGREES),
+    f"arm {TURNS[1]}": ("arm's turn about the scan point of a posture", *_DEGREES),
+    "exposure": ("arm's shift of an exposure", " mm", 1.0),
+    f"exposure {TURNS[0]}": ("arm's turn about Tool of an exposure", *_DEGREES),
+    f"exposure {TURNS[1]}": ("arm's turn about the scan point of an exposure", *_DEGREES),
+    "flatness": ("plate's flatness", " mm", 1.0),
+    "sheet shape": ("shape of the sheets", " mm", 1.0),
+    "stripe": ("noise of the stripes", " times its own sigma", 1.0),
+}
+"""Causes of scatter on a plate as people read them: name, unit, and that unit's number of one."""
 
 
 class StripeResidual(RowRecord):
@@ -197,6 +218,7 @@ def hand_eye_calibration(
         left_out_translation_mm=max(one.left_out_translation_mm for one in postures),
         chi2_probability=fit.probability,
         region_factor=joint.region_factor,
+        is_arm_given=not is_estimated[0],
     )
     return HandEyeCalibration(
         tool_from_sensor=fit.state.tool_from_sensor,
@@ -289,29 +311,27 @@ def plate_facts(checked: CheckedFit, plate: PlateSurface) -> tuple[tuple[str, st
     reference, fit = plate.reference, checked.fit
     is_solved = fit.problem.options.solve_plate
     a, b, c, d = (plane_after(fit) or plate.plane if is_solved else plate.plane).coefficients
-    facts = [("plate", f"{a:.6f} x {_signed(b)} y {_signed(c)} z {_signed(d, 4)} = 0 in Base (mm)")]
+    facts = [("Plate", f"{a:.6f} x {_signed(b)} y {_signed(c)} z {_signed(d, 4)} = 0 in Base (mm)")]
     if reference.n_points:
         rms = "" if reference.rms_mm is None else f", {reference.rms_mm:.4f} mm rms from it"
-        facts.append(("probed", f"{reference.n_points} points{rms}"))
+        facts.append(("Probed", f"{reference.n_points} points{rms}"))
     if is_solved:
-        facts.append(("plane", "solved along, without regard to the probing"))
+        facts.append(("Plane", "solved along, without regard to the probing"))
     elif reference.covariance is None and reference.n_points:
-        facts.append(("plane", "taken as exact: the probed plate's uncertainty is not known"))
+        facts.append(("Plane", "taken as exact: the probed plate's uncertainty is not known"))
     elif reference.covariance is None:
-        facts.append(("plane", "taken as exact: only A, B, C, D were given"))
+        facts.append(("Plane", "taken as exact: only A, B, C, D were given"))
     else:
-        facts.append(("plane", "as probed, weighted by its uncertainty"))
+        facts.append(("Plane", "as probed, weighted by its uncertainty"))
     if checked.plane_check:
-        facts.append(("plane, checked", checked.plane_check))
+        facts.append(("Plane, checked", checked.plane_check))
     moved = _sensor_in_words(fit)
     if moved:
-        facts.append(("sensor, moved", moved))
+        facts.append(("Sensor, moved", moved))
     for component, sigma in zip(fit.components, fit.noise.sigmas, strict=True):
-        unit = {"stripe": "times its own sigma"}.get(component.name, "mm")
-        if "rotation" in component.name:
-            unit = "rad"
+        label, unit, factor = SCATTER_NAMES[component.name]
         origin = "estimated" if component.is_estimated else "given"
-        facts.append((f"scatter: {component.name}", f"{sigma:.3g} {unit} ({origin})"))
+        facts.append((f"Scatter, {label}", f"{factor * sigma:.3g}{unit} ({origin})"))
     return tuple(facts)
 
 
@@ -622,3 +642,47 @@ def angle_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray
 def _values(pose: Pose[Tool, Sensor]) -> FloatArray:
     angles = np.degrees(euler_from_rotations(pose.rotation, "intrinsic-xyz")[0])
     return np.concatenate([angles, pose.translation_mm])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeNumbers:
+    """A hand-eye as people read it.
+
+    Parameters
+    ----------
+    euler_deg, euler_sigma_deg
+        (3,) angles of eq. 2.69, ``R = Rx(theta) Ry(gamma) Rz(phi)``, and standard deviations.
+    translation_mm, translation_sigma_mm
+        (3,) origin of Sensor in Tool.
+    rotation_sigma_deg
+        Root mean square standard deviation of a rotation about an axis of Tool.
+    size_sigma_mm
+        Root mean square standard deviation of a component of the translation.
+    """
+
+    euler_deg: FloatArray
+    euler_sigma_deg: FloatArray
+    translation_mm: FloatArray
+    translation_sigma_mm: FloatArray
+    rotation_sigma_deg: float
+    size_sigma_mm: float
+
+
+def hand_eye_numbers(hand_eye: HandEyeCalibration, covariance: FloatArray) -> HandEyeNumbers:
+    """Numbers of a hand-eye under a covariance (6, 6), in the order of its own."""
+    rotation = hand_eye.tool_from_sensor.rotation
+    steps = np.stack([rotation_from_vector(ANGLE_STEP_RAD * axis) @ rotation for axis in np.eye(3)])
+    angles = euler_from_rotations(rotation[None], "intrinsic-xyz")[0]
+    difference = euler_from_rotations(steps, "intrinsic-xyz") - angles
+    wrapped = (difference + np.pi) % (2.0 * np.pi) - np.pi
+    deuler_drotation = wrapped.T / ANGLE_STEP_RAD
+    euler_variance = np.diag(deuler_drotation @ covariance[:3, :3] @ deuler_drotation.T)
+    variance = np.diag(covariance)
+    return HandEyeNumbers(
+        euler_deg=np.degrees(angles),
+        euler_sigma_deg=np.degrees(np.sqrt(euler_variance)),
+        translation_mm=np.asarray(hand_eye.tool_from_sensor.translation_mm),
+        translation_sigma_mm=np.sqrt(variance[3:]),
+        rotation_sigma_deg=float(np.degrees(np.sqrt(variance[:3].mean()))),
+        size_sigma_mm=float(np.sqrt(variance[3:].mean())),
+    )

@@ -416,7 +416,8 @@ class _Case:
             return refused
         is_told = model.is_bowed or not self.options.is_bow_allowed
         common = self._common_plane(k)
-        warnings = (*geometry_warnings(geometry, common, fitted_deg), *points.warnings)
+        stated_deg = _tilt_sigma_deg(covariance, sheet.scale_mm)
+        warnings = (*geometry_warnings(geometry, common, fitted_deg, stated_deg), *points.warnings)
         if model.plane_test.p_value < LACK_OF_FIT_P:
             outlier = find_outlier_view(observations, sheet, self.errors)
             if outlier is not None:
@@ -449,7 +450,7 @@ class _Case:
             ),
             covariance=covariance,
             is_bow_free=model.is_bowed,
-            tilt_sigma_deg=_tilt_sigma_deg(covariance, sheet.scale_mm),
+            tilt_sigma_deg=stated_deg,
             offset_sigma_mm=float(np.sqrt(covariance[2, 2])),
             comparisons=compare_planes(sheet, observations, self.images, self.cameras),
             points=points,

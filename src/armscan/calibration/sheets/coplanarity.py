@@ -178,9 +178,13 @@ def refuse_underdetermined_tilt(
 
 
 def geometry_warnings(
-    geometry: SheetGeometry, common: CommonPlane | None, tilt_sigma_deg: float
+    geometry: SheetGeometry, common: CommonPlane | None, fitted_deg: float, stated_deg: float
 ) -> tuple[str, ...]:
-    """What is weak about the boards of a solved sheet."""
+    """What is weak about the boards of a solved sheet.
+
+    ``fitted_deg`` is what the boards' places leave its direction open by, which more depth mends;
+    ``stated_deg`` what is told of it everywhere.
+    """
     warnings = []
     if geometry.n_boards == 2 and common is not None:
         sigmas = common.largest_mm / max(common.sigma_largest_mm, 1e-12)
@@ -196,9 +200,9 @@ def geometry_warnings(
             "sheet rests on their distances alone, and stripes given to the wrong sheet would be "
             "coplanar all the same: tilt the board by 20 deg or more between images"
         )
-    if tilt_sigma_deg > WEAK_TILT_SIGMA_DEG:
+    if fitted_deg > WEAK_TILT_SIGMA_DEG:
         warnings.append(
-            f"the sheet's direction is known to {tilt_sigma_deg:.2f} deg only: spread the boards "
+            f"the sheet's direction is known to {stated_deg:#.3g} deg only: spread the boards "
             "over more depth"
         )
     return tuple(warnings)

@@ -25,6 +25,7 @@ from armscan.inspection.selection import InspectionOptions, StepOptions
 from armscan.inspection.sphere import inspect_sphere as sphere_of
 from armscan.inspection.step import inspect_step as step_of
 from armscan.jobs.job import Job, solved
+from armscan.reconstruction.place import DELIVERED
 from armscan.records.cloud import PointCloud
 from armscan.records.points import ProbedPoints
 from armscan.report.inspection.shapes import (
@@ -220,9 +221,15 @@ def finished_inspection(
     """Write the page, if one is wanted, and sum up."""
     is_simulated = cloud.is_simulated or are_simulated(inputs)
     if cloud.noise_length is None and cloud.sigma_noise_mm.any():
+        is_delivered = tuple(cloud.sheet_names) == (DELIVERED,)
         assumed = (
             "the cloud does not say how far neighbours share the stripe's noise: it is taken as "
-            "new in every point, as if nothing had been smoothed along it; reconstruct again"
+            "new in every point, as if nothing had been smoothed along it; "
+            + (
+                "a sensor that delivers profiles does not tell"
+                if is_delivered
+                else "reconstruct again"
+            )
         )
         report = replace(report, warnings=(*report.warnings, assumed))
     written: tuple[Path, ...] = ()

@@ -9,7 +9,8 @@ import math
 from hashlib import sha256
 from pathlib import Path
 
-from armscan.errors import FileFormatError, InputError, OptionError, OutputError
+from armscan.errors import ArmscanError, FileFormatError, InputError, OptionError, OutputError
+from armscan.reconstruction.sync import exposure_poses
 from armscan.report.quantity import Quantity, Summary
 from armscan.storage.clouds import CLOUD_SUFFIXES
 from armscan.storage.files import (
@@ -154,13 +155,38 @@ def recover_recording(source: Path, output: Path, *, is_overwriting: bool = Fals
             "this is the damaged file itself", where=f"-o {output}", remedy="name another file"
         )
     if output.suffix.lower() != SUFFIX:
-        return _summary(title, extract_recording(source, output, is_recovering=True), output)
+        found = extract_recording(source, output, is_recovering=True)
+        return _summary(title, found, output, _lost_poses(output, found))
     check_outputs((output,), is_overwriting=is_overwriting)
     with scratch_folder(output) as scratch:
         folder = scratch / "recording"
         found = extract_recording(source, folder, is_recovering=True)
+        poses = _lost_poses(folder, found)
         record_folder(folder, output)
-    return _summary(title, found, output)
+    return _summary(title, found, output, poses)
+
+
+def _lost_poses(folder: Path, found: ReadBack) -> tuple[str, ...]:
+    """Say if exposures came back whose poses did not; nothing of a file that lost nothing."""
+    if not found.lost:
+        return ()
+    if not found.n_samples:
+        return (
+            "NO POSES: the file gives no sample of the arm; if an arm was recorded, none of the "
+            f"{found.n_exposures} exposures that came back can be placed",
+        )
+    try:
+        scan = read_recording(folder)
+        poses = exposure_poses(scan.rows, scan.arm, scan.session.clock)
+    except ArmscanError as error:
+        return (f"NO POSES: of {found.n_exposures} exposures none can be placed ({error.what})",)
+    n_lost = int((~poses.has_pose).sum())
+    if not n_lost:
+        return ()
+    return (
+        f"POSES LOST: {n_lost} of {found.n_exposures} exposures that came back have no pose "
+        f"({poses.missing})",
+    )
 
 
 def _refuse_points(output: Path, source: Path) -> None:
@@ -184,7 +210,7 @@ def _lost_exposures(found: ReadBack) -> Quantity:
     return Quantity(key, label, math.nan, meaning=meaning, shown=shown)
 
 
-def _summary(title: str, found: ReadBack, output: Path) -> Summary:
+def _summary(title: str, found: ReadBack, output: Path, poses: tuple[str, ...] = ()) -> Summary:
     is_file = output.suffix.lower() == SUFFIX
     return Summary(
         title=title,
@@ -197,7 +223,7 @@ def _summary(title: str, found: ReadBack, output: Path) -> Summary:
             Quantity("least_lost_exposures", "", found.n_lost),
             Quantity("seconds", "duration", found.seconds, unit="s"),
         ),
-        warnings=(*(f"lost: {text}" for text in found.lost), *found.aside, *found.warnings),
+        warnings=(*poses, *(f"lost: {text}" for text in found.lost), *found.aside, *found.warnings),
         written=(output,),
         next_step=f"armscan convert {output} FOLDER" if is_file else f"armscan info {output}",
         extra={"kind": "recording", "lost": list(found.lost)},

@@ -67,6 +67,10 @@ FUSED_SIGMA = (
 )
 MUCH_BEYOND = 0.05
 """Part of the points on a fitted plane that may lie too far from the nominal one to count."""
+SCATTER_IN_PROPAGATED = (
+    "though the other is larger: a jackknife counts as new in each block what blocks share, and is "
+    "the largest of three; what exposures disagree about has weighed in this one"
+)
 STILL_SIGMA = fact(
     "Sigma of the height",
     "not known from one exposure: its error is the calibration's, which shifts both faces nearly "
@@ -372,7 +376,10 @@ def sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
     """Where the standard deviation of a length comes from; nothing of one that is not known."""
     if math.isnan(length.sigma_mm):
         return ()
-    origin = "propagated" if math.isfinite(length.sigma_propagated_mm) else "from scatter"
+    origin, why = "from scatter", ""
+    if math.isfinite(length.sigma_propagated_mm):
+        larger = length.sigma_scatter_mm > length.sigma_propagated_mm
+        origin, why = "propagated", SCATTER_IN_PROPAGATED if larger else ""
     return (
         fact(
             f"Sigma of the {name} from scatter",
@@ -384,7 +391,7 @@ def sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
             f"{significant(length.sigma_propagated_mm, 'mm')}: from the points' covariances, "
             "common to exposures as far as what these disagree about tells",
         ),
-        fact("Shown after ±", f"the sigma {origin}"),
+        fact("Shown after ±", f"the sigma {origin}", why),
         fact(
             "Not in either",
             "what a calibration errs more than it says: `armscan verify` tests it",

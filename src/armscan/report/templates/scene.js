@@ -83,9 +83,15 @@ function drawScenes() {
       // a pale rim keeps a label readable where lines cross it
       context.strokeStyle = "rgba(255, 255, 255, 0.9)";
       context.lineWidth = 4 * ratio;
+      // one label where several would lie on each other; turning the scene shows the others
+      const drawn = [];
       for (const [text, ...at] of labels) {
-        context.strokeText(text, ...place(at, 0));
-        context.fillText(text, ...place(at, 0));
+        const [x, y] = place(at, 0), wide = context.measureText(text).width, high = 14 * ratio;
+        if (drawn.some(([left, top, size]) =>
+          x < left + size && left < x + wide && Math.abs(y - top) < high)) continue;
+        drawn.push([x, y, wide]);
+        context.strokeText(text, x, y);
+        context.fillText(text, x, y);
       }
       if (picked >= 0) drawPicked(context, place(points, 3 * picked), width, ratio);
       drawAxes(context, turn, 46 * ratio, height - 46 * ratio, 30 * ratio, ratio);

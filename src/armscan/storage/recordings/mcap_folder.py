@@ -548,12 +548,23 @@ class McapFolder:
             shown = stored_image(message, place.said)
             return shown.data if isinstance(shown, CompressedImage) else _netpbm(shown)
         except DAMAGE as error:
-            raise self._damaged(error) from error
+            raise self._damaged(error, name) from error
 
-    def _damaged(self, error: BaseException) -> FileFormatError:
+    @property
+    def damaged_images(self) -> tuple[str, ...]:
+        """Images that cannot be read; it reads all of the file."""
+        found = []
+        for name in self._images:
+            try:
+                self.read(name)
+            except FileFormatError:
+                found.append(name)
+        return tuple(found)
+
+    def _damaged(self, error: BaseException, name: str = "") -> FileFormatError:
         return FileFormatError(
             f"the recording is damaged ({error or type(error).__name__})",
-            where=path_text(self.path),
+            where=path_text(self.path / name),
             remedy=RECOVER_REMEDY,
         )
 

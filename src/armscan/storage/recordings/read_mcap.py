@@ -21,7 +21,13 @@ from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError, FileFormatError, OutputError
 from armscan.geometry.arrays import ImageArray
 from armscan.records.exposure import Exposure
-from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.records.recording import (
+    NO_TRIGGER,
+    ArmTrack,
+    CameraSetup,
+    ExposureRow,
+    Session,
+)
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, arm_columns
 from armscan.storage.files import (
     check_outputs,
@@ -472,19 +478,51 @@ def _write_all(
     images: Iterable[ImageArray | bytes],
     progress: Report | None,
 ) -> WriterStatus:
+    n_arm, n_before = 0 if content.arm is None else len(content.arm), _samples_before(content)
+    n_written = 0
     with writer:
         writer.begin(content.session, content.documents)
         for k, (row, image) in enumerate(zip(content.rows, images, strict=True)):
+            n_written = _write_samples(writer, content, n_written, n_before[k])
             cells = {name: column[k] for name, column in content.columns.items()}
             writer.add_exposure(row, image, cells=cells)
             if progress is not None:
                 progress(k + 1, len(content.rows), row.source)
-        for first in range(0, 0 if content.arm is None else len(content.arm), ARM_BATCH):
-            span = slice(first, first + ARM_BATCH)
-            cells_of = {name: cells[span] for name, cells in content.arm_cells.items()}
-            if content.arm is not None:
-                writer.add_arm_samples(content.arm.select(span), cells=cells_of)
+        _write_samples(writer, content, n_written, n_arm)
     return writer.status()
+
+
+def _samples_before(content: _Content) -> list[int]:
+    """(E,) samples of the arm that stand before each exposure in the file, none after its pose.
+
+    As they would come live, so that a file that is cut off keeps the poses of what is left: up to
+    the sample after the exposure's time or that of its trigger; of separate clocks without
+    triggers the same share of samples as of exposures.
+    """
+    rows, arm = content.rows, content.arm
+    if arm is None or not rows:
+        return [0] * len(rows)
+    after = np.ceil(np.arange(1, len(rows) + 1) * (len(arm) / len(rows))).astype(np.int64)
+    if content.session.clock != "separate":
+        times = np.array([row.t_ns for row in rows], dtype=np.int64)
+        after = np.searchsorted(arm.t_ns, times, "right") + 1
+    elif arm.trigger_ids is not None:
+        place = {int(trigger): k + 1 for k, trigger in enumerate(arm.trigger_ids)}
+        own = [NO_TRIGGER - 1 if row.trigger_id is None else row.trigger_id for row in rows]
+        after = np.array([place.get(k, 0) for k in own], dtype=np.int64)
+    least = np.minimum(np.maximum.accumulate(after), len(arm))
+    return [int(n) for n in least]
+
+
+def _write_samples(writer: RecordingWriter, content: _Content, first: int, end: int) -> int:
+    """Write samples of the arm from one on to before another; returns how many there are now."""
+    arm = content.arm
+    while arm is not None and first < end:
+        span = slice(first, min(first + ARM_BATCH, end))
+        cells = {name: column[span] for name, column in content.arm_cells.items()}
+        writer.add_arm_samples(arm.select(span), cells=cells)
+        first = span.stop
+    return first
 
 
 def _give_name(part: Path, output: Path, beside: Mapping[Path, bytes]) -> None:

@@ -19,6 +19,7 @@ from armscan.pipeline.cameras import (
     calibrate_camera_from_found,
     calibrate_camera_from_views,
     camera_calibration,
+    numbered_alike,
 )
 from armscan.pipeline.targets import find_targets
 from armscan.records.exposure import Exposure
@@ -199,7 +200,8 @@ def calibrate_camera_from_file(
             remedy="calibrate again from the images",
         )
     target = targets[0]
-    fit = solved(solve_camera(found.views, options), camera_file)
+    solution = solved(solve_camera(found.views, options), camera_file)
+    fit = numbered_alike(found.views, solution, target)
     nonsense = reasons_to_refuse(fit)
     is_simulated = was_simulated(before.provenance, camera_file)
     provenance = job.provenance(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +25,9 @@ from armscan.calibration.cameras.result import (
 from armscan.calibration.cameras.robust import agreeing_numberings, missed_places_mm
 from armscan.calibration.cameras.stereo_result import SideFit, StereoFit
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.poses import Board, Pose
 from armscan.geometry.rotations import vector_from_rotation
 from armscan.models.calibration import (
     CameraCalibration,
@@ -168,7 +169,7 @@ def calibrate_camera_from_views(
         is_same = settled is not None and settled.free_parameters == fit.free_parameters
         if is_same or done == total:
             progress(ProgressEvent("solve", total, total))
-            return CameraRun(_numbered_alike(views, fit, target), (), rounds)
+            return CameraRun(numbered_alike(views, fit, target), (), rounds)
         progress(ProgressEvent("solve", done, total))
         model = _model_of(fit)
 
@@ -195,37 +196,49 @@ def _with_settled_centres(
     return views, CENTRE_ROUNDS - 1, before
 
 
-def _numbered_alike(
-    views: Sequence[TargetView], fit: CameraFit, target: Target | None
-) -> CameraFit:
-    """The camera of the same views, numbered alike if the target looks alike when turned."""
+def numbered_alike(views: Sequence[TargetView], fit: CameraFit, target: Target | None) -> CameraFit:
+    """The camera of the same views, numbered alike if the target looks alike when turned.
+
+    See `armscan.calibration.cameras.robust.agreeing_numberings`.
+    """
     if target is None or not target.symmetric_turns:
         return fit
-    used = [view for view in fit.used_views if not view.is_misfit]
-    seen = [(v.view, v.sensor_from_board, v.residuals_px, ~v.is_outlier) for v in used]
+    seen = [
+        _Seen(fit.camera, view.view, view.sensor_from_board, view.residuals_px, view.is_outlier)
+        for view in fit.used_views
+        if not view.is_misfit
+    ]
     known = numberings(target)
-    chosen = _agreeing(fit.camera, seen, known)
-    if chosen is None:
+    turn = _numbering_of(seen, known)
+    if not turn:
         return fit
-    turn = {view.source: known[k] for view, k in zip(used, chosen, strict=True)}
     alike = [renumbered(view, target, turn.get(view.source, known[0])) for view in views]
     again = calibrate_camera(alike, fit.options)
     return fit if isinstance(again, FitFailure) else again
 
 
-Seen = tuple[TargetView, Pose[Sensor, Board], FloatArray, BoolArray]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """A view with its camera, and its pose, residuals and outliers before that camera."""
+
+    camera: CameraModel
+    view: TargetView
+    pose: Pose[Any, Board]
+    residuals_px: FloatArray
+    is_outlier: BoolArray
 
 
-def _agreeing(
-    camera: CameraModel, seen: Sequence[Seen], known: Sequence[Numbering]
-) -> IntArray | None:
-    """As `agreeing_numberings`, of views with poses, residuals and the points that were used."""
-    places = [view.points_board_mm[kept] for view, _, _, kept in seen]
+def _numbering_of(seen: Sequence[_Seen], known: Sequence[Numbering]) -> dict[str, Numbering]:
+    """Numbering of each view, by source, in which all agree; empty if none changes."""
+    places = [one.view.points_board_mm[~one.is_outlier] for one in seen]
     missed = [
-        missed_places_mm(camera, pose, board_mm, residuals_px[kept])
-        for board_mm, (_, pose, residuals_px, kept) in zip(places, seen, strict=True)
+        missed_places_mm(one.camera, one.pose, board_mm, one.residuals_px[~one.is_outlier])
+        for board_mm, one in zip(places, seen, strict=True)
     ]
-    return agreeing_numberings(places, missed, known)
+    chosen = agreeing_numberings(places, missed, known)
+    if chosen is None:
+        return {}
+    return {one.view.source: known[k] for one, k in zip(seen, chosen, strict=True)}
 
 
 def _model_of(fit: CameraFit) -> DistortionModel:
@@ -454,22 +467,27 @@ def _pairs_numbered_alike(
     """
     if not target.symmetric_turns:
         return None
-    seen: list[Seen] = [
-        (fitted.pair.left, own.sensor_from_board, own.residuals_px, ~own.is_outlier)
-        for fitted in fit.pairs
-        if not fitted.is_misfit
-        and fitted.pair.left is not None
-        and (own := fitted.left) is not None
-    ]
-    known = numberings(target)
-    chosen = _agreeing(fit.views.left, seen, known)
-    if chosen is None:
+    seen = []
+    for fitted in fit.pairs:
+        pair, left, right = fitted.pair, fitted.left, fitted.right
+        if fitted.is_misfit:
+            continue
+        if pair.left is not None and left is not None:
+            where = left.sensor_from_board
+            seen.append(_Seen(fit.views.left, pair.left, where, left.residuals_px, left.is_outlier))
+        elif pair.right is not None and right is not None:
+            before = fit.views.right_from_left @ right.sensor_from_board
+            seen.append(
+                _Seen(fit.views.right, pair.right, before, right.residuals_px, right.is_outlier)
+            )
+    turn = _numbering_of(seen, numberings(target))
+    if not turn:
         return None
-    turn = {view.source: known[k] for (view, *_), k in zip(seen, chosen, strict=True)}
     alike = {pair.name: pair for pair in pairs}
     for pair in (fitted.pair for fitted in fit.pairs):
-        if pair.left is not None and (how := turn.get(pair.left.source)) is not None:
-            views = (v and renumbered(v, target, how) for v in pair.views)
+        told = [v.source for v in pair.views if v is not None and v.source in turn]
+        if told:
+            views = (v and renumbered(v, target, turn[told[0]]) for v in pair.views)
             alike[pair.name] = StereoPair(*views)
     return list(alike.values())
 

@@ -92,13 +92,11 @@ def pair_sources(lit: Sequence[str], dark: Sequence[str]) -> list[int]:
             "or none at all",
         )
     names = [PurePath(source).name for source in lit]
-    place = {PurePath(source).name: k for k, source in enumerate(dark)}
-    if len(place) < len(dark):
-        return list(range(len(dark)))
-    if set(names) == set(place):
-        return [place[name] for name in names]
+    dark_names = [PurePath(source).name for source in dark]
+    if len(set(dark_names)) == len(dark) and set(names) == set(dark_names):
+        return [dark_names.index(name) for name in names]
     for k, name in enumerate(names):
-        if place.get(name, k) != k:
+        if name in dark_names and dark_names[k] != name:
             raise InputError(
                 f"{dark[k]} would be taken for its view without laser, where one of its own name "
                 "is given, too",
@@ -180,6 +178,13 @@ def _check_pair(exposure: Exposure, partner: Exposure) -> None:
             "the same image is given with and without laser",
             where=exposure.source,
             remedy="give the image without laser as its partner",
+        )
+    if exposure.colour != partner.colour:
+        raise InputError(
+            f"the image with laser is {exposure.colour}, its partner {partner.source} "
+            f"{partner.colour}",
+            where=exposure.source,
+            remedy="give both as the camera took them",
         )
     sizes = [(e.width_px, e.height_px, e.window) for e in (exposure, partner)]
     if sizes[0] != sizes[1]:

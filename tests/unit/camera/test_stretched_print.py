@@ -66,7 +66,9 @@ def test_a_print_that_is_far_off_is_refused_and_can_be_forced(stretch: float) ->
     told = float(reason.split(" times as far apart")[0].split()[-1])
     assert told == pytest.approx(stretch, abs=0.01)
     x, y = (np.diff(np.unique(GRID.points_board_mm[:, k])).min() for k in range(2))
-    one, other = (float(text) for text in reason.split("write ")[1].split()[0].split("x"))
+    one, other = (
+        float(text) for text in reason.split("give both lengths, ")[1].split()[0].split("x")
+    )
     assert one == pytest.approx(x)
     assert other == pytest.approx(y * told, rel=1e-3), "the specification that fits"
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -64,6 +66,22 @@ def test_numbers_that_start_at_any_corner_state_the_same(target: CircleGrid) -> 
         assert again.fit.target_error_mm == pytest.approx(alike.fit.target_error_mm, rel=1e-5)
         assert alike.fit.target_error_mm == pytest.approx(0.01, rel=0.25)
         assert plain.fit.target_error_mm < 0.9 * alike.fit.target_error_mm
+
+
+def test_views_left_out_stay_out_and_too_few_tell_nothing() -> None:
+    target = CircleGrid(11, 9, 15.0)
+    views, _ = make_views(Scene(target=target, missed_mm=0.01), 1)
+    mixed, _ = turned_at_random(views, target, 1)
+    options = replace(OPTIONS, leave_out=(views[3].source, views[7].source))
+    run = calibrate_camera_from_views(mixed, options, target=target)
+    assert isinstance(run, CameraRun)
+    plain = calibrate_camera_from_views(mixed, options)
+    assert isinstance(plain, CameraRun)
+    assert run.fit.target_error_mm > 1.1 * plain.fit.target_error_mm, "numbered anew"
+    assert [v.source for v in run.fit.views if not v.is_used] == list(options.leave_out)
+    places, missed = [target.points_board_mm] * 3, np.ones((len(target.points_board_mm), 2))
+    turned = numberings(target)[1].new_index
+    assert agreeing_numberings(places, [missed, missed[turned], missed], numberings(target)) is None
 
 
 @pytest.mark.parametrize("n_views", [4, 8, 20])

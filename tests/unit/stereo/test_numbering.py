@@ -153,14 +153,18 @@ def test_boards_that_lie_alike_do_not_tell() -> None:
     assert "chessboard" in fit.remedy
 
 
+@pytest.mark.parametrize("n_right_only", [0, 6])
 @pytest.mark.parametrize(("scene", "turns"), [(SCENE, (0, 2)), (SQUARE, (0, 1, 2, 3))])
 def test_pairs_numbered_apart_state_what_pairs_numbered_alike_do(
-    scene: StereoScene, turns: tuple[int, ...]
+    scene: StereoScene, turns: tuple[int, ...], n_right_only: int
 ) -> None:
     """Errors of the print turn with it: taken for others in each pair, they would average out."""
     scene = replace(scene, n_pairs=12, missed_mm=0.01)
     rng = np.random.default_rng(3)
     pairs, _ = make_pairs(scene, 3)
+    pairs[-n_right_only or len(pairs) :] = [
+        StereoPair(None, pair.right) for pair in pairs[-n_right_only or len(pairs) :]
+    ]
     chosen = [(int(rng.choice(turns)), int(rng.choice(turns))) for _ in pairs]
     mixed = [turned(pair, scene.target, *of) for pair, of in zip(pairs, chosen, strict=True)]
     alike, again = (

@@ -161,6 +161,10 @@ def test_views_without_laser_are_taken_off(
     assert "swap the images" in capsys.readouterr().err
     assert main([*words, "--background", str(on)]) == 2
     assert "its own view without laser" in capsys.readouterr().err
+    colour = tmp_path / "colour.png"
+    cv2.imwrite(str(colour), cv2.merge([cv2.imread(str(off / "0.png"), 0)] * 3))
+    assert main([*words, "--background", str(colour)]) == 2
+    assert "as the camera took them" in capsys.readouterr().err
     (off / "0.png").rename(off / "2.png")
     assert main([*words, "--background", str(off)]) == 2
     assert "of its own name" in capsys.readouterr().err

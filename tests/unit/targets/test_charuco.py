@@ -193,3 +193,32 @@ def test_a_marker_beside_the_board_moves_no_corner(*, is_covered: bool) -> None:
     assert isinstance(both, TargetView)
     np.testing.assert_array_equal(both.point_index, alone.point_index)
     np.testing.assert_allclose(both.points_px, alone.points_px, atol=1e-6)
+
+
+def test_a_corner_off_the_others_lattice_is_left_out() -> None:
+    """As sharp as any other: a patch of the print that was torn and glued down 3 px aside."""
+    board, number = replace(ODD, layout="new"), 20
+    exposure, corners_px = photograph(board)
+    image, (u, v) = exposure.image.copy(), np.rint(corners_px[number]).astype(int)
+    image[v - 9 : v + 10, u - 6 : u + 13] = exposure.image[v - 9 : v + 10, u - 9 : u + 10]
+    whole, torn = detect_target(exposure, board), detect_target(Exposure(image, "torn"), board)
+    assert isinstance(whole, TargetView)
+    assert isinstance(torn, TargetView)
+    assert set(whole.point_index.tolist()) - set(torn.point_index.tolist()) == {number}
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
+def test_of_two_copies_that_hide_each_other_one_is_taken(share: float) -> None:
+    board = replace(ODD, layout="new")
+    column = round(share * board.columns)
+    left, corners_px = photograph(board, columns=(0, column))
+    right, _ = photograph(board, columns=(column, board.columns))
+    image = np.concatenate([left.image, right.image], axis=1)
+    view = detect_target(Exposure(image, "two"), board)
+    assert isinstance(view, TargetView)
+    aside = np.array([left.width_px, 0])
+    off = [
+        np.hypot(*(view.points_px - corners_px[view.point_index] - k * aside).T).max()
+        for k in range(2)
+    ]
+    assert min(off) < 0.2

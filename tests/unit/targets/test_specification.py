@@ -9,6 +9,7 @@ from armscan.vision.targets.target import (
     Charuco,
     Chessboard,
     CircleGrid,
+    as_two_lengths,
     describe_target,
     format_target,
     parse_target,
@@ -107,3 +108,18 @@ def test_a_formatted_target_is_read_back(text: str) -> None:
 )
 def test_a_description_tells_what_a_ruler_measures(text: str, span: str) -> None:
     assert span in describe_target(parse_target(text))
+
+
+def test_a_stretched_target_is_described_as_the_parser_takes_it_or_not_at_all() -> None:
+    for text, fits in (
+        ("chessboard:9x6:25", "chessboard:9x6:25x26.25"),
+        ("circle-grid:11x9:3.75x3.8", "circle-grid:11x9:3.75x3.99"),
+        ("asymmetric-circle-grid:4x11:5", "asymmetric-circle-grid:4x11:5x5.25"),
+    ):
+        told = as_two_lengths(parse_target(text).points_board_mm, 0.05)
+        kind, counts, _ = text.split(":")
+        written = told.split("both lengths, ")[1].split()[0]
+        assert parse_target(f"{kind}:{counts}:{written}") == parse_target(fits)
+    points = parse_target("chessboard:9x6:25").points_board_mm
+    for refused in (parse_target("circle-grid:9x9:15").points_board_mm, points):
+        assert as_two_lengths(refused, 0.1 if refused is not points else 1.5) == "print another"

@@ -39,7 +39,6 @@ from armscan.calibration.cameras.result import (
     RefusedView,
     ViewFit,
     advise,
-    as_two_lengths,
     largest_angle_deg,
     measure_coverage,
     rms_reasons,
@@ -74,7 +73,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import PARAMETER_NAMES, TANGENTIAL, CameraModel
-from armscan.vision.targets.target import TargetView
+from armscan.vision.targets.target import TargetView, as_two_lengths
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -429,8 +428,8 @@ def calibrate_camera(
     chi2 / degrees of freedom: the point covariances give the weights, the residuals the level.
 
     A target of wrong size in mm cannot be noticed here: it scales the poses and leaves the camera
-    as it is. So does a numbering that starts at the opposite corner of a symmetric target; but
-    what is stated of the camera asks for views that are numbered alike, see
+    as it is. A numbering that starts at the opposite corner of a symmetric target leaves it, too,
+    but its sigmas are right only where all views are numbered alike; see
     `armscan.calibration.cameras.robust.agreeing_numberings`.
 
     Parameters
@@ -486,7 +485,7 @@ def _of_other_cells(views: Sequence[TargetView], prepared: PreparedViews) -> Fit
     return FitFailure(
         "no camera fits the target as it is described, and one does if rows lie "
         f"{stretch:.2f} times as far apart as columns",
-        "measure the print both ways and give both lengths, "
+        "measure the print both ways and "
         f"{as_two_lengths(views[0].points_board_mm, stretch - 1.0)}; print without fitting to the "
         "page",
     )

@@ -24,7 +24,7 @@ from armscan.geometry.arrays import (
 )
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import CameraModel
-from armscan.vision.targets.target import TargetView
+from armscan.vision.targets.target import TargetView, as_two_lengths
 
 DistortionModel = Literal["auto", "none", "k1", "k1k2", "k1k2p1p2", "k1k2p1p2k3", "fisheye"]
 
@@ -616,17 +616,8 @@ def about_stretch(stretch: float, sigma: float, points_board_mm: FloatArray) -> 
         f"the print seems {100.0 * abs(stretch):.2f} % {way} from row to row than is said of it "
         f"(± {100.0 * sigma:.2f} %, beside its length from column to column): measure it both "
         f"ways, {x:.5g} mm and {y * (1.0 + stretch):.5g} mm from first to last would fit; "
-        f"{as_two_lengths(points_board_mm, stretch)}, or print it anew"
+        f"{as_two_lengths(points_board_mm, stretch)}"
     ]
-
-
-def as_two_lengths(points_board_mm: FloatArray, stretch: float) -> str:
-    """How to describe a target with these points (N, 3) whose rows lie further apart than said."""
-    x, y = (np.diff(np.unique(points_board_mm[:, k].round(6))).min() for k in range(2))
-    return (
-        f"write {x:.6g}x{y * (1.0 + stretch):.5g} for its pitch or square (of ChArUco, which has "
-        "one length, print another)"
-    )
 
 
 def is_much_bowed(bow_mm: FloatArray, points_board_mm: FloatArray) -> bool:
@@ -655,7 +646,7 @@ def reasons_to_refuse(fit: CameraFit) -> tuple[str, ...]:
         # which would worsen the others
         return (
             f"the target's rows seem to lie {1.0 + fit.stretch:.4f} times as far apart as is said, "
-            f"beside its columns: measure the print both ways and give both lengths, "
+            f"beside its columns: measure the print both ways and "
             f"{as_two_lengths(_board_points(fit), fit.stretch)}; print without fitting to the page",
         )
     return (

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import fdtrc
@@ -23,7 +24,7 @@ from armscan.calibration.cameras.adjustment import (
 from armscan.calibration.cameras.result import BOW_P, BoardWarp
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.poses import Board, Pose
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.detect import Numbering
 
@@ -395,7 +396,7 @@ _ROUNDS_OF_TURNS = 10
 
 
 def missed_places_mm(
-    camera: CameraModel, pose: Pose[Sensor, Board], board_mm: FloatArray, residuals_px: FloatArray
+    camera: CameraModel, pose: Pose[Any, Board], board_mm: FloatArray, residuals_px: FloatArray
 ) -> FloatArray:
     """(M, 2) what points (M, 3) of a board miss their places by, along its axes."""
     _, by_point, _ = camera.project_with_jacobian(pose.apply(board_mm))

@@ -357,7 +357,7 @@ def _signed(value: float, digits: int = 6) -> str:
 class AskedDiameter:
     """Diameter that the points themselves ask for, as if it were solved along.
 
-    ``sigma_mm``: As stated then. ``if_known_mm``: The same, the scatters taken as estimated.
+    ``sigma_mm``: The scatters not taken as known. ``if_known_mm``: As they are estimated.
     """
 
     diameter_mm: float
@@ -416,14 +416,12 @@ def diameter_asked(fit: HandEyeSolution) -> AskedDiameter | None:
     if freed is None:
         return AskedDiameter(2.0 * float(fit.state.surface[3]), float("inf"), float("inf"))
     placed = fit.problem.place(freed.state)
-    known = fit.problem.sensor_covariance(placed)
-    whole = covariance_over_noise(
-        placed.residual_mm, placed.jacobian[:, columns], fit.components, known, noise
-    )
+    known, jacobian = fit.problem.sensor_covariance(placed), placed.jacobian[:, columns]
     diameter_mm = 2.0 * float(freed.state.surface[3])
-    linear = solve_linear(placed.residual_mm, placed.jacobian[:, columns], scatter + known)
+    linear = solve_linear(placed.residual_mm, jacobian, scatter + known)
     if linear is None:
         return AskedDiameter(diameter_mm, float("inf"), float("inf"))
+    whole = covariance_over_noise(placed.residual_mm, jacobian, fit.components, known, noise)
     k = int(np.flatnonzero(columns == RADIUS_COLUMN)[0])
     sigma_mm, if_known_mm = (
         2.0 * float(np.sqrt(matrix[k, k])) for matrix in (whole.matrix, linear.covariance)

@@ -540,7 +540,9 @@ def fit_board_saddles(
     steps = steps_px[0] / scale, steps_px[1] / scale
     start = (corners_px + 0.5) / scale - 0.5
     reduced = _fit_bent_saddles(small.astype(np.float64), cells, start, steps, clear_cells)
-    covariance = reduced.covariance_px2 * np.outer(scale, scale)
+    # pixels that overlap share their noise
+    shared = scale / (scale - 1.0 / 3.0)
+    covariance = reduced.covariance_px2 * np.outer(scale * shared, scale * shared)
     reduced = Saddles((reduced.points_px + 0.5) * scale - 0.5, covariance, reduced.is_good)
     is_clearer = _median_sigma(reduced) < _MUCH_CLEARER * _median_sigma(saddles)
     return reduced if is_clearer else saddles

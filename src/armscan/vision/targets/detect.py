@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
@@ -49,6 +51,8 @@ DECISIVE = 4
 _CLEARANCE = 0.85
 _FITTING = 0.75
 """Least share of neighbours at their places: of a wrong count half may be."""
+_FARTHER = 0.25
+"""Part of the distance to a marker farther away by which it may lie off what one marker says."""
 _NEAR = 0.5
 """Farthest that a neighbour lies off its place, in squares; the nearest other place is at 1.4."""
 
@@ -68,11 +72,12 @@ class Markers:
 class _Neighbours:
     """Pairs of a marker and one of its nearest neighbours on a board, both read.
 
-    ``first``: (P,) numbers of the markers as read. ``agrees``: (P,) Whether the neighbour lies
-    where that marker says.
+    ``first``, ``second``: (P,) numbers of the markers as read. ``agrees``: (P,) Whether the second
+    lies where the first says.
     """
 
     first: IntArray
+    second: IntArray
     agrees: BoolArray
 
 
@@ -197,12 +202,39 @@ def _corners(
 
 def _trusted(markers: Markers, board: Charuco) -> IntArray:
     """Which of the markers (N,) lie where their neighbours say; of one number but one."""
-    neighbours = _neighbours(markers, board)
-    n_agreeing = np.bincount(neighbours.first[neighbours.agrees], minlength=len(markers.ids))
-    n_seen = np.bincount(neighbours.first, minlength=len(markers.ids))
+    neighbours, n = _neighbours(markers, board), len(markers.ids)
+    n_agreeing = np.bincount(neighbours.first[neighbours.agrees], minlength=n)
+    n_seen = np.bincount(neighbours.first, minlength=n)
     known = np.flatnonzero((markers.ids < len(board.marker_squares)) & (2 * n_agreeing >= n_seen))
     known = known[np.argsort(-n_agreeing[known], kind="stable")]
-    return np.asarray(known[np.unique(markers.ids[known], return_index=True)[1]])
+    known = known[np.unique(markers.ids[known], return_index=True)[1]]
+    return _of_one_board(markers, board, neighbours, known)
+
+
+def _of_one_board(
+    markers: Markers, board: Charuco, neighbours: _Neighbours, known: IntArray
+) -> IntArray:
+    """The largest group of neighbours among markers, and others that lie about where it says.
+
+    Two copies of a board may each show what is hidden of the other.
+    """
+    first, second = neighbours.first[neighbours.agrees], neighbours.second[neighbours.agrees]
+    n = len(markers.ids)
+    links = coo_array((np.ones(len(first)), (first, second)), shape=(n, n))
+    group = connected_components(links, directed=False)[1]
+    is_main = group[known] == np.argmax(np.bincount(group[known], minlength=1))
+    main, others = known[is_main], known[~is_main]
+    if len(main) < 2 or not len(others):
+        return known
+    place, centre = board.marker_squares[markers.ids], markers.corners_px.mean(axis=1)
+    apart = place[others][:, None] - place[main]
+    nearest = np.argmin(np.abs(apart).sum(axis=-1), axis=1)
+    apart = apart[np.arange(len(others)), nearest]
+    away = centre[others] - centre[main[nearest]]
+    squares = np.linalg.solve(_per_square(markers, board)[main[nearest]], away[:, :, None])
+    off = np.hypot(*(squares[:, :, 0] - apart).T)
+    is_near = off < _NEAR + _FARTHER * np.hypot(*apart.T)
+    return np.sort(np.concatenate([main, others[is_near]]))
 
 
 def _corners_near(
@@ -272,8 +304,7 @@ def _neighbours(markers: Markers, board: Charuco) -> _Neighbours:
 
     Affine, of one marker alone: that holds under any lens and for boards that are bent.
     """
-    right, down = _ways_along(markers.corners_px)
-    per_square = np.stack([right, down], axis=-1) * (board.square_mm / board.marker_mm)
+    per_square = _per_square(markers, board)
     is_known = (markers.ids < len(board.marker_squares)) & (np.abs(np.linalg.det(per_square)) > 1.0)
     known = np.flatnonzero(is_known)
     place, centre = board.marker_squares[markers.ids[known]], markers.corners_px[known].mean(axis=1)
@@ -283,14 +314,14 @@ def _neighbours(markers: Markers, board: Charuco) -> _Neighbours:
     away = centre[second] - centre[first]
     squares_away = np.linalg.solve(per_square[known[first]], away[:, :, None])[:, :, 0]
     off = np.hypot(*(squares_away - apart[first, second]).T)
-    return _Neighbours(known[first], off < _NEAR)
+    return _Neighbours(known[first], known[second], off < _NEAR)
 
 
-def _ways_along(corners_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Ways (N, 2) along a marker's upper and left sides."""
-    right = 0.5 * (corners_px[:, 1] - corners_px[:, 0] + corners_px[:, 2] - corners_px[:, 3])
-    down = 0.5 * (corners_px[:, 3] - corners_px[:, 0] + corners_px[:, 2] - corners_px[:, 1])
-    return right, down
+def _per_square(markers: Markers, board: Charuco) -> FloatArray:
+    """(N, 2, 2) ways along a square's upper and left sides, as columns, px."""
+    one, two, three, four = np.moveaxis(markers.corners_px, 1, 0)
+    sides = np.stack([two - one + three - four, four - one + three - two], axis=-1)
+    return np.asarray(0.5 * sides * (board.square_mm / board.marker_mm))
 
 
 def _misfit(

@@ -219,6 +219,22 @@ def _pitches(target: CircleGrid | Chessboard) -> str:
     return f"{pitch_mm:.12g}{second}"
 
 
+def as_two_lengths(points_board_mm: FloatArray, stretch: float) -> str:
+    """How to describe a target with these points (N, 3) whose rows lie further apart than said."""
+    counts, pitches = [], []
+    for k in range(2):
+        lines = np.unique(points_board_mm[:, k].round(6))
+        counts.append(len(lines))
+        pitches.append(float(np.diff(lines).min()))
+    x, y = pitches[0], pitches[1] * (1.0 + stretch)
+    if counts[0] == counts[1] or not MOST_STRETCH**-1 < y / x < MOST_STRETCH:
+        return "print another"
+    return (
+        f"give both lengths, {x:.6g}x{y:.5g} for its pitch or square (of ChArUco, which has one, "
+        "print another)"
+    )
+
+
 def describe_target(target: Target) -> str:
     """The target in words, with its size in mm, so that a wrong length or unit is noticed."""
     width, height, _ = target.points_board_mm.max(axis=0) - target.points_board_mm.min(axis=0)

@@ -159,6 +159,8 @@ def calibrate_camera_from_views(
             plain = replace(options, distortion=model, n_folds=0)
             try:
                 views, rounds, settled = _with_settled_centres(views, plain)
+                if settled is not None:
+                    views = _views_numbered_alike(views, settled, target)
             except InputError:
                 # the largest model may fold over where the one that is chosen does not
                 if done > 1 or options.distortion != "auto":
@@ -201,8 +203,19 @@ def numbered_alike(views: Sequence[TargetView], fit: CameraFit, target: Target |
 
     See `armscan.calibration.cameras.robust.agreeing_numberings`.
     """
-    if target is None or not target.symmetric_turns:
+    alike = _views_numbered_alike(views, fit, target)
+    if alike is views:
         return fit
+    again = calibrate_camera(alike, fit.options)
+    return fit if isinstance(again, FitFailure) else again
+
+
+def _views_numbered_alike(
+    views: Sequence[TargetView], fit: CameraFit, target: Target | None
+) -> Sequence[TargetView]:
+    """The views, by what their points miss before a camera; themselves where that changes none."""
+    if target is None or not target.symmetric_turns:
+        return views
     seen = [
         _Seen(fit.camera, view.view, view.sensor_from_board, view.residuals_px, view.is_outlier)
         for view in fit.used_views
@@ -211,10 +224,8 @@ def numbered_alike(views: Sequence[TargetView], fit: CameraFit, target: Target |
     known = numberings(target)
     turn = _numbering_of(seen, known)
     if not turn:
-        return fit
-    alike = [renumbered(view, target, turn.get(view.source, known[0])) for view in views]
-    again = calibrate_camera(alike, fit.options)
-    return fit if isinstance(again, FitFailure) else again
+        return views
+    return [renumbered(view, target, turn.get(view.source, known[0])) for view in views]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -145,8 +145,8 @@ def calibrate_camera_from_views(
     """Calibrate; for circles, correct the centres with the camera and calibrate again.
 
     Parameters, errors and result as `calibrate_camera_from_exposures`, with the target found.
-    Views of a ``target`` that looks alike when turned are numbered alike at the end, if what its
-    points miss their places by tells how.
+    Views of a ``target`` that looks alike when turned are numbered alike, if what its points miss
+    their places by tells how.
     """
     options = options or CameraOptions()
     total = MODEL_ROUNDS if any(view.edges is not None for view in views) else 1

@@ -409,7 +409,8 @@ def agreeing_numberings(
 ) -> IntArray | None:
     """Which numbering each view has of a target that looks alike when turned.
 
-    These turn with the print: where the views are numbered alike, points miss their places alike.
+    Errors of its print turn with it: where views are numbered alike, points miss their places
+    alike. It is told by all views together, and must be clearer than chance can make it.
 
     Parameters
     ----------

@@ -68,6 +68,23 @@ def test_numbers_that_start_at_any_corner_state_the_same(target: CircleGrid) -> 
         assert plain.fit.target_error_mm < 0.9 * alike.fit.target_error_mm
 
 
+def test_outliers_do_not_hide_how_views_are_numbered() -> None:
+    target, rng = CircleGrid(11, 9, 15.0), np.random.default_rng(7)
+    views, _ = make_views(Scene(target=target, missed_mm=0.01), 1)
+    spoilt = []
+    for view in views:
+        points = view.points_px.copy()
+        points[rng.choice(len(view), 4, replace=False)] += 40.0
+        spoilt.append(replace(view, points_px=points))
+    mixed, _ = turned_at_random(spoilt, target, 1)
+    alike, again = (
+        calibrate_camera_from_views(given, OPTIONS, target=target) for given in (spoilt, mixed)
+    )
+    assert isinstance(alike, CameraRun)
+    assert isinstance(again, CameraRun)
+    np.testing.assert_allclose(again.fit.sigma, alike.fit.sigma, rtol=1e-4)
+
+
 def test_views_left_out_stay_out_and_too_few_tell_nothing() -> None:
     target = CircleGrid(11, 9, 15.0)
     views, _ = make_views(Scene(target=target, missed_mm=0.01), 1)

@@ -258,6 +258,7 @@ def _is_disturbed(residual: FloatArray, contrast: FloatArray, is_good: BoolArray
 def _without_outliers(residuals: FloatArray, weights: FloatArray) -> FloatArray:
     """Drop pixels that a laser line or dirt put far off the model."""
     size = np.where(weights > 0.0, np.abs(residuals), np.nan)
+    size[~(weights > 0.0).any(axis=1)] = 0.0
     sigma = MAD_TO_SIGMA * np.nanmedian(size, axis=1)
     kept = np.abs(residuals) <= _OUTLIER_SIGMAS * np.maximum(sigma, 0.3)[:, None]
     return np.asarray(weights * kept)

@@ -102,6 +102,11 @@ def bars(rng: np.random.Generator) -> np.ndarray:
     return np.tile(columns, (240, 1))
 
 
+def write_colour(path: Path, levels: np.ndarray) -> None:
+    """Write (240, 320, 3) levels of red, green and blue."""
+    cv2.imwrite(str(path), np.clip(levels, 0, 255).astype(np.uint8)[:, :, ::-1])
+
+
 def written(out: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict, np.ndarray]:
     """What is told, and the accepted points' distances from the line, px."""
     report = json.loads(capsys.readouterr().out)
@@ -120,7 +125,7 @@ def test_light_that_all_colours_have_in_common_is_taken_off(
     for k in range(3):
         red = SCENE.expose_red(k, 1.0).image.astype(np.float64)
         image = 0.6 * red + bars(rng)[..., None] + rng.normal(0.0, 1.0, red.shape)
-        cv2.imwrite(str(folder / f"{k}.png"), np.clip(image, 0, 255).astype(np.uint8)[:, :, ::-1])
+        write_colour(folder / f"{k}.png", image)
     out = tmp_path / "lines.csv"
     assert main(["stripes", str(folder), "-o", str(out), "--json"]) == 0
     report, away = written(out, capsys)
@@ -197,7 +202,7 @@ def test_print_of_the_lasers_colour_takes_no_difference(
             if abs(v - 120) > 40:
                 image[v : v + 3, :, 1:] -= 90.0
         image += rng.normal(0.0, 1.0, image.shape)
-        cv2.imwrite(str(folder / f"{k}.png"), np.clip(image, 0, 255).astype(np.uint8)[:, :, ::-1])
+        write_colour(folder / f"{k}.png", image)
     out = tmp_path / "lines.csv"
     assert main(["stripes", str(folder), "-o", str(out), "--json"]) == 0
     report, away = written(out, capsys)

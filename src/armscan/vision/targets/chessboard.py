@@ -560,6 +560,7 @@ def _fit_bent_saddles(
     steps_px: Steps,
     clear_cells: float,
 ) -> Saddles:
+    """As `fit_board_saddles`, in the image as it is."""
     saddles = fit_saddles(grey, corners_px, *steps_px)
     n_good = int(saddles.is_good.sum())
     lattice = board_lattice(grey, cells, saddles, steps_px)

@@ -36,6 +36,7 @@ from armscan.errors import (
     OutputError,
 )
 from armscan.geometry.poses import Pose
+from armscan.jobs.probe import probe
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from armscan.report.quantity import Summary
@@ -170,7 +171,7 @@ def test_advice_after_a_doubtful_check_says_what_it_means_and_the_report_reads_a
 ) -> None:
     journey = open_journey(tmp_path / "s", SETTINGS)
     touch_plate(journey, 12)
-    probed = work.probe
+    probed = probe
 
     def with_remark(*given: Any, **how: Any) -> Summary:
         return replace(probed(*given, **how), warnings=("The touches are few.",))

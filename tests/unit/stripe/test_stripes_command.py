@@ -167,7 +167,7 @@ def test_views_without_laser_are_taken_off(
     assert main([*words, "--background", str(on)]) == 2
     assert "its own view without laser" in capsys.readouterr().err
     colour = tmp_path / "colour.png"
-    cv2.imwrite(str(colour), cv2.merge([cv2.imread(str(off / "0.png"), 0)] * 3))
+    cv2.imwrite(str(colour), np.zeros((*levels.shape, 3), np.uint8))
     assert main([*words, "--background", str(colour)]) == 2
     assert "as the camera took them" in capsys.readouterr().err
     (off / "0.png").rename(off / "2.png")

@@ -39,7 +39,7 @@ import numpy as np
 
 from armscan.devices.sources import Preset
 from armscan.geometry.arrays import FloatArray
-from armscan.jobs.demo import DemoRequest, make_head_demo
+from armscan.jobs.twin.demo import DemoRequest, make_head_demo
 from armscan.pipeline.truth import HeadDemo, NamingErrors
 from armscan.report.demo import head_data
 

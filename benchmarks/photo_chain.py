@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from armscan.jobs.demo import DemoRequest, run_photo_demo
+from armscan.jobs.twin.demo import DemoRequest, run_photo_demo
 
 COLUMNS = (
     "seed",

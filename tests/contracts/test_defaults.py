@@ -20,7 +20,7 @@ import typer
 
 from armscan.cli.app import command
 from armscan.cli.options import DefaultOf
-from armscan.jobs.demo import DemoRequest
+from armscan.jobs.twin.demo import DemoRequest
 from armscan.reconstruction.triangulate import CALIBRATED_DEPTHS, LABEL_DEPTHS
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from armscan.devices.sources import TwinScene
-from armscan.jobs.demo import DemoRequest, run_head_demo
+from armscan.jobs.twin.demo import DemoRequest, run_head_demo
 from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_scanner_calibration

@@ -17,7 +17,7 @@ import pytest
 
 from armscan.cli.run import main
 from armscan.devices.sources import TwinScene
-from armscan.jobs.demo import FILES, RECORDINGS, TRUTH, DemoRequest, run_head_demo
+from armscan.jobs.twin.demo import FILES, RECORDINGS, TRUTH, DemoRequest, run_head_demo
 from armscan.report.quantity import Summary
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_scanner_calibration

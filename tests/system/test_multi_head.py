@@ -10,7 +10,7 @@ import pytest
 
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection
-from armscan.jobs.demo import Calibrated, DemoRequest, calibrate_head
+from armscan.jobs.twin.demo import Calibrated, DemoRequest, calibrate_head
 from armscan.pipeline.scan import ScanReconstruction, measure_scan
 from armscan.pipeline.simulate import TwinName, fewer_views
 from armscan.pipeline.truth import hand_eye_errors, naming_errors, sheet_errors, true_names

@@ -17,7 +17,7 @@ import pytest
 from scipy import stats
 
 from armscan.cli import main
-from armscan.jobs.demo import FILES, RECORDINGS, TRUTH, DemoRequest, run_photo_demo
+from armscan.jobs.twin.demo import FILES, RECORDINGS, TRUTH, DemoRequest, run_photo_demo
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.simulate import TwinName
 from armscan.simulation.twin import SimulatedInstrument

@@ -24,7 +24,8 @@ from armscan.geometry.rotations import EulerConvention, nearest_rotation, vector
 from armscan.geometry.shapes import Plane
 from armscan.pipeline.hand_eye import posed_stripes_from_profiles
 from armscan.reconstruction.place import arm_covariance
-from armscan.storage.points import read_profiles, read_robot_poses
+from armscan.storage.points import read_profiles
+from armscan.storage.recordings.robot_poses import read_robot_poses
 from armscan.thesis.hand_eye import SAME_ROTATION_DEG, TwoStepHandEye, calibrate_in_two_steps
 from rigs.photographs import DATA, needs
 

@@ -71,6 +71,9 @@ calibrate.command("camera", epilog=calibrate_cameras.CAMERA_EXAMPLE)(calibrate_c
 calibrate.command("stereo", epilog=calibrate_cameras.STEREO_EXAMPLE)(calibrate_cameras.stereo)
 calibrate.command("laser", epilog=calibrate_sensor.LASER_EXAMPLE)(calibrate_sensor.laser)
 calibrate.command("hand-eye", epilog=calibrate_sensor.HAND_EYE_EXAMPLE)(calibrate_sensor.hand_eye)
+calibrate.command("hand-eye-target", epilog=calibrate_cameras.HAND_EYE_TARGET_EXAMPLE)(
+    calibrate_cameras.hand_eye_target
+)
 calibrate.command("latency", epilog=calibrate_cameras.LATENCY_EXAMPLE)(calibrate_cameras.latency)
 inspect_group = typer.Typer(
     help="Compare measured points with what they should be.",

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan calibrate camera`` and ``stereo``, from a flat target; ``latency``, from a plate."""
+"""``armscan calibrate camera``, ``stereo`` and ``hand-eye-target``, from a flat target, and
+``latency``, from a plate.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,10 +15,13 @@ import typer
 from armscan.cli.delivery import OF_CALIBRATIONS, Work, job_command
 from armscan.cli.options import (
     ArmFile,
+    ArmPosition,
+    ArmRotation,
     BitsAlign,
     BitsUsed,
     DefaultOf,
     Document,
+    EulerAngles,
     LaserColourOption,
     Method,
     MethodOption,
@@ -38,6 +44,16 @@ STEREO_EXAMPLE = (
     "      --target chessboard:9x6:25 -o stereo.json\n\n"
     "\b\nTake 10 to 20 pairs at rest, both images at one instant; the board is tilted by 20 to 45\n"
     "degrees to all sides and reaches the corners of both images. Lists pair in their order."
+)
+HAND_EYE_TARGET_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan calibrate hand-eye-target 'photos/*.png' --poses poses.csv \\\n"
+    "      --target chessboard:11x6:13 --camera camera.json -o hand-eye.json\n"
+    "  armscan calibrate hand-eye-target --scan scans/target --target chessboard:11x6:13 \\\n"
+    "      --sensor sensor.json -o scanner.json\n\n"
+    "\b\nThe target stays where it is. Take 12 or more postures at rest, the target in view: turn\n"
+    "the camera by 20 to 40 degrees about two or more of its axes, nearer and farther. A pose is\n"
+    "x, y, z in mm and three angles, a quaternion under a header, or a matrix of 3 x 4 or 4 x 4."
 )
 LATENCY_EXAMPLE = (
     "\b\nExample:\n"
@@ -198,6 +214,58 @@ def stereo(
         cameras=cameras,
         options=options,
         image_options=pixels,
+    )
+
+
+@job_command(Document, Path("scanner.json"), also=OF_CALIBRATIONS)
+def hand_eye_target(
+    *,
+    images: Photographs = None,
+    target: Target,
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="Table of the arm's poses base_from_tool, one a photograph."),
+    ] = None,
+    euler: EulerAngles = None,
+    scan: TargetScan = None,
+    arm: ArmFile = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="The camera's calibration, before there are light sheets.")
+    ] = None,
+    sensor: Annotated[
+        Path | None, typer.Option(help="Calibration of camera and sheets: makes a scanner.")
+    ] = None,
+    leave_out: NotUsed = None,
+    arm_position_mm: ArmPosition = None,
+    arm_rotation_deg: ArmRotation = None,
+    bits_used: BitsUsed = None,
+    bits_align: BitsAlign = None,
+) -> Work:
+    """Find where the camera sits on the arm, from views of a target at rest."""
+    from armscan.calibration.hand_eye.observations import HandEyeOptions
+    from armscan.geometry.rotations import check_convention
+    from armscan.jobs.board_hand_eye import LookSource, calibrate_hand_eye_on_board
+    from armscan.storage.images import ImageOptions
+
+    source = given(
+        LookSource,
+        images=tuple(images or ()),
+        poses=poses,
+        euler=None if euler is None else check_convention(euler),
+        scan=scan,
+        arm=arm,
+        camera=camera,
+        sensor=sensor,
+        leave_out=tuple(leave_out or ()),
+    )
+    options = given(
+        HandEyeOptions,
+        arm_position_mm=arm_position_mm,
+        arm_rotation_rad=None if arm_rotation_deg is None else math.radians(arm_rotation_deg),
+    )
+    pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
+    return lambda job: calibrate_hand_eye_on_board(
+        job, source, target, options=options, image_options=pixels
     )
 
 

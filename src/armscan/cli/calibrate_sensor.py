@@ -12,6 +12,8 @@ import typer
 from armscan.cli.delivery import OF_CALIBRATIONS, Work, job_command
 from armscan.cli.options import (
     ArmFile,
+    ArmPosition,
+    ArmRotation,
     BitsAlign,
     BitsUsed,
     DefaultOf,
@@ -220,14 +222,8 @@ def hand_eye(
     poses: PoseTable = None,
     euler: EulerAngles = None,
     arm: ArmFile = None,
-    arm_position_mm: Annotated[
-        float | None,
-        typer.Option(help="Scatter of Tool's origin, mm an axis; left out, estimated."),
-    ] = None,
-    arm_rotation_deg: Annotated[
-        float | None,
-        typer.Option(help="Scatter of its orientation about there; left out, estimated."),
-    ] = None,
+    arm_position_mm: ArmPosition = None,
+    arm_rotation_deg: ArmRotation = None,
     plate_flatness_mm: Annotated[
         float | None,
         typer.Option(help="Scatter of the plate's surface; left out, estimated."),
@@ -238,7 +234,7 @@ def hand_eye(
 ) -> Work:
     """Find where the sensor sits on the arm.
 
-    From postures over a flat plate or a sphere.
+    From postures over a flat plate or a sphere; before a target see `calibrate hand-eye-target`.
     """
     from armscan.calibration.hand_eye.observations import HandEyeOptions
     from armscan.geometry.rotations import check_convention

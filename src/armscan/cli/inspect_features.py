@@ -128,7 +128,7 @@ def relation(
 ) -> Work:
     """Distance and angle of two features of one cloud."""
     from armscan.inspection.selection import InspectionOptions
-    from armscan.jobs.inspection.features import inspect_relation, parse_feature
+    from armscan.jobs.inspection.shapes import inspect_relation, parse_feature
 
     one, other = parse_feature(first, "the first feature"), parse_feature(second, "the second")
     options = given(InspectionOptions, feature_mm=feature_mm)
@@ -138,7 +138,7 @@ def relation(
 def _inspect(kind: str, cloud: Path, feature_mm: float | None, **said: str | float | None) -> Work:
     """Work on one feature, of which each field was said as a number or as numbers in a text."""
     from armscan.inspection.selection import InspectionOptions
-    from armscan.jobs.inspection.features import inspect_feature, wanted_feature
+    from armscan.jobs.inspection.shapes import inspect_feature, wanted_feature
 
     known: dict[str, object] = {
         name: numbers(value, OPTION_OF[name]) if isinstance(value, str) else value

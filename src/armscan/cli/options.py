@@ -60,6 +60,15 @@ def _written(module: str, name: str, owner: str = "") -> object:
     return _written(imports[name], name)
 
 
+ArmPosition = Annotated[
+    float | None, typer.Option(help="Scatter of Tool's origin, mm an axis; left out, estimated.")
+]
+ArmRotation = Annotated[
+    float | None,
+    typer.Option(help="Scatter of its orientation about there; left out, estimated."),
+]
+
+
 class Side(StrEnum):
     """Axis of Base along which a plate's face looks."""
 
@@ -135,7 +144,8 @@ StripeMethodOption = Annotated[
 EulerAngles = Annotated[
     str | None,
     typer.Option(
-        help="Angles in --poses: intrinsic-xyz, extrinsic-xyz (FANUC), intrinsic-zxz.",
+        help="Angles in --poses: intrinsic-xyz, extrinsic-xyz (FANUC), intrinsic-zyx (KUKA), "
+        "intrinsic-zxz, rotation-vector (UR).",
         show_default=DefaultOf("armscan.jobs.hand_eye:StripeSource.euler"),
     ),
 ]

@@ -87,8 +87,8 @@ def demo(
     Images are rendered, calibrated from and measured in, and the errors are stated.
     """
     from armscan.devices.sources import Preset
-    from armscan.jobs.demo import DemoRequest, run_all_heads, run_head_demo, run_photo_demo
-    from armscan.jobs.inspection.demo import run_workpiece_demo
+    from armscan.jobs.twin.demo import DemoRequest, run_all_heads, run_head_demo, run_photo_demo
+    from armscan.jobs.twin.inspect_demo import run_workpiece_demo
 
     is_head = scene not in (DemoScene.ALL, DemoScene.PHOTOS, DemoScene.WORKPIECE)
     head = f"thesis-{scene.value}" if is_head else "thesis-single"
@@ -173,7 +173,7 @@ def simulate(
     a part with two faults, whose CAD model comes with armscan, or --part; latency is the plate with
     the head moved nearer and away, and an arm with a clock of its own.
     """
-    from armscan.jobs.simulate import SimulateRequest, run_simulation
+    from armscan.jobs.twin.simulate import SimulateRequest, run_simulation
     from armscan.pipeline.simulate import SimulateOptions
 
     quality = None if preset is None else preset.value

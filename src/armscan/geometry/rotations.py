@@ -87,15 +87,21 @@ def slerp(start: FloatArray, end: FloatArray, fraction: FloatArray) -> FloatArra
     return np.asarray((first * Rotation.from_rotvec(turn * fraction[:, None])).as_matrix())
 
 
-EulerConvention = Literal["intrinsic-xyz", "extrinsic-xyz", "intrinsic-zxz"]
+EulerConvention = Literal[
+    "intrinsic-xyz", "extrinsic-xyz", "intrinsic-zyx", "intrinsic-zxz", "rotation-vector"
+]
 """``intrinsic-xyz``: R = Rx(a) Ry(b) Rz(c), the thesis (eq. 2.69); ``extrinsic-xyz``:
-R = Rz(c) Ry(b) Rx(a), FANUC's W P R; ``intrinsic-zxz``: R = Rz(a) Rx(b) Rz(c), FARO."""
+R = Rz(c) Ry(b) Rx(a), FANUC's W P R; ``intrinsic-zyx``: R = Rz(a) Ry(b) Rx(c), KUKA's A B C;
+``intrinsic-zxz``: R = Rz(a) Rx(b) Rz(c), FARO; ``rotation-vector``: R = exp([a, b, c]x), no Euler
+angles but the axis times the angle, Universal Robots."""
 
-_Sequence: TypeAlias = Literal["XYZ", "xyz", "ZXZ"]
-_SEQUENCES: dict[EulerConvention, _Sequence] = {
+_Sequence: TypeAlias = Literal["XYZ", "xyz", "ZYX", "ZXZ"]
+_SEQUENCES: dict[EulerConvention, _Sequence | None] = {
     "intrinsic-xyz": "XYZ",
     "extrinsic-xyz": "xyz",
+    "intrinsic-zyx": "ZYX",
     "intrinsic-zxz": "ZXZ",
+    "rotation-vector": None,
 }
 
 
@@ -121,7 +127,10 @@ def rotations_from_euler(angles_rad: FloatArray, convention: EulerConvention) ->
     angles = np.asarray(angles_rad, dtype=np.float64).reshape(-1, 3)
     if len(angles) == 0:
         return np.zeros((0, 3, 3))
-    return np.asarray(Rotation.from_euler(_SEQUENCES[convention], angles).as_matrix())
+    sequence = _SEQUENCES[convention]
+    if sequence is None:
+        return np.asarray(Rotation.from_rotvec(angles).as_matrix())
+    return np.asarray(Rotation.from_euler(sequence, angles).as_matrix())
 
 
 def euler_from_rotations(rotations: FloatArray, convention: EulerConvention) -> FloatArray:
@@ -129,4 +138,5 @@ def euler_from_rotations(rotations: FloatArray, convention: EulerConvention) -> 
     matrices = np.asarray(rotations, dtype=np.float64).reshape(-1, 3, 3)
     if len(matrices) == 0:
         return np.zeros((0, 3))
-    return np.asarray(Rotation.from_matrix(matrices).as_euler(_SEQUENCES[convention]))
+    sequence, turns = _SEQUENCES[convention], Rotation.from_matrix(matrices)
+    return np.asarray(turns.as_rotvec() if sequence is None else turns.as_euler(sequence))

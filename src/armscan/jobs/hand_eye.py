@@ -70,7 +70,6 @@ from armscan.storage.points import (
     profile_files,
     read_points_or_plane,
     read_profiles,
-    read_robot_poses,
 )
 from armscan.storage.recording import (
     FolderRecording,
@@ -78,6 +77,7 @@ from armscan.storage.recording import (
     recording_name,
     recording_tables,
 )
+from armscan.storage.recordings.robot_poses import read_robot_poses
 from armscan.thesis.hand_eye import PrintedHandEye, as_printed
 from armscan.vision.stripe.image import StripeOptions
 

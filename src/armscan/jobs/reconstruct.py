@@ -68,7 +68,7 @@ from armscan.storage.documents import (
 from armscan.storage.files import read_bytes, scratch_folder
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.points import profile_files, read_profiles, read_robot_poses
+from armscan.storage.points import profile_files, read_profiles
 from armscan.storage.recording import (
     FolderRecording,
     is_recording,
@@ -76,6 +76,7 @@ from armscan.storage.recording import (
     recording_name,
     recording_tables,
 )
+from armscan.storage.recordings.robot_poses import read_robot_poses
 
 LISTED = 4
 

@@ -411,7 +411,7 @@ HAND_EYE_PARAMETER_NAMES = (
 """Order of the hand-eye's parameters: rotation-vector increment in Tool, multiplied from the left
 (``R <- exp(dr) R``), then the increment of the translation."""
 
-HandEyeMethod = Literal["plate", "sphere"]
+HandEyeMethod = Literal["plate", "sphere", "board"]
 LaserColour = Literal[
     "auto",
     "red",
@@ -531,7 +531,7 @@ class HandEyeCalibration(ArrayRecord):
     n_postures, n_exposures, n_points
         What was used.
     plate
-        The plate in Base: frame "Base"; None after a sphere.
+        The plate in Base: frame "Base"; None after a sphere or a target.
     diagnostics
         Evidence for a reader; None where there is none.
     """

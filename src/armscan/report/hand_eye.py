@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from armscan.calibration.hand_eye.board_result import BoardPosture
 from armscan.calibration.hand_eye.observations import PosedStripe
 from armscan.calibration.hand_eye.result import (
     HandEyeFit,
@@ -81,20 +82,6 @@ NOISE_TEXT = (
     "alike within the stated length. Stripe noise comes on top. Points of one posture therefore "
     "err together, and the sigmas of the hand-eye count postures, not points."
 )
-
-
-ARM_FROM = {
-    (
-        False,
-        True,
-    ): "estimated from the residuals, which therefore test nothing: compare it with the "
-    "arm's certificate",
-    (True, True): "the shift as given; what was not given is estimated from the residuals, which "
-    "therefore test little",
-    (False, False): "as given",
-    (True, False): "as given",
-}
-"""Where the scatter is from, by whether the arm's shift was given and others were estimated."""
 
 
 def total_covariance(scanner: ScannerCalibration) -> FloatArray:
@@ -269,7 +256,7 @@ def hand_eye_page(
         Section("The postures", (Gallery((posture_scene(fit, stripes),), 560),)),
         _residual_section(fit, scanner),
         Section("Posture by posture", (posture_table(fit),)),
-        Section("The noise model", (Text(NOISE_TEXT), Facts(_noise_facts(fit)))),
+        Section("The noise model", (Text(NOISE_TEXT), Facts(noise_facts(fit.calibration)))),
     ]
     if images:
         names = [] if scanner.sensor is None else [sheet.name for sheet in scanner.sensor.sheets]
@@ -284,7 +271,7 @@ def hand_eye_page(
         f"{hand_eye.n_exposures} exposures and {hand_eye.n_points:,} points",
         sections,
         cards=(
-            *_sigma_cards(scanner),
+            *sigma_cards(scanner),
             *(replace(one, meaning="an axis") for one in only(told, "arm_position_mm")),
             *(item for item in told if item.label in of_result),
         ),
@@ -293,7 +280,8 @@ def hand_eye_page(
     )
 
 
-def _sigma_cards(scanner: ScannerCalibration) -> tuple[Quantity, Quantity]:
+def sigma_cards(scanner: ScannerCalibration) -> tuple[Quantity, Quantity]:
+    """Standard deviations of the hand-eye, with and without the sensor's own."""
     hand_eye = scanner.hand_eye
     alone = hand_eye_numbers(hand_eye, hand_eye.covariance)
     total = hand_eye_numbers(hand_eye, total_covariance(scanner))
@@ -314,20 +302,24 @@ def _sigma_cards(scanner: ScannerCalibration) -> tuple[Quantity, Quantity]:
 
 def _result_section(fit: HandEyeFit, scanner: ScannerCalibration) -> Section:
     told = for_people(hand_eye_quantities(scanner))
-    correlations = correlation_chart(
+    blocks = (
+        Facts(told[:3]),
+        Facts(told[3:]),
+        Facts(tuple(fact(*pair) for pair in fit.reference), "The reference"),
+        Gallery((correlations(scanner), _residual_histogram(fit))),
+    )
+    return Section("The hand-eye", blocks)
+
+
+def correlations(scanner: ScannerCalibration) -> Picture:
+    """Of the hand-eye's six parameters."""
+    return correlation_chart(
         total_covariance(scanner),
         SHORT_NAMES,
         title="Correlations",
         caption="Increments of rotation about, and of translation along, the axes of Tool. Near "
         "1 or -1, two of them can hardly be told apart with these postures.",
     )
-    blocks = (
-        Facts(told[:3]),
-        Facts(told[3:]),
-        Facts(tuple(fact(*pair) for pair in fit.reference), "The reference"),
-        Gallery((correlations, _residual_histogram(fit))),
-    )
-    return Section("The hand-eye", blocks)
 
 
 def posture_table(fit: HandEyeFit) -> Table:
@@ -361,8 +353,7 @@ def _angle(value_deg: float) -> str:
 
 
 def _residual_section(fit: HandEyeFit, scanner: ScannerCalibration) -> Section:
-    numbers = hand_eye_numbers(fit.calibration, total_covariance(scanner))
-    bars = left_out_bars(fit, numbers.rotation_sigma_deg, numbers.size_sigma_mm)
+    bars = left_out_bars(fit.postures, scanner)
     blocks = [Gallery((residuals_by_posture(fit), bars), 700)]
     plate = fit.calibration.plate
     if plate is not None:
@@ -381,8 +372,9 @@ def _arm_scatter(shift_mm: float, scan_rad: float, tool_rad: float) -> str:
     return f"{significant(shift_mm, 'mm')}, {_turns(scan_rad, tool_rad)}"
 
 
-def _noise_facts(fit: HandEyeFit) -> tuple[Quantity, ...]:
-    noise, known = fit.calibration.arm_noise, fit.calibration.diagnostics
+def noise_facts(hand_eye: HandEyeCalibration) -> tuple[Quantity, ...]:
+    """What scatters, and where that is from."""
+    noise, known = hand_eye.arm_noise, hand_eye.diagnostics
     common = _arm_scatter(noise.position_mm, noise.rotation_rad, noise.tool_rotation_rad)
     new = _arm_scatter(
         noise.exposure_position_mm, noise.exposure_rotation_rad, noise.exposure_tool_rotation_rad
@@ -499,19 +491,22 @@ def _residual_map(fit: HandEyeFit, plate: Plane) -> Picture:
     )
 
 
-def left_out_bars(fit: HandEyeFit, rotation_sigma_deg: float, size_sigma_mm: float) -> Picture:
+def left_out_bars(
+    postures: Sequence[PostureResult] | Sequence[BoardPosture], scanner: ScannerCalibration
+) -> Picture:
     """Change of the hand-eye when one posture takes no part."""
-    names = [posture.posture for posture in fit.postures]
+    names = [posture.posture for posture in postures]
+    numbers = hand_eye_numbers(scanner.hand_eye, total_covariance(scanner))
     series = (
-        ("change of the rotation, °", rotation_sigma_deg, "left_out_rotation_deg"),
-        ("change of the translation, mm", size_sigma_mm, "left_out_translation_mm"),
+        ("change of the rotation, °", numbers.rotation_sigma_deg, "left_out_rotation_deg"),
+        ("change of the translation, mm", numbers.size_sigma_mm, "left_out_translation_mm"),
         ("residual left out, in sigmas", 1.0, "left_out_normalised"),
     )
     with styled():
         figure = new_figure(PAGE_WIDTH, 2.9)
         grid: Any = figure.subplots(1, 3)
         for axes, (label, usual, name) in zip(grid, series, strict=True):
-            heights = [getattr(posture, name) for posture in fit.postures]
+            heights = [getattr(posture, name) for posture in postures]
             axes.bar(range(len(names)), heights, 0.6, color=ACCENT)
             axes.axhline(usual, color=ALERT, linewidth=1.0, linestyle="--")
             axes.set_title(label, loc="left", fontsize=8.5)

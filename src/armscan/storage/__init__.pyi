@@ -26,7 +26,7 @@ from .parts.recipes import read_recipe as read_recipe
 from .points import read_marker_list as read_marker_list
 from .points import read_probed_points as read_probed_points
 from .points import read_profiles as read_profiles
-from .points import read_robot_poses as read_robot_poses
 from .recording import FolderRecording as FolderRecording
 from .recording import read_recording as read_recording
 from .recording import write_recording as write_recording
+from .recordings.robot_poses import read_robot_poses as read_robot_poses

@@ -22,7 +22,8 @@ from armscan.models.arm import AXIS_PARAMETERS, ArmModel, forward
 from armscan.records.recording import NO_TRIGGER, ArmTrack, PoseForm, Session
 from armscan.storage.codec import Layout, MismatchError, RecordCodec, parse_toml, toml_bytes
 from armscan.storage.files import new_folder, path_text, read_bytes, told_of
-from armscan.storage.points import (
+from armscan.storage.recording_session import SESSION_FILE, session_toml
+from armscan.storage.recordings.robot_poses import (
     FORM_COLUMNS,
     METRES_REMEDY,
     POSITION,
@@ -31,7 +32,6 @@ from armscan.storage.points import (
     pose_numbers,
     rotations_of_form,
 )
-from armscan.storage.recording_session import SESSION_FILE, session_toml
 from armscan.storage.tables import CsvTable, csv_bytes, number_columns
 
 ARM_MODEL_FILE = "arm.toml"

@@ -18,8 +18,8 @@ import trimesh
 from armscan.cli.twin import PresetName, Scene
 from armscan.devices.sources import Preset, TwinScene
 from armscan.errors import ArmscanError, InputError, OptionError, OutputError
-from armscan.jobs import simulate as simulate_job_simulate
-from armscan.jobs.simulate import SimulateRequest, run_simulation
+from armscan.jobs.twin import simulate as simulate_job_simulate
+from armscan.jobs.twin.simulate import SimulateRequest, run_simulation
 from armscan.pipeline import simulate
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.simulate import (

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
-from armscan.storage.points import read_profiles, read_robot_poses
+from armscan.storage.points import read_profiles
+from armscan.storage.recordings.robot_poses import read_robot_poses
 from rigs.photographs import DATA, needs
 
 YAML = "%YAML:1.0\n---\nscan_line: [ 1.5e+00, 0., .Nan, 2.,\n    0., -3.5, 4., 0., -6. ]\n"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from armscan.errors import OutputError
-from armscan.jobs.demo import FILES, demo_folder
+from armscan.jobs.twin.demo import FILES, demo_folder
 from armscan.storage.documents import new_provenance
 from armscan.storage.image_paths import are_simulated
 
@@ -128,7 +128,7 @@ def test_own_files_that_come_while_it_works_are_kept(tmp_path: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from armscan.jobs.demo import demo_folder
+from armscan.jobs.twin.demo import demo_folder
 calls, rename = [], Path.rename
 def killed(*_):
     os.kill(os.getpid(), signal.SIGKILL)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from armscan.errors import EstimationError, OptionError
-from armscan.jobs.demo import FILES, DemoRequest, run_all_heads, run_head_demo
+from armscan.jobs.twin.demo import FILES, DemoRequest, run_all_heads, run_head_demo
 
 
 def test_a_head_without_demo_is_refused_before_any_work(tmp_path: Path) -> None:
@@ -31,7 +31,7 @@ def test_the_earlier_comparison_stays_whole_when_a_head_fails(
         (folder / "truth.json").write_text("new")
         raise EstimationError(f"{request.head} failed")
 
-    monkeypatch.setattr("armscan.jobs.demo.make_head_demo", fail)
+    monkeypatch.setattr("armscan.jobs.twin.demo.make_head_demo", fail)
     with pytest.raises(EstimationError, match="thesis-single failed"):
         run_all_heads(DemoRequest(tmp_path))
     assert {(tmp_path / name).read_text() for name in names} == {"old"}

@@ -542,7 +542,9 @@ def find_reading(
     and that leaves ``typical_mm``; the other reading may leave ``most_mm``.
     """
     few = three_a_stripe(given)
-    for words, remedy, rotations, translations in _readings(few):
+    for words, remedy, rotations, translations in other_readings(
+        few.rotations, few.translations_mm
+    ):
         read = replace(few, rotations=rotations, translations_mm=translations)
         left = find_start(read, plate).typical_mm
         if left < BETTER * typical_mm and left <= most_mm:
@@ -550,10 +552,10 @@ def find_reading(
     return None
 
 
-def _readings(
-    given: CondensedObservations,
+def other_readings(
+    rotations: FloatArray, translations: FloatArray
 ) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
-    rotations, translations = given.rotations, given.translations_mm
+    """Other ways to read (N, 3, 3) and (N, 3) of ``base_from_tool``: words, remedy, and both so."""
     names: tuple[EulerConvention, ...] = get_args(EulerConvention)
     for read in names:
         angles = euler_from_rotations(rotations, read)
@@ -593,6 +595,9 @@ def _readings(
 
 def _other_branch(angles_rad: FloatArray, convention: EulerConvention) -> FloatArray:
     """The other three angles (N, 3) of the same rotations."""
+    if convention == "rotation-vector":
+        size = np.linalg.norm(angles_rad, axis=1, keepdims=True)
+        return np.asarray(angles_rad * (1.0 - 2.0 * np.pi / np.maximum(size, 1e-12)))
     first, middle, last = angles_rad.T
     turned = -middle if convention == "intrinsic-zxz" else np.pi - middle
     return np.column_stack([first + np.pi, turned, last + np.pi])

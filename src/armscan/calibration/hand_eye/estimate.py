@@ -609,7 +609,11 @@ def conditioning_at(
         known = problem.surface_covariance(placed) + problem.sensor_covariance(placed)
         total = total_covariance(components, sigmas) + known
     whitened = Whitening(total)(placed.jacobian[:, problem.columns])
-    hand_eye, others = whitened[:, :N_HAND_EYE], whitened[:, N_HAND_EYE:]
+    return conditioning_of(whitened[:, :N_HAND_EYE], whitened[:, N_HAND_EYE:])
+
+
+def conditioning_of(hand_eye: FloatArray, others: FloatArray) -> Conditioning:
+    """From whitened derivatives (M, 6) by the hand-eye and (M, K) by unknowns to eliminate."""
     if others.shape[1]:
         basis, _ = np.linalg.qr(others)
         hand_eye = hand_eye - basis @ (basis.T @ hand_eye)

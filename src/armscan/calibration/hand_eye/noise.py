@@ -148,6 +148,22 @@ def noise_components(
     )
 
 
+def arm_components(
+    covariances: list[FloatArray], position_mm: float | None, rotation_rad: float | None
+) -> tuple[NoiseComponent, ...]:
+    """The scatter of an arm's poses by itself: its shift and both `TURNS`.
+
+    Parameters
+    ----------
+    covariances
+        (M, M) of each, for a standard deviation of 1.
+    position_mm, rotation_rad
+        Given, or None to have them estimated.
+    """
+    shift = _component("arm", covariances[0], position_mm, TYPICAL_ARM_MM, ARM_WIDTH)
+    return _pose_components(covariances, shift, rotation_rad)
+
+
 def _expected_arm_mm(surface: ReferenceSurface) -> float:
     """Expected scatter of the arm's position.
 

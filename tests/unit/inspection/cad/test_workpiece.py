@@ -11,7 +11,7 @@ import numpy as np
 
 from armscan.geometry.poses import Pose
 from armscan.inspection.cad.distance import PartSurface
-from armscan.jobs.inspection.demo import MADE_MM, TOLERANCES, _beside_truth
+from armscan.jobs.twin.inspect_demo import MADE_MM, TOLERANCES, _beside_truth
 from armscan.simulation.twin import build_twin
 from armscan.storage.parts.meshes import read_part
 

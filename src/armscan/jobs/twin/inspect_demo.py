@@ -12,10 +12,10 @@ import numpy as np
 from armscan.devices.sources import TwinTruth
 from armscan.geometry.poses import Base, Cad, Part, Pose
 from armscan.geometry.rotations import vector_from_rotation
-from armscan.jobs.demo import TRUTH, DemoRequest, calibrate_head, demo_folder, typed_commands
 from armscan.jobs.inspection.cad import inspect_cad
 from armscan.jobs.job import Job
 from armscan.jobs.reconstruct import StillPaths, reconstruct
+from armscan.jobs.twin.demo import TRUTH, DemoRequest, calibrate_head, demo_folder, typed_commands
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.simulate import record_scenes
 from armscan.report.quantity import Quantity, Summary

@@ -1,0 +1,639 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hand-eye of a camera that sees a flat target at rest from several postures of the arm.
+
+The arm tells ``base_from_tool``, the view ``sensor_from_board``; where both are right,
+``base_from_tool tool_from_sensor sensor_from_board`` is the same ``base_from_board`` in every
+posture. Neither is exact: a board's pose has the covariance of its points and of the camera, and
+the arm's scatters by what `armscan.calibration.hand_eye.noise` estimates. The two unknown poses are
+those of generalised least squares under both (Strobl and Hirzinger 2006 weigh so; Shah 2013 names
+the problem robot-world and hand-eye).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import betainc, chdtrc
+
+from armscan.calibration.hand_eye.board_looks import (
+    N_POSE,
+    TURN_MORE,
+    BoardLook,
+    BoardPose,
+    BoardStart,
+    find_board_start,
+    middle_of,
+    refuse_far,
+)
+from armscan.calibration.hand_eye.board_result import (
+    AskedScale,
+    BoardHandEyeFit,
+    BoardPosture,
+    refuse_scale,
+    scale_warnings,
+)
+from armscan.calibration.hand_eye.checks import (
+    MOST_OPEN_MM,
+    conditioning_warnings,
+    influence_warnings,
+    refuse_hardly_determined,
+)
+from armscan.calibration.hand_eye.estimate import Conditioning, LeftOut, conditioning_of
+from armscan.calibration.hand_eye.noise import (
+    NoiseComponent,
+    NoiseEstimate,
+    arm_components,
+    arm_noise,
+    covariance_over_noise,
+    estimate_noise,
+    solve_linear,
+    total_covariance,
+)
+from armscan.calibration.hand_eye.observations import HandEyeOptions
+from armscan.calibration.hand_eye.result import FINITE_CONDITION
+from armscan.calibration.sheets.board_points import BoardBow
+from armscan.errors import EstimationError
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import Whitening, square_root
+from armscan.geometry.poses import Base, Board, Pose, Sensor, Tool
+from armscan.geometry.rotations import skew
+from armscan.models.calibration import (
+    CameraCalibration,
+    HandEyeCalibration,
+    HandEyeDiagnostics,
+)
+from armscan.models.camera import CameraModel
+
+N_UNKNOWN = 12
+LEAST_LOOKS = 4
+"""Three have six numbers to spare, of which the scatter of the arm would have to be told."""
+MAX_LOOKS = 100
+"""Of more, so many are used, evenly spread."""
+MAX_STEPS, SETTLED = 30, 1e-3
+WRONG_CHANCE = 1e-3
+"""Of the worst of all postures; an outlier has less."""
+MOST_WRONG = 0.25
+
+
+def calibrate_on_board(
+    looks: Sequence[BoardLook],
+    camera: CameraCalibration,
+    options: HandEyeOptions | None = None,
+    bow: BoardBow | None = None,
+) -> BoardHandEyeFit | FitFailure:
+    """Find where the camera sits on the arm's last link from looks at a target that stays put.
+
+    Parameters
+    ----------
+    looks
+        Each with the arm's pose.
+    camera
+        With which the target's poses were found. The looks move it within its covariance.
+    options
+        The arm's scatter, where it is known; else it is estimated.
+    bow
+        Of the target, with which its poses were found; None if it is flat.
+
+    Returns
+    -------
+    BoardHandEyeFit
+        With method "board". The calibration belongs to the moved camera: ``covariance`` holds that
+        fixed, ``dhand_eye_dsensor`` (6, 9) says how the hand-eye follows it.
+    """
+    options = options or HandEyeOptions()
+    refused = _refuse_few(looks)
+    if refused is not None:
+        return refused
+    spread = np.linspace(0, len(looks) - 1, min(len(looks), MAX_LOOKS)).round().astype(np.int64)
+    used = [looks[k] for k in spread]
+    notes: tuple[str, ...] = ()
+    if len(used) < len(looks):
+        notes = (f"{len(used)} of {len(looks)} looks at the target were used, evenly spread",)
+    start = find_board_start(used)
+    if isinstance(start, FitFailure):
+        return start
+    refused = refuse_far(start, used)
+    if refused is not None:
+        return refused
+    # A scatter that was given does not make looks wrong: which are, the others' own scatter says.
+    problem = _Problem.of(used, start, camera, HandEyeOptions(), bow)
+    wrong = _find_wrong(problem, start.is_suspect)
+    if isinstance(wrong, FitFailure):
+        return wrong
+    solution = _solve(replace(problem.without(list(wrong)), options=options))
+    if isinstance(solution, FitFailure):
+        return solution
+    return _evidence(solution, tuple(wrong.values()), notes)
+
+
+def _refuse_few(looks: Sequence[BoardLook]) -> FitFailure | None:
+    n = len({look.posture for look in looks})
+    if n >= LEAST_LOOKS:
+        return None
+    return FitFailure(
+        f"{n} posture{'s' if n != 1 else ''} with the target and the arm's pose "
+        f"{'are' if n != 1 else 'is'} too few: two poses are unknown, 12 numbers, and the arm's "
+        "scatter",
+        f"{LEAST_LOOKS} are the least; {TURN_MORE}",
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """Looks with the state at which they are linearised.
+
+    ``root`` (9 or 11, Q) is a root of the covariance of what all looks have in common, the camera's
+    parameters and the target's bow; ``units`` (Q,) are by how much they are off, in its units.
+    """
+
+    looks: tuple[BoardLook, ...]
+    camera: CameraCalibration
+    options: HandEyeOptions
+    tool_from_sensor: Pose[Tool, Sensor]
+    base_from_board: Pose[Base, Board]
+    chosen: tuple[BoardPose, ...]
+    root: FloatArray
+    units: FloatArray
+
+    @staticmethod
+    def of(
+        looks: Sequence[BoardLook],
+        start: BoardStart,
+        camera: CameraCalibration,
+        options: HandEyeOptions,
+        bow: BoardBow | None,
+    ) -> _Problem:
+        common = camera.covariance
+        if bow is not None:
+            follow = np.vstack([np.eye(len(common)), bow.by_cameras])
+            common = follow @ common @ follow.T
+            common[-2:, -2:] += bow.covariance_mm2
+        root = square_root(common, "the covariance of camera and target")
+        return _Problem(
+            looks=tuple(looks),
+            camera=camera,
+            options=options,
+            tool_from_sensor=start.tool_from_sensor,
+            base_from_board=start.base_from_board,
+            chosen=tuple(look.poses[k] for look, k in zip(looks, start.chosen, strict=True)),
+            root=root,
+            units=np.zeros(root.shape[1]),
+        )
+
+    def without(self, rows: Sequence[int]) -> _Problem:
+        """All but some looks."""
+        keep = [k for k in range(len(self.looks)) if k not in rows]
+        return replace(
+            self,
+            looks=tuple(self.looks[k] for k in keep),
+            chosen=tuple(self.chosen[k] for k in keep),
+        )
+
+    def moved(self, step: FloatArray) -> _Problem:
+        """After a step (12 + Q,) of all unknowns, with the poses that agree best then."""
+        moved = replace(
+            self,
+            tool_from_sensor=self.tool_from_sensor.retract(step[:N_POSE]),
+            base_from_board=self.base_from_board.retract(step[N_POSE:N_UNKNOWN]),
+            units=self.units + step[N_UNKNOWN:],
+        )
+        return replace(moved, chosen=tuple(map(moved._nearest, self.looks)))
+
+    @property
+    def common(self) -> FloatArray:
+        """(9 or 11,) step of the camera's parameters, and of the bow."""
+        return np.asarray(self.root @ self.units)
+
+    @property
+    def moved_camera(self) -> CameraModel:
+        """The camera as the looks move it."""
+        camera = self.camera.camera
+        return camera.moved_to(camera.parameters + self.common[: len(camera.parameters)])
+
+    def seen(self, pose: BoardPose) -> Pose[Sensor, Board]:
+        """The pose of a view under the moved camera and bow."""
+        return pose.sensor_from_board.retract(pose.by_common @ self.common)
+
+    def predicted(self, look: BoardLook) -> Pose[Sensor, Board]:
+        """Where the look's camera has the board, by arm, hand-eye and mean board."""
+        held = look.base_from_tool @ self.tool_from_sensor
+        return held.inverse() @ self.base_from_board
+
+    def misclosure_px(self, look: BoardLook, pose: BoardPose) -> FloatArray:
+        """(M, 2) where the points of a view are, less where they are predicted."""
+        points = self.predicted(look).apply(pose.view.points_board_mm)
+        return np.asarray(pose.view.points_px - self.moved_camera.project(points))
+
+    def _nearest(self, look: BoardLook) -> BoardPose:
+        if len(look.poses) == 1:
+            return look.poses[0]
+        predicted = self.predicted(look).rotation
+        traces = [float(np.sum(p.sensor_from_board.rotation * predicted)) for p in look.poses]
+        return look.poses[int(np.argmax(traces))]
+
+    def system(self) -> _System:
+        """Misclosures and their derivatives."""
+        n = len(self.looks)
+        arm = np.array([look.base_from_tool.rotation for look in self.looks])
+        arm_mm = np.array([look.base_from_tool.translation_mm for look in self.looks])
+        hand_eye, board = self.tool_from_sensor, self.base_from_board
+        views = [self.seen(pose) for pose in self.chosen]
+        seen = np.array([pose.rotation for pose in views])
+        seen_mm = np.array([pose.translation_mm for pose in views])
+        sensor_from_tool = hand_eye.rotation.T
+        sensor_from_base = sensor_from_tool @ arm.transpose(0, 2, 1)
+        from_arm = board.translation_mm - arm_mm
+        in_tool = np.einsum("nji,nj->ni", arm, from_arm) - hand_eye.translation_mm
+        predicted = sensor_from_base @ board.rotation
+        residual = np.zeros((n, N_POSE))
+        residual[:, :3] = Rotation.from_matrix(seen @ predicted.transpose(0, 2, 1)).as_rotvec()
+        residual[:, 3:] = seen_mm - in_tool @ hand_eye.rotation
+        q = len(self.units)
+        jacobian = np.zeros((n, N_POSE, N_UNKNOWN + q + 1))
+        jacobian[:, :3, :3] = jacobian[:, 3:, 3:6] = sensor_from_tool
+        jacobian[:, 3:, :3] = -sensor_from_tool @ skew(in_tool)
+        jacobian[:, :3, 6:9] = jacobian[:, 3:, 9:12] = -sensor_from_base
+        jacobian[:, :, N_UNKNOWN:-1] = [pose.by_common @ self.root for pose in self.chosen]
+        jacobian[:, 3:, -1] = seen_mm
+        prior = np.eye(q, N_UNKNOWN + q + 1, N_UNKNOWN)
+        by_arm = np.zeros((3, n, N_POSE, 3))
+        by_arm[0][:, 3:] = sensor_from_base
+        by_arm[1][:, :3] = by_arm[2][:, :3] = sensor_from_base
+        by_arm[1][:, 3:] = -sensor_from_base @ skew(from_arm)
+        scan_point = arm @ hand_eye.apply(self._scan_point_mm()) + arm_mm
+        by_arm[2][:, 3:] = -sensor_from_base @ skew(board.translation_mm - scan_point)
+        return _System(
+            self,
+            np.append(residual.reshape(-1), self.units),
+            np.concatenate([jacobian.reshape(-1, N_UNKNOWN + q + 1), prior]),
+            np.concatenate([by_arm.reshape(3, -1, 3), np.zeros((3, q, 3))], axis=1),
+        )
+
+    def _scan_point_mm(self) -> FloatArray:
+        """(3,) in Sensor: the mean of the target's middles."""
+        middles = [pose.sensor_from_board.apply(middle_of(pose.view)) for pose in self.chosen]
+        return np.asarray(np.mean(middles, axis=0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _System:
+    """Misclosures at a state (6 N + Q,), the last those of what is known of the common parameters.
+
+    Their derivative (6 N + Q, 12 + Q + 1) is by hand-eye, board, common parameters and, last, the
+    target's scale; that by the arm (3, 6 N + Q, 3) by its shift and its turns about Tool and about
+    the scan point.
+    """
+
+    problem: _Problem
+    residual: FloatArray
+    jacobian: FloatArray
+    by_arm: FloatArray
+
+    @property
+    def components(self) -> tuple[NoiseComponent, ...]:
+        """The arm's scatter; looks of one posture share it."""
+        names = np.array([look.posture for look in self.problem.looks])
+        alike = np.zeros((len(self.residual), len(self.residual)))
+        n = N_POSE * len(names)
+        alike[:n, :n] = np.kron(names[:, None] == names[None, :], np.ones((N_POSE, N_POSE)))
+        options = self.problem.options
+        return arm_components(
+            [alike * (part @ part.T) for part in self.by_arm],
+            options.arm_position_mm,
+            options.arm_rotation_rad,
+        )
+
+    @property
+    def known(self) -> FloatArray:
+        """(6 N + Q, 6 N + Q) covariance by the points' noise, and 1 of the common parameters."""
+        known = np.eye(len(self.residual))
+        for k, pose in enumerate(self.problem.chosen):
+            known[_rows(k), _rows(k)] = pose.covariance
+        return known
+
+
+def _rows(k: int) -> slice:
+    """Misclosures of a look."""
+    return slice(N_POSE * k, N_POSE * (k + 1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """A system at its minimum, and the scatter there."""
+
+    system: _System
+    noise: NoiseEstimate
+    is_settled: bool
+    components: tuple[NoiseComponent, ...] = field(repr=False)
+
+    @property
+    def total(self) -> FloatArray:
+        """Covariance of the misclosures."""
+        return total_covariance(self.components, self.noise.sigmas) + self.system.known
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """Without the scale."""
+        return self.system.jacobian[:, :-1]
+
+
+_NOTHING = FitFailure(
+    "the refinement found no minimum: the postures or the scatters given are degenerate", TURN_MORE
+)
+
+
+def _solve(problem: _Problem) -> _Solution | FitFailure:
+    """Generalised least squares, the arm's scatter by restricted maximum likelihood."""
+    sigmas = None
+    for count in range(MAX_STEPS):
+        system = problem.system()
+        components = system.components
+        jacobian = system.jacobian[:, :-1]
+        noise = estimate_noise(system.residual, jacobian, components, system.known, sigmas)
+        sigmas = noise.sigmas
+        total = total_covariance(components, sigmas) + system.known
+        linear = solve_linear(system.residual, jacobian, total)
+        if linear is None:
+            return _NOTHING
+        size = float(linear.step @ np.linalg.solve(linear.covariance, linear.step))
+        if size < SETTLED**2 * len(linear.step):
+            return _Solution(system, noise, True, components)
+        if count < MAX_STEPS - 1:
+            problem = problem.moved(linear.step)
+    return _Solution(system, noise, False, components)
+
+
+def _find_wrong(
+    problem: _Problem, is_suspect: BoolArray
+) -> dict[int, tuple[str, str]] | FitFailure:
+    """Looks that all others together call wrong, by their rows: (source, reason).
+
+    Those that the start calls suspect are judged by the others first: together they could hide each
+    other. Then the worst that is left, as long as it is wrong.
+    """
+    n, out = len(problem.looks), [int(k) for k in np.flatnonzero(is_suspect)]
+    found: dict[int, tuple[str, str]] = {}
+    others = _solve(problem.without(out)) if n - len(out) >= LEAST_LOOKS else _NOTHING
+    if not isinstance(others, FitFailure):
+        found = {k: told for k in out if (told := _contradiction(problem, k, others, n))}
+    while n - len(found) > LEAST_LOOKS + 1:
+        solution = _solve(problem.without(list(found)))
+        if isinstance(solution, FitFailure):
+            return solution
+        left, rows = _left_out(solution), [k for k in range(n) if k not in found]
+        worst = rows[max(left, key=lambda k: left[k].normalised, default=0)]
+        others = _solve(problem.without([*found, worst]))
+        told = None if isinstance(others, FitFailure) else _contradiction(problem, worst, others, n)
+        if told is None:
+            break
+        found[worst] = told
+    if len(found) <= MOST_WRONG * n:
+        return found
+    named = ", ".join(source for source, _ in list(found.values())[:4])
+    return FitFailure(
+        f"{len(found)} of {n} looks contradict the others ({named} ...)",
+        "check that poses and images have the same order, and that target and base did not move",
+    )
+
+
+def _contradiction(
+    problem: _Problem, row: int, others: _Solution, n_looks: int
+) -> tuple[str, str] | None:
+    """Source and reason of a look that cannot belong to the others, the worst of ``n_looks``."""
+    chance, off_mm, off_deg = _chance(problem, row, others)
+    if chance * n_looks > WRONG_CHANCE:
+        return None
+    return problem.chosen[row].view.source, (
+        f"contradicts the others by {off_mm:.2f} mm and {off_deg:.2f} degrees: a wrong pose, a "
+        "moved target, or another numbering of its points"
+    )
+
+
+def _chance(problem: _Problem, row: int, others: _Solution) -> tuple[float, float, float]:
+    """How likely a look is so far off what the others say, and how far that is, in mm and degrees.
+
+    By Hotelling's T^2: the scatter of six numbers is known from as many others as the rest has to
+    spare.
+    """
+    alone = replace(
+        others.system.problem, looks=(problem.looks[row],), chosen=(problem.chosen[row],)
+    )
+    alone = alone.moved(np.zeros(N_UNKNOWN + len(alone.units)))
+    system, own = alone.system(), _rows(0)
+    residual, jacobian = system.residual[own], system.jacobian[own, :-1]
+    linear = solve_linear(others.system.residual, others.jacobian, others.total)
+    scatter = (total_covariance(system.components, others.noise.sigmas) + system.known)[own, own]
+    if linear is not None:
+        scatter = scatter + jacobian @ linear.covariance @ jacobian.T
+    square = float(residual @ np.linalg.solve(scatter, residual))
+    n_free = max(N_POSE * len(others.system.problem.looks) - N_UNKNOWN, 1)
+    chance = float(betainc(0.5 * n_free, 0.5 * N_POSE, n_free / (n_free + square)))
+    off = _middle_off_mm(alone, 0)
+    return chance, off, float(np.degrees(np.linalg.norm(residual[:3])))
+
+
+def _middle_off_mm(problem: _Problem, row: int) -> float:
+    """By how much the target's middle is off, seen from Base."""
+    pose, look = problem.chosen[row], problem.looks[row]
+    middle = middle_of(pose.view)
+    away = problem.seen(pose).apply(middle) - problem.predicted(look).apply(middle)
+    return float(np.linalg.norm(away))
+
+
+def _evidence(
+    solution: _Solution, not_used: tuple[tuple[str, str], ...], notes: tuple[str, ...]
+) -> BoardHandEyeFit | FitFailure:
+    """The result with what it rests on, or why it cannot be trusted."""
+    system, problem = solution.system, solution.system.problem
+    try:
+        stated = covariance_over_noise(
+            system.residual, solution.jacobian, solution.components, system.known, solution.noise
+        )
+        conditioning = _conditioning(solution)
+        asked = _asked_scale(solution)
+    except (EstimationError, np.linalg.LinAlgError) as error:
+        return FitFailure(f"{_NOTHING.reason} ({error})", TURN_MORE)
+    refused = refuse_hardly_determined(conditioning, MOST_OPEN_MM, "", TURN_MORE)
+    refused = refused if refused is not None else refuse_scale(asked)
+    if refused is not None:
+        return refused
+    root = problem.root[: len(problem.camera.covariance)]
+    after = root @ stated.matrix[N_UNKNOWN:, N_UNKNOWN:] @ root.T
+    between = stated.matrix[:N_POSE, N_UNKNOWN:] @ root.T
+    follow = between @ np.linalg.pinv(after, rcond=1e-12, hermitian=True)
+    covariance = stated.matrix[:N_POSE, :N_POSE]
+    own = covariance - follow @ between.T
+    left = _left_out(solution)
+    misclosures = tuple(map(problem.misclosure_px, problem.looks, problem.chosen))
+    postures = tuple(
+        _posture(problem, k, left[k], misclosures[k]) for k in range(len(problem.looks))
+    )
+    calibration = HandEyeCalibration(
+        tool_from_sensor=problem.tool_from_sensor,
+        covariance=_positive(own),
+        dhand_eye_dsensor=follow,
+        arm_noise=arm_noise(solution.components, solution.noise.sigmas),
+        rms_mm=_rms_mm(problem),
+        n_postures=len({look.posture for look in problem.looks}),
+        n_exposures=len(problem.looks),
+        n_points=sum(p.n_points for p in postures),
+        diagnostics=_diagnostics(
+            solution, conditioning.under(covariance), postures, stated.region_factor
+        ),
+    )
+    names = [pose.view.source for pose in problem.chosen]
+    warnings = (
+        *notes,
+        *(f"{source} {reason}" for source, reason in not_used),
+        *conditioning_warnings(conditioning.under(covariance), len(problem.looks), ""),
+        *influence_warnings(names, left, own),
+        *scale_warnings(asked),
+        *_scatter_warnings(solution),
+    )
+    return BoardHandEyeFit(
+        calibration=calibration,
+        base_from_board=problem.base_from_board,
+        board_covariance=stated.matrix[N_POSE:N_UNKNOWN, N_POSE:N_UNKNOWN],
+        looks=problem.looks,
+        chosen=tuple(
+            replace(pose, sensor_from_board=problem.seen(pose)) for pose in problem.chosen
+        ),
+        postures=postures,
+        conditioning=conditioning,
+        asked=asked,
+        camera=problem.moved_camera,
+        camera_step=problem.common[: len(root)],
+        camera_covariance=0.5 * (after + after.T),
+        before=problem.camera,
+        misclosures_px=misclosures,
+        not_used=not_used,
+        warnings=warnings,
+    )
+
+
+def _positive(covariance: FloatArray) -> FloatArray:
+    """The nearest covariance without negative variances, which averages may leave by rounding."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _conditioning(solution: _Solution) -> Conditioning:
+    whitened = Whitening(solution.total)(solution.jacobian)
+    return conditioning_of(whitened[:, :N_POSE], whitened[:, N_POSE:])
+
+
+def _left_out(solution: _Solution) -> dict[int, LeftOut]:
+    """What changes without each look, as `armscan.calibration.hand_eye.estimate.leave_out`."""
+    residual = solution.system.residual
+    linear = solve_linear(residual, solution.jacobian, solution.total)
+    if linear is None:
+        return {}
+    explained, found = linear.projected @ residual, {}
+    for k in range(len(solution.system.problem.looks)):
+        block = _rows(k)
+        own = np.linalg.pinv(linear.projected[block, block], rcond=1e-10, hermitian=True)
+        predicted = own @ explained[block]
+        square = float(explained[block] @ predicted)
+        size = float(np.sqrt(max(square, 0.0) / N_POSE))
+        chance = float(chdtrc(N_POSE, square))
+        found[k] = LeftOut(linear.gain[:, block] @ predicted, size, size, chance)
+    return found
+
+
+def _posture(problem: _Problem, k: int, left: LeftOut, misclosure_px: FloatArray) -> BoardPosture:
+    look, pose = problem.looks[k], problem.chosen[k]
+    view, predicted = pose.view, problem.predicted(look)
+    turn = problem.seen(pose).rotation @ predicted.rotation.T
+    return BoardPosture(
+        posture=look.posture,
+        source=view.source,
+        n_points=len(view),
+        rms_px=float(np.sqrt((misclosure_px**2).sum(axis=1).mean())),
+        shift_mm=_middle_off_mm(problem, k),
+        turn_deg=float(np.degrees(Rotation.from_matrix(turn).magnitude())),
+        tilt_deg=float(np.degrees(np.arccos(min(abs(predicted.rotation[2, 2]), 1.0)))),
+        stand_off_mm=float(np.linalg.norm(pose.sensor_from_board.apply(middle_of(view)))),
+        left_out_rotation_deg=float(np.degrees(np.linalg.norm(left.change[:3]))),
+        left_out_translation_mm=float(np.linalg.norm(left.change[3:N_POSE])),
+        left_out_normalised=left.normalised,
+    )
+
+
+def _rms_mm(problem: _Problem) -> float:
+    """Distance of the target's points, placed by view, hand-eye and arm, from the mean board's."""
+    squares = []
+    for look, pose in zip(problem.looks, problem.chosen, strict=True):
+        points, predicted = pose.view.points_board_mm, problem.predicted(look)
+        away = problem.seen(pose).apply(points) - predicted.apply(points)
+        squares.append((away**2).sum(axis=1))
+    return float(np.sqrt(np.concatenate(squares).mean()))
+
+
+def _diagnostics(
+    solution: _Solution,
+    conditioning: Conditioning,
+    postures: Sequence[BoardPosture],
+    region_factor: float,
+) -> HandEyeDiagnostics:
+    residual, jacobian = solution.system.residual, solution.jacobian
+    linear = solve_linear(residual, jacobian, solution.total)
+    square = float("nan") if linear is None else float(residual @ linear.projected @ residual)
+    is_estimated = [component.is_estimated for component in solution.components]
+    return HandEyeDiagnostics(
+        method="board",
+        rank=conditioning.rank,
+        condition=min(conditioning.condition, FINITE_CONDITION),
+        weakest=conditioning.weakest,
+        plate_flatness_mm=0.0,
+        flatness_length_mm=0.0,
+        is_noise_estimated=any(is_estimated),
+        left_out_rotation_deg=max(one.left_out_rotation_deg for one in postures),
+        left_out_translation_mm=max(one.left_out_translation_mm for one in postures),
+        chi2_probability=float(chdtrc(len(residual) - jacobian.shape[1], square)),
+        region_factor=region_factor,
+        is_arm_given=not is_estimated[0],
+    )
+
+
+def _asked_scale(solution: _Solution) -> AskedScale:
+    """Solve the target's size along, the scatter estimated anew."""
+    system = solution.system
+    residual, jacobian, known = system.residual, system.jacobian, system.known
+    noise = estimate_noise(residual, jacobian, solution.components, known, solution.noise.sigmas)
+    total = total_covariance(solution.components, noise.sigmas) + known
+    linear = solve_linear(residual, jacobian, total)
+    if linear is None:
+        return AskedScale(1.0, float("inf"), float("inf"))
+    whole = covariance_over_noise(residual, jacobian, solution.components, known, noise)
+    sigma, if_known = (
+        float(np.sqrt(matrix[-1, -1])) for matrix in (whole.matrix, linear.covariance)
+    )
+    return AskedScale(1.0 + float(linear.step[-1]), sigma, if_known)
+
+
+LARGE_ARM_MM, LARGE_ARM_RAD = 0.5, np.radians(0.2)
+
+
+def _scatter_warnings(solution: _Solution) -> tuple[str, ...]:
+    """Warn of an arm that scatters more than robots do, and of a solution that had not settled."""
+    found = []
+    noise = arm_noise(solution.components, solution.noise.sigmas)
+    turn_rad = float(np.hypot(noise.rotation_rad, noise.tool_rotation_rad))
+    if solution.components[0].is_estimated and (
+        noise.position_mm > LARGE_ARM_MM or turn_rad > LARGE_ARM_RAD
+    ):
+        found.append(
+            f"the arm's poses seem to scatter by {noise.position_mm:.2f} mm and "
+            f"{np.degrees(turn_rad):.2f} degrees an axis: much even for a robot; a base or target "
+            "that moved, poses read while the arm moved, and a poor camera look the same"
+        )
+    if not solution.is_settled or not solution.noise.is_settled:
+        found.append(
+            "the refinement had not settled when its steps ran out: the hand-eye may be off by "
+            "more than stated"
+        )
+    return tuple(found)

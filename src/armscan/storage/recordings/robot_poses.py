@@ -1,0 +1,343 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How rotations are written in tables, and tables of a robot's poses."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from armscan.errors import FileFormatError
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import (
+    EulerConvention,
+    euler_from_rotations,
+    rotations_from_euler,
+    vector_from_rotation,
+)
+from armscan.records.recording import PoseForm
+from armscan.storage.codec import parse_json
+from armscan.storage.files import read_bytes
+from armscan.storage.tables import refuse_beyond_reach
+
+POSITION: Final = ("x_mm", "y_mm", "z_mm")
+FORM_COLUMNS: Final[dict[PoseForm, tuple[str, ...]]] = {
+    "quaternion": ("qw", "qx", "qy", "qz"),
+    "matrix": tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
+    "euler": ("a_deg", "b_deg", "c_deg"),
+    "joints": (),
+}
+NORM_TOLERANCE = 1e-6
+ORTHONORMAL_TOLERANCE = 1e-5
+"""Six decimals of nine numbers leave up to about 3e-6, more than a `Pose` allows; what passes is
+made exact before it becomes one."""
+FULL_TURNS_DEG = 720.0
+
+
+def rotations_of_form(
+    numbers: FloatArray, form: PoseForm, convention: EulerConvention, places: Sequence[str]
+) -> FloatArray:
+    """Rotations (N, 3, 3) of numbers (N, C) in the order of `FORM_COLUMNS`.
+
+    A quaternion is w, x, y, z (Hamilton, active), of either sign and norm 1 within 1e-6; a matrix
+    is row by row and orthonormal within 1e-5, and the nearest rotation is taken.
+
+    Parameters
+    ----------
+    numbers
+        Finite.
+    form, convention
+        How they are written.
+    places
+        (N,) file and line of each, for messages.
+
+    Raises
+    ------
+    FileFormatError
+        If a row is no rotation.
+    """
+    if form == "quaternion":
+        return _from_quaternions(numbers, places)
+    if form == "matrix":
+        return _from_matrices(numbers.reshape(-1, 3, 3), places)
+    largest = np.abs(numbers).max(axis=1, initial=0.0)
+    if (largest > FULL_TURNS_DEG).any():
+        row = int(np.argmax(largest > FULL_TURNS_DEG))
+        raise FileFormatError(
+            f"an angle of {largest[row]:g} deg",
+            where=places[row],
+            remedy="check that positions and angles are in their columns",
+        )
+    return rotations_from_euler(np.radians(numbers), convention)
+
+
+def pose_numbers(
+    rotations: FloatArray, is_known: BoolArray, form: PoseForm, convention: EulerConvention
+) -> FloatArray:
+    """Numbers (N, C) in the order of `FORM_COLUMNS`, NaN where the pose is not known."""
+    numbers = np.full((len(rotations), len(FORM_COLUMNS[form])), np.nan)
+    known = rotations[is_known]
+    if not len(known):
+        return numbers
+    if form == "quaternion":
+        numbers[is_known] = np.roll(Rotation.from_matrix(known).as_quat(canonical=True), 1, axis=1)
+    elif form == "matrix":
+        numbers[is_known] = known.reshape(-1, 9)
+    else:
+        numbers[is_known] = np.degrees(euler_from_rotations(known, convention))
+    return numbers
+
+
+def _from_quaternions(numbers: FloatArray, places: Sequence[str]) -> FloatArray:
+    if not len(numbers):
+        return np.zeros((0, 3, 3))
+    norms = np.linalg.norm(numbers, axis=1)
+    wrong = np.abs(norms - 1.0) > NORM_TOLERANCE
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise FileFormatError(
+            f"the quaternion's norm is {norms[row]:.8g}, not 1 within {NORM_TOLERANCE:g}",
+            where=places[row],
+            remedy="write qw,qx,qy,qz with seven decimals or more, each in its own column",
+        )
+    return np.asarray(Rotation.from_quat(np.roll(numbers, -1, axis=1)).as_matrix())
+
+
+def _from_matrices(matrices: FloatArray, places: Sequence[str]) -> FloatArray:
+    defect = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
+    is_mirrored = np.linalg.det(matrices) < 0.0
+    wrong = (defect > ORTHONORMAL_TOLERANCE) | is_mirrored
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        fact = (
+            "mirrors" if is_mirrored[row] else f"is not orthonormal: |R R' - 1| = {defect[row]:.2g}"
+        )
+        raise FileFormatError(
+            f"the matrix {fact}",
+            where=places[row],
+            remedy="write r11,r12,r13,r21 and so on, row by row, with seven decimals or more",
+        )
+    left, _, right = np.linalg.svd(matrices)
+    is_exact = defect < 1e-14
+    return np.where(is_exact[:, None, None], matrices, left @ right)
+
+
+REACH_MM = 10.0
+"""No arm keeps its last link this near to the origin of Base; in metres, no arm gets farther."""
+MOVED_MM = 0.01
+TURNED_RAD = math.radians(3.0)
+
+METRES_REMEDY = (
+    "multiply x, y and z by 1000; if they are millimetres, add 1000 to each x, for Base may lie "
+    "anywhere"
+)
+
+
+def are_within_reach_of_base(translations_mm: FloatArray) -> bool:
+    """True if all (N, 3) positions lie within 10 mm of Base's origin, and not all at it."""
+    if not len(translations_mm):
+        return False
+    distance = np.linalg.norm(translations_mm, axis=1)
+    return bool(0.0 < distance.max() < REACH_MM)
+
+
+def are_surely_metres(rotations: FloatArray, translations_mm: FloatArray) -> bool:
+    """True if the poses of an arm make no sense in millimetres.
+
+    They do not where the tool stays within 10 mm of Base's origin and moves, while it turns about
+    two axes: a stage of small travel does not turn, and a turntable turns about one axis only.
+
+    Parameters
+    ----------
+    rotations
+        (N, 3, 3) of ``base_from_tool``.
+    translations_mm
+        (N, 3) as written under the name of millimetres.
+    """
+    if len(rotations) < 3 or not are_within_reach_of_base(translations_mm):
+        return False
+    moved = np.linalg.norm(translations_mm - translations_mm.mean(axis=0), axis=1).max()
+    chosen = np.unique(np.linspace(0, len(rotations) - 1, 200).astype(np.int64))
+    turns = np.array([vector_from_rotation(rotations[0].T @ rotations[k]) for k in chosen])
+    _, _, axes = np.linalg.svd(turns, full_matrices=False)
+    about_second = np.abs(turns @ axes[1]).max()
+    return bool(moved > MOVED_MM and about_second > TURNED_RAD)
+
+
+JSON_KEY = "RobPoses"
+QUATERNION = FORM_COLUMNS["quaternion"]
+HEADERS = (
+    ("x", "y", "z", "w", "p", "r"),
+    ("x", "y", "z", "a", "b", "c"),
+    ("x", "y", "z", "rx", "ry", "rz"),
+    *(("x", "y", "z", *order) for order in (QUATERNION, (*QUATERNION[1:], QUATERNION[0]))),
+)
+"""Headers that are understood, without units and case."""
+METRES = re.compile(r"^x[_ (\[]*m\b", re.IGNORECASE)
+"""The first word of a header whose positions are in metres."""
+UNIT_OF_ANGLE = re.compile(r"[_ (\[](rad|deg)", re.IGNORECASE)
+N_ANGLES, N_QUATERNION, N_ROWS, N_MATRIX = 6, 7, 12, 16
+HOW_TO_WRITE = (
+    "write x, y, z in mm and three angles in degrees, in this order; or a matrix of 3 x 4 or 4 x 4 "
+    "numbers row by row; or, under the header x,y,z,qw,qx,qy,qz or x,y,z,qx,qy,qz,qw, a quaternion"
+)
+BLOCK_TOLERANCE = 1e-4
+"""A printed matrix of four decimals is made exact when it is this near to a rotation."""
+
+
+def read_robot_poses(path: Path, convention: EulerConvention) -> tuple[Pose[Base, Tool], ...]:
+    """Read poses ``base_from_tool``.
+
+    Text with one pose a line, separated by commas or blanks, with or without a header; ``#`` starts
+    a comment. Or JSON: a list of poses, or an object with such a list called ``RobPoses``. A pose
+    is x, y, z in mm and the angles a, b, c of the convention in degrees (FANUC: W, P, R,
+    ``extrinsic-xyz``), or a rotation vector in rad, or as a header's ``a_rad`` or ``rx [deg]``
+    says; or the matrix of ``base_from_tool``, 3 x 4 or 4 x 4, in one line or one line
+    a row; or x, y, z and a quaternion, whose order the header says. Positions are in metres under a
+    header that begins with ``x_m`` or ``x [m]``.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, cut, or a pose is none of these or not finite, or positions are in
+        metres under the name of millimetres.
+    """
+    data = read_bytes(path)
+    where = str(path)
+    is_json = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
+    header, rows, places = _from_json(data, where) if is_json else _from_text(data, where)
+    if not rows:
+        raise FileFormatError("the file holds no pose", where=where, remedy=HOW_TO_WRITE)
+    factor = 1000.0 if header and METRES.match(header[0]) else 1.0
+    positions, rotations = _poses_of(header, rows, places, convention)
+    positions = factor * positions
+    refuse_beyond_reach(positions, where)
+    if are_surely_metres(rotations, positions):
+        raise FileFormatError(
+            "the tool turns but stays within 10 mm of Base's origin: positions look like metres",
+            where=where,
+            remedy=f"say so in a header, x_m,y_m,z_m and so on, or {METRES_REMEDY}",
+        )
+    return tuple(Pose(one, place) for one, place in zip(rotations, positions, strict=True))
+
+
+def _poses_of(
+    header: Sequence[str],
+    rows: Sequence[Sequence[float]],
+    places: Sequence[str],
+    convention: EulerConvention,
+) -> tuple[FloatArray, FloatArray]:
+    """Positions (N, 3) as written, and rotations (N, 3, 3)."""
+    n, names = len(rows[0]), _plain(header)
+    counts = (N_QUATERNION,) if names[3:4] in (("qw",), ("qx",)) else (N_ANGLES, N_ROWS, N_MATRIX)
+    for row, place in zip(rows, places, strict=True):
+        if len(row) != n or n not in counts:
+            kind = "seven" if N_QUATERNION in counts else "six"
+            raise FileFormatError(f"a pose is not {kind} numbers", where=place, remedy=HOW_TO_WRITE)
+    table = np.array(rows)
+    if n == N_ANGLES:
+        unit = UNIT_OF_ANGLE.search(header[3]) if header else None
+        is_rad = convention == "rotation-vector" if unit is None else unit[1].lower() == "rad"
+        angles = np.degrees(table[:, 3:]) if is_rad else table[:, 3:]
+        return table[:, :3], rotations_of_form(angles, "euler", convention, places)
+    if n == N_QUATERNION:
+        turn = table[:, 3:] if names[3] == "qw" else np.roll(table[:, 3:], 1, axis=1)
+        norm = np.linalg.norm(turn, axis=1, keepdims=True)
+        near = np.abs(norm - 1.0) < BLOCK_TOLERANCE
+        turn = np.where(near, turn / np.where(near, norm, 1.0), turn)
+        return table[:, :3], rotations_of_form(turn, "quaternion", convention, places)
+    if n == N_MATRIX:
+        last = np.abs(table[:, N_ROWS:] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
+        if last.max() > BLOCK_TOLERANCE:
+            raise FileFormatError(
+                "the last row of a 4 x 4 matrix is not 0, 0, 0, 1",
+                where=places[int(np.argmax(last))],
+                remedy="write matrices row by row, the position in the last column",
+            )
+    matrices = table[:, :N_ROWS].reshape(-1, 3, 4)
+    turns = matrices[:, :, :3]
+    left, _, right = np.linalg.svd(turns)
+    near_mm = np.abs(left @ right - turns).max(axis=(1, 2)) < BLOCK_TOLERANCE
+    turns = np.where(near_mm[:, None, None], left @ right, turns)
+    return matrices[:, :, 3], _from_matrices(turns, places)
+
+
+def _from_json(data: bytes, where: str) -> tuple[list[str], list[list[float]], list[str]]:
+    text = data.decode("utf-8-sig", errors="replace").lstrip()
+    if text.startswith("["):
+        data = f'{{"{JSON_KEY}": {text}}}'.encode()
+    rows: Any = parse_json(data, where).get(JSON_KEY)
+    if not isinstance(rows, list):
+        raise FileFormatError(
+            f"there is no list called {JSON_KEY}", where=where, remedy="name the robot's poses"
+        )
+    places = [f"{where}, pose {k}" for k in range(1, len(rows) + 1)]
+    flat = [_numbers(_flat(row), place) for row, place in zip(rows, places, strict=True)]
+    return [], flat, places
+
+
+def _flat(row: Any) -> list[Any]:
+    """Numbers of a pose that is a list, or a list of a matrix's rows."""
+    if not isinstance(row, list):
+        return [row]
+    return [value for item in row for value in (item if isinstance(item, list) else [item])]
+
+
+def _from_text(data: bytes, where: str) -> tuple[list[str], list[list[float]], list[str]]:
+    try:
+        lines = data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise FileFormatError(
+            "this is not UTF-8 text", where=where, remedy="save it as UTF-8"
+        ) from error
+    header: list[str] = []
+    rows: list[list[float]] = []
+    places: list[str] = []
+    for number, line in enumerate(lines, start=1):
+        words = [word for word in re.split(r"[\s,;\[\]]+", line.split("#")[0]) if word]
+        titles = re.split(r"\s*[,;]\s*|\s+(?![(\[])", line.strip())
+        if not words:
+            continue
+        if not rows and not header and _plain(titles) in HEADERS:
+            header = titles
+            continue
+        places.append(f"{where}, line {number}")
+        rows.append(_numbers(words, places[-1]))
+    if rows and all(len(row) == 4 for row in rows):
+        return header, *_joined(rows, places)
+    return header, rows, places
+
+
+def _joined(rows: list[list[float]], places: list[str]) -> tuple[list[list[float]], list[str]]:
+    """Matrices of four numbers a line, with or without their last rows, one pose each."""
+    has_last = all(row == [0.0, 0.0, 0.0, 1.0] for row in rows[3::4])
+    step = 4 if has_last and len(rows) % 4 == 0 else 3
+    if len(rows) % step:
+        raise FileFormatError(
+            f"{len(rows)} lines of four numbers are no matrices of 3 or 4 rows",
+            where=places[-1],
+            remedy=HOW_TO_WRITE,
+        )
+    joined = np.array(rows).reshape(-1, 4 * step).tolist()
+    return joined, places[::step]
+
+
+def _plain(words: Sequence[str]) -> tuple[str, ...]:
+    """Names of columns without units and case."""
+    return tuple(re.sub(r"[_ (\[].*", "", word).lower() for word in words)
+
+
+def _numbers(row: Sequence[Any], where: str) -> list[float]:
+    try:
+        values = [float(value) for value in row]
+    except (TypeError, ValueError):
+        values = []
+    if not values or not bool(np.isfinite(values).all()):
+        raise FileFormatError("a pose is not six numbers", where=where, remedy=HOW_TO_WRITE)
+    return values

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hand-eye of a camera before a flat target: certainty, numbering, wrong poses, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from armscan.calibration.hand_eye.board_looks import BoardLook, better_reading, find_board_start
+from armscan.calibration.hand_eye.board_result import BoardHandEyeFit
+from armscan.calibration.hand_eye.observations import HandEyeOptions
+from armscan.calibration.hand_eye.on_board import _Problem, calibrate_on_board
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Pose
+from armscan.geometry.rotations import euler_from_rotations, rotations_from_euler
+from rigs.board_postures import TRUE_CAMERA, BoardRig, board_rig, misread
+
+
+def solved(rig: BoardRig) -> BoardHandEyeFit:
+    fit = calibrate_on_board(rig.looks, rig.camera)
+    assert isinstance(fit, BoardHandEyeFit), fit
+    return fit
+
+
+def error(fit: BoardHandEyeFit, rig: BoardRig) -> FloatArray:
+    """(6,) step from the hand-eye found to the true one."""
+    found, true = fit.calibration.tool_from_sensor, rig.tool_from_sensor
+    turn = Rotation.from_matrix(true.rotation @ found.rotation.T).as_rotvec()
+    return np.concatenate([turn, true.translation_mm - found.translation_mm])
+
+
+SETTLED = 0.01
+"""Of a standard deviation: solutions end within a thousandth."""
+
+
+def apart(fit: BoardHandEyeFit, other: BoardHandEyeFit) -> float:
+    """The largest difference of two hand-eyes over its standard deviation."""
+    one, two = fit.calibration.tool_from_sensor, other.calibration.tool_from_sensor
+    turn = Rotation.from_matrix(one.rotation @ two.rotation.T).as_rotvec()
+    step = np.concatenate([turn, one.translation_mm - two.translation_mm])
+    return float(np.abs(step / np.sqrt(np.diag(covariance(fit)))).max())
+
+
+def covariance(fit: BoardHandEyeFit) -> FloatArray:
+    follow = fit.calibration.dhand_eye_dsensor
+    assert follow is not None
+    return np.asarray(fit.calibration.covariance + follow @ fit.camera_covariance @ follow.T)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[tuple[BoardRig, BoardHandEyeFit]]:
+    """Arms of 0.02 to 0.5 mm with levers of 50 to 400 mm, before 8 to 15 postures each."""
+    found = []
+    for seed in range(36):
+        generator = np.random.default_rng(1000 + seed)
+        rig = board_rig(
+            seed,
+            int(generator.integers(8, 16)),
+            arm_mm=float(np.exp(generator.uniform(np.log(0.02), np.log(0.5)))),
+            lever_mm=float(np.exp(generator.uniform(np.log(50.0), np.log(400.0)))),
+        )
+        found.append((rig, solved(rig)))
+    return found
+
+
+def test_errors_are_as_large_as_stated(drawn: list[tuple[BoardRig, BoardHandEyeFit]]) -> None:
+    """Two-sided: a variance doubled or times 0.6 falls out of what 36 draws of six leave."""
+    squares = []
+    for rig, fit in drawn:
+        off = error(fit, rig)
+        squares.append(float(off @ np.linalg.solve(covariance(fit), off)))
+    low, high = chi2.ppf([0.001, 0.999], 6 * len(drawn)) / len(drawn)
+    assert low < np.mean(squares) < high
+    assert not low < 2.0 * np.mean(squares) < high
+    assert not low < 0.5 * np.mean(squares) < high
+    held = [
+        square < chi2.ppf(0.95, 6) * fit.calibration.diagnostics.region_factor
+        for square, (_, fit) in zip(squares, drawn, strict=True)
+        if fit.calibration.diagnostics is not None
+    ]
+    assert np.mean(held) > 0.87
+
+
+def test_right_postures_are_kept_and_sizes_agree(
+    drawn: list[tuple[BoardRig, BoardHandEyeFit]],
+) -> None:
+    assert sum(len(fit.not_used) for _, fit in drawn) <= 1
+    sizes = [(fit.asked.scale - 1.0) / fit.asked.sigma for _, fit in drawn]
+    assert 0.7 < np.sqrt(np.mean(np.square(sizes))) < 1.3
+
+
+def test_the_moved_camera_is_nearer_to_the_true_one(
+    drawn: list[tuple[BoardRig, BoardHandEyeFit]],
+) -> None:
+    """Whatever the camera errs by that the arm sees is put right, and its covariance says so."""
+    squares, before = [], []
+    for _, fit in drawn:
+        off = (TRUE_CAMERA - fit.camera.parameters)[:4]
+        squares.append(off**2 / np.diag(fit.camera_covariance)[:4])
+        before.append(np.diag(fit.camera_covariance)[:4] / np.diag(fit.before.covariance)[:4])
+    assert np.mean(before) < 0.9
+    assert 0.7 < np.mean(squares) < 1.4
+
+
+def test_derivatives_are_those_of_differences() -> None:
+    rig = board_rig(3, 5)
+    start = find_board_start(rig.looks)
+    assert not isinstance(start, FitFailure)
+    problem = _Problem.of(rig.looks, start, rig.camera, HandEyeOptions(), None)
+    problem = problem.moved(np.full(12 + len(problem.units), 1e-3))
+    system = problem.system()
+    for column in range(system.jacobian.shape[1] - 1):
+        step = np.zeros(system.jacobian.shape[1] - 1)
+        step[column] = 1e-5
+        there, back = problem.moved(step).system(), problem.moved(-step).system()
+        slope = (there.residual - back.residual) / 2e-5
+        # the misclosures, hundredths of rad, are taken as small
+        np.testing.assert_allclose(
+            system.jacobian[:, column], slope, atol=5e-3 * max(1.0, np.abs(slope).max())
+        )
+
+
+def test_the_scatter_of_the_arm_does_what_it_is_said_to() -> None:
+    """A pose that is off by a shift, and by a turn about Tool, moves the misclosures so."""
+    rig = board_rig(4, 5)
+    start = find_board_start(rig.looks)
+    assert not isinstance(start, FitFailure)
+    problem = _Problem.of(rig.looks, start, rig.camera, HandEyeOptions(), None)
+    system = problem.system()
+    for axis in range(3):
+        unit = 1e-5 * np.eye(3)[axis]
+        for kind, step in ((0, np.append(np.zeros(3), unit)), (1, np.append(unit, np.zeros(3)))):
+            moved = [
+                replace(one, base_from_tool=one.base_from_tool.retract(step)) for one in rig.looks
+            ]
+            off = replace(problem, looks=tuple(moved)).system().residual - system.residual
+            np.testing.assert_allclose(off / 1e-5, system.by_arm[kind][:, axis], atol=2e-2)
+
+
+def test_views_of_a_symmetric_target_may_be_numbered_from_either_end() -> None:
+    straight = solved(board_rig(5, target="chessboard:9x7:25"))
+    turned = solved(board_rig(5, target="chessboard:9x7:25", turned=True))
+    assert apart(turned, straight) < SETTLED
+    np.testing.assert_allclose(
+        turned.calibration.arm_noise.position_mm,
+        straight.calibration.arm_noise.position_mm,
+        rtol=1e-3,
+    )
+    assert not turned.not_used
+
+
+@pytest.mark.parametrize("row", [0, 7])
+def test_a_wrong_pose_is_named_and_left_out(row: int) -> None:
+    rig = board_rig(6, arm_mm=0.1)
+    wrong = solved(misread(rig, row, 3.0))
+    assert [source for source, _ in wrong.not_used] == [f"{row}.png"]
+    assert any(text.startswith(f"{row}.png contradicts the others by") for text in wrong.warnings)
+    clean = calibrate_on_board([o for k, o in enumerate(rig.looks) if k != row], rig.camera)
+    assert isinstance(clean, BoardHandEyeFit)
+    assert apart(wrong, clean) < SETTLED
+
+
+def test_a_third_of_wrong_poses_is_refused() -> None:
+    rig = board_rig(7)
+    for row in (1, 4, 6, 9):
+        rig = misread(rig, row, 15.0 + row)
+    fit = calibrate_on_board(rig.looks, rig.camera)
+    assert isinstance(fit, FitFailure)
+    assert "4 of 12 looks contradict the others (1.png, 4.png, 6.png, 9.png ...)" in fit.reason
+
+
+def test_wrong_poses_do_not_hide_each_other() -> None:
+    fit = solved(misread(misread(misread(board_rig(7), 1, 9.0), 4, 10.0), 9, 11.0))
+    assert [source for source, _ in fit.not_used] == ["1.png", "4.png", "9.png"]
+    assert fit.calibration.arm_noise.position_mm < 0.3
+
+
+def test_a_target_of_another_size_is_refused_and_told() -> None:
+    fit = calibrate_on_board(board_rig(8, scale=1.03).looks, board_rig(8).camera)
+    assert isinstance(fit, FitFailure)
+    asked = float(fit.reason.split("a target of ")[1].split()[0])
+    assert asked == pytest.approx(1.03, abs=0.003)
+
+
+def test_turns_about_one_axis_are_refused() -> None:
+    fit = calibrate_on_board(board_rig(9, one_axis=True).looks, board_rig(9).camera)
+    assert isinstance(fit, FitFailure)
+    assert "about one axis only" in fit.reason
+    assert "two of its axes" in fit.remedy
+
+
+def test_three_postures_are_too_few() -> None:
+    rig = board_rig(10, 4)
+    assert isinstance(calibrate_on_board(rig.looks, rig.camera), BoardHandEyeFit)
+    fit = calibrate_on_board(rig.looks[:3], rig.camera)
+    assert isinstance(fit, FitFailure)
+    assert fit.reason.startswith("3 postures with the target and the arm's pose are too few")
+
+
+def _inverse(look: BoardLook) -> BoardLook:
+    pose = look.base_from_tool
+    return replace(
+        look, base_from_tool=Pose(pose.rotation.T, -pose.rotation.T @ pose.translation_mm)
+    )
+
+
+def _kuka_as_fanuc(look: BoardLook) -> BoardLook:
+    pose = look.base_from_tool
+    angles = euler_from_rotations(pose.rotation[None], "intrinsic-zyx")
+    read = rotations_from_euler(angles, "extrinsic-xyz")[0]
+    return replace(look, base_from_tool=Pose(read, pose.translation_mm))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [(_inverse, "as tool_from_base"), (_kuka_as_fanuc, "as intrinsic-zyx")],
+)
+def test_poses_that_mean_something_else_are_recognised(change, said: str) -> None:  # type: ignore[no-untyped-def]
+    rig = board_rig(11, arm_mm=0.3)
+    looks = [change(look) for look in rig.looks]
+    failure = calibrate_on_board(looks, rig.camera)
+    assert isinstance(failure, FitFailure)
+    told = better_reading(looks, failure)
+    assert said in told.reason
+    assert "they agree within" in told.reason
+    assert told.remedy != failure.remedy
+
+
+def test_nothing_is_told_of_poses_that_fit_in_no_way() -> None:
+    rig = board_rig(12)
+    mixed = [
+        replace(look, base_from_tool=other.base_from_tool)
+        for look, other in zip(rig.looks, rig.looks[5:] + rig.looks[:5], strict=True)
+    ]
+    failure = calibrate_on_board(mixed, rig.camera)
+    assert isinstance(failure, FitFailure)
+    assert better_reading(mixed, failure) == failure
+
+
+def test_a_given_scatter_is_taken_and_tested() -> None:
+    rig = board_rig(13, arm_mm=0.1, lever_mm=100.0)
+    given = HandEyeOptions(arm_position_mm=0.1, arm_rotation_rad=1e-3)
+    fit = calibrate_on_board(rig.looks, rig.camera, given)
+    assert isinstance(fit, BoardHandEyeFit)
+    assert fit.calibration.arm_noise.position_mm == 0.1
+    assert fit.calibration.diagnostics is not None
+    assert not fit.calibration.diagnostics.is_noise_estimated
+    assert 1e-3 < fit.calibration.diagnostics.chi2_probability < 0.999
+    tight = HandEyeOptions(arm_position_mm=0.02, arm_rotation_rad=1e-4)
+    wrong = calibrate_on_board(rig.looks, rig.camera, tight)
+    assert isinstance(wrong, BoardHandEyeFit)
+    assert wrong.calibration.diagnostics is not None
+    assert wrong.calibration.diagnostics.chi2_probability < 1e-6

@@ -30,16 +30,19 @@ height_px = {HEIGHT}
 """
 
 
-def draw_postures(folder: Path) -> None:
-    """The plate from several postures at rest; the poses are those of the images, exactly."""
+def draw_postures(folder: Path, *, of_target: bool = False) -> None:
+    """The plate from several postures at rest; the poses are those of the images, exactly.
+
+    ``of_target``: The target at rest in place of the plate, without laser.
+    """
     (folder / "images").mkdir(parents=True)
     exposures, samples = ["index,t_ns,camera,file,lasers,view"], [_ARM_HEADER]
     for k, (a, b, z) in enumerate(POSTURES):
-        image = draw(a, b, z, has_laser=True, is_plain=True)
+        image = draw(a, b, z, has_laser=not of_target, is_plain=not of_target)
         cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
         time = 10**9 * (k + 1)
-        exposures.append(f"{k},{time},0,images/{k}.png,A,p{k}")
-        rotation, place = base_from_tool(a, b, z, k)
+        exposures.append(f"{k},{time},0,images/{k}.png,{'' if of_target else 'A'},p{k}")
+        rotation, place = base_from_tool(a, b, z, 0 if of_target else k)
         numbers = ",".join(f"{value!r}" for value in [*place.tolist(), *rotation.ravel().tolist()])
         samples += [f"{time + shift},{numbers}" for shift in (-(10**7), 10**7)]
     (folder / "session.toml").write_text(SESSION)

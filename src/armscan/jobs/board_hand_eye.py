@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from armscan.calibration.hand_eye.board_looks import BoardLook, better_reading, board_poses
+from armscan.calibration.hand_eye.board_looks import BoardLook, board_poses
 from armscan.calibration.hand_eye.board_result import BoardHandEyeFit
 from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.on_board import (
-    LEAST_LOOKS,
     MAX_LOOKS,
     calibrate_on_board,
 )
@@ -178,7 +177,7 @@ def calibrate_hand_eye_on_board(
             TITLE, tried_targets(found.views, (*found.not_found, *unclear), sources), by_source,
             provenance, warnings=views.warnings, is_simulated=views.is_simulated,
         )  # fmt: skip
-        job.refuse(page, _explained(fit, found, looks))
+        job.refuse(page, _explained(fit, found))
     fit = replace(fit, not_used=(*not_used, *fit.not_used))
     warnings = (*views.warnings, *fit.warnings)
     provenance = job.provenance(
@@ -285,12 +284,11 @@ def _looks(
     return looks, tuple(unclear)
 
 
-def _explained(failure: FitFailure, found: FoundTargets, looks: Sequence[BoardLook]) -> FitFailure:
-    """A failure with what may be its cause: no target, or poses that mean something else."""
+def _explained(failure: FitFailure, found: FoundTargets) -> FitFailure:
+    """A failure with what may be its cause: no target in some views, or one of another count."""
     if found.wrong_count is not None:
         return found.wrong_count
-    failure = FitFailure(failure.reason + found.not_found_text(), failure.remedy)
-    return better_reading(looks, failure) if len(looks) >= LEAST_LOOKS else failure
+    return FitFailure(failure.reason + found.not_found_text(), failure.remedy)
 
 
 def _summary(

@@ -89,6 +89,7 @@ def board_quantities(fit: BoardHandEyeFit) -> tuple[Quantity, ...]:
             fit.asked.sigma,
             meaning="times the stated one",
         ),
+        Quantity("target_scale_sigma", "", fit.asked.sigma),
         Quantity("n_not_used", "Views not used", len(fit.not_used)),
     )
 

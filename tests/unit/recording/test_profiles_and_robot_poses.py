@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from armscan.errors import FileFormatError
+from armscan.geometry.rotations import EulerConvention
 from armscan.storage.points import read_profiles
 from armscan.storage.recordings.robot_poses import read_robot_poses
 from rigs.photographs import DATA, needs
@@ -84,6 +86,49 @@ def test_robot_poses_of_every_form(tmp_path: Path, text: str) -> None:
     np.testing.assert_allclose(poses[1].rotation @ [1, 0, 0], [0, 1, 0], atol=1e-15)
 
 
+def printed(rows: np.ndarray) -> str:
+    return "\n".join(" ".join(f"{value:.7f}" for value in row) for row in rows)
+
+
+TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
+PLACE = np.array([10.0, 20.0, 1000.0])
+MATRIX = np.column_stack([TURN.as_matrix(), PLACE])
+WHOLE = np.vstack([MATRIX, [0.0, 0.0, 0.0, 1.0]])
+X, Y, Z, W = TURN.as_quat()
+ANGLES = np.degrees(TURN.as_euler("xyz"))
+VECTOR = TURN.as_rotvec()
+METRES = PLACE / 1000.0
+
+
+def table(header: str, *row: object) -> str:
+    return header + "\n" + printed(np.array([np.hstack(row)] * 2))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("text", "convention"),
+    [
+        (table("", MATRIX.ravel()), "intrinsic-xyz"),
+        (table("", WHOLE.ravel()), "intrinsic-xyz"),
+        (printed(np.vstack([MATRIX, MATRIX])), "intrinsic-xyz"),
+        (printed(np.vstack([WHOLE, WHOLE])), "intrinsic-xyz"),
+        (f"[{WHOLE.tolist()}, {WHOLE.ravel().tolist()}]", "intrinsic-xyz"),
+        (table("x,y,z,qw,qx,qy,qz", PLACE, W, X, Y, Z), "intrinsic-xyz"),
+        (table("x_mm y_mm z_mm qx qy qz qw", PLACE, X, Y, Z, W), "intrinsic-xyz"),
+        (table("x [m],y [m],z [m],qx,qy,qz,qw", METRES, X, Y, Z, W), "intrinsic-xyz"),
+        (table("x_m,y_m,z_m,a_deg,b_deg,c_deg", METRES, ANGLES), "extrinsic-xyz"),
+        (table("", PLACE, ANGLES), "extrinsic-xyz"),
+        (table("x,y,z,a_rad,b_rad,c_rad", PLACE, np.radians(ANGLES)), "extrinsic-xyz"),
+        (table("", PLACE, ANGLES[::-1]), "intrinsic-zyx"),
+        (table("", PLACE, VECTOR), "rotation-vector"),
+        (table("x,y,z,rx_deg,ry_deg,rz_deg", PLACE, np.degrees(VECTOR)), "rotation-vector"),
+    ],
+)
+def test_poses_as_robots_write_them(tmp_path: Path, text: str, convention: EulerConvention) -> None:
+    for pose in read_robot_poses(written(tmp_path, "poses", text), convention):
+        np.testing.assert_allclose(pose.translation_mm, PLACE, atol=1e-3)
+        np.testing.assert_allclose(pose.rotation, TURN.as_matrix(), atol=1e-6)
+
+
 def test_the_convention_decides_what_the_angles_mean(tmp_path: Path) -> None:
     """W = P = 90 deg: R = Ry Rx sends x to -z, R = Rx Ry sends it to y."""
     path = written(tmp_path, "poses", "0 0 500 90 90 0\n")
@@ -101,6 +146,11 @@ def test_the_convention_decides_what_the_angles_mean(tmp_path: Path) -> None:
         ('{"RobPoses": [[1, 2, 3, 4, 5, null]]}', "pose 1: a pose is not six numbers"),
         ('{"Poses": []}', "no list called RobPoses"),
         ("# nothing\n", "no pose"),
+        (f"x,y,z,qw,qx,qy,qz\n{ROW}\n", "a pose is not seven numbers"),
+        ("x,y,z,qw,qx,qy,qz\n0 0 500 1 1 0 0\n", "norm is 1.4142136"),
+        ("1 0 0 5\n0 1 0 5\n", "2 lines of four numbers are no matrices"),
+        ("1 0 0 5 0 1 0 5 0 0 -1 500\n", "mirrors"),
+        ("1 0 0 5 0 1 0 5 0 0 1 500 0 0 0 2\n", "last row of a 4 x 4 matrix"),
         ("0 0 90 1300 500 200\n", "an angle of 1300 deg"),
         ("1.3 0 .5 0 0 0\n1.2 0 .5 20 0 0\n1.2 .1 .5 0 20 0\n", "look like metres"),
     ],

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from armscan.calibration.cameras.start import estimate_board_poses
 from armscan.calibration.hand_eye.alternatives import other_readings
+from armscan.calibration.hand_eye.estimate import LEVER_MM
 from armscan.calibration.sheets.board_points import BoardBow, dpose_dcamera
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, floats
 from armscan.geometry.estimate import FitFailure
@@ -152,6 +153,11 @@ class BoardStart:
     def typical_mm(self) -> float:
         """Median over the looks."""
         return float(np.median(self.off_mm))
+
+    @property
+    def typical_at_lever_mm(self) -> float:
+        """Both together, turns counted at 100 mm."""
+        return self.typical_mm + LEVER_MM * self.typical_rad
 
     @property
     def is_suspect(self) -> BoolArray:
@@ -381,13 +387,13 @@ MUCH_BETTER = 0.2
 TRIPLES_OF_READING = 60
 
 
-def better_reading(looks: Sequence[BoardLook], failure: FitFailure) -> FitFailure:
-    """A failure that tells of another reading of the arm's poses, if it makes the looks agree.
+def better_reading(looks: Sequence[BoardLook], fact: str) -> FitFailure | None:
+    """Refuse in favour of another way to read the arm's poses, if it makes the looks agree.
 
-    Convention, direction, unit and order are tried.
+    Convention, direction, unit and order are tried. ``fact`` says what is wrong as they are read.
     """
-    given = find_board_start(looks)
-    least_rad = np.inf if isinstance(given, FitFailure) else MUCH_BETTER * given.typical_rad
+    given, found = find_board_start(looks), None
+    least_mm = np.inf if isinstance(given, FitFailure) else MUCH_BETTER * given.typical_at_lever_mm
     rotations = np.array([look.base_from_tool.rotation for look in looks])
     translations = np.array([look.base_from_tool.translation_mm for look in looks])
     for words, remedy, turns, shifts in other_readings(rotations, translations):
@@ -398,12 +404,11 @@ def better_reading(looks: Sequence[BoardLook], failure: FitFailure) -> FitFailur
         start = find_board_start(read, TRIPLES_OF_READING)
         if isinstance(start, FitFailure) or isinstance(refuse_far(start, read), FitFailure):
             continue
-        if start.typical_rad < least_rad:
-            least_rad = start.typical_rad
-            failure = FitFailure(
-                f"{failure.reason.partition(' (read otherwise')[0]} (read otherwise: {words}, they "
-                f"agree within {start.typical_mm:.1f} mm and "
-                f"{np.degrees(start.typical_rad):.2f} degrees, medians)",
+        if start.typical_at_lever_mm < least_mm:
+            least_mm = start.typical_at_lever_mm
+            found = FitFailure(
+                f"{fact}; {words} would leave {start.typical_mm:.2f} mm and "
+                f"{np.degrees(start.typical_rad):.2f} degrees (medians)",
                 remedy,
             )
-    return failure
+    return found

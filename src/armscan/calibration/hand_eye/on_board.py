@@ -24,6 +24,7 @@ from armscan.calibration.hand_eye.board_looks import (
     BoardLook,
     BoardPose,
     BoardStart,
+    better_reading,
     find_board_start,
     middle_of,
     refuse_far,
@@ -62,6 +63,7 @@ from armscan.geometry.least_squares import Whitening, square_root
 from armscan.geometry.poses import Base, Board, Pose, Sensor, Tool
 from armscan.geometry.rotations import skew
 from armscan.models.calibration import (
+    ArmNoise,
     CameraCalibration,
     HandEyeCalibration,
     HandEyeDiagnostics,
@@ -113,21 +115,39 @@ def calibrate_on_board(
     notes: tuple[str, ...] = ()
     if len(used) < len(looks):
         notes = (f"{len(used)} of {len(looks)} looks at the target were used, evenly spread",)
-    start = find_board_start(used)
+    found = _calibrated(used, camera, options, bow)
+    if isinstance(found, FitFailure):
+        better = better_reading(used, found.reason)
+        return found if better is None else better
+    if found.not_used or is_wide(found.calibration.arm_noise):
+        better = better_reading(used, "the arm's poses and the views hardly agree")
+        if better is not None:
+            return better
+    return replace(found, warnings=(*notes, *found.warnings))
+
+
+def _calibrated(
+    looks: Sequence[BoardLook],
+    camera: CameraCalibration,
+    options: HandEyeOptions,
+    bow: BoardBow | None,
+) -> BoardHandEyeFit | FitFailure:
+    """The hand-eye of poses that mean what they are read as."""
+    start = find_board_start(looks)
     if isinstance(start, FitFailure):
         return start
-    refused = refuse_far(start, used)
+    refused = refuse_far(start, looks)
     if refused is not None:
         return refused
     # A scatter that was given does not make looks wrong: which are, the others' own scatter says.
-    problem = _Problem.of(used, start, camera, HandEyeOptions(), bow)
+    problem = _Problem.of(looks, start, camera, HandEyeOptions(), bow)
     wrong = _find_wrong(problem, start.is_suspect)
     if isinstance(wrong, FitFailure):
         return wrong
     solution = _solve(replace(problem.without(list(wrong)), options=options))
     if isinstance(solution, FitFailure):
         return solution
-    return _evidence(solution, tuple(wrong.values()), notes)
+    return _evidence(solution, tuple(wrong.values()))
 
 
 def _refuse_few(looks: Sequence[BoardLook]) -> FitFailure | None:
@@ -445,7 +465,7 @@ def _middle_off_mm(problem: _Problem, row: int) -> float:
 
 
 def _evidence(
-    solution: _Solution, not_used: tuple[tuple[str, str], ...], notes: tuple[str, ...]
+    solution: _Solution, not_used: tuple[tuple[str, str], ...]
 ) -> BoardHandEyeFit | FitFailure:
     """The result with what it rests on, or why it cannot be trusted."""
     system, problem = solution.system, solution.system.problem
@@ -487,7 +507,6 @@ def _evidence(
     )
     names = [pose.view.source for pose in problem.chosen]
     warnings = (
-        *notes,
         *(f"{source} {reason}" for source, reason in not_used),
         *conditioning_warnings(conditioning.under(covariance), len(problem.looks), ""),
         *influence_warnings(names, left, own),
@@ -618,14 +637,18 @@ def _asked_scale(solution: _Solution) -> AskedScale:
 LARGE_ARM_MM, LARGE_ARM_RAD = 0.5, np.radians(0.2)
 
 
+def is_wide(noise: ArmNoise) -> bool:
+    """Whether an arm scatters more than robots do."""
+    turn_rad = float(np.hypot(noise.rotation_rad, noise.tool_rotation_rad))
+    return noise.position_mm > LARGE_ARM_MM or turn_rad > LARGE_ARM_RAD
+
+
 def _scatter_warnings(solution: _Solution) -> tuple[str, ...]:
     """Warn of an arm that scatters more than robots do, and of a solution that had not settled."""
     found = []
     noise = arm_noise(solution.components, solution.noise.sigmas)
     turn_rad = float(np.hypot(noise.rotation_rad, noise.tool_rotation_rad))
-    if solution.components[0].is_estimated and (
-        noise.position_mm > LARGE_ARM_MM or turn_rad > LARGE_ARM_RAD
-    ):
+    if solution.components[0].is_estimated and is_wide(noise):
         found.append(
             f"the arm's poses seem to scatter by {noise.position_mm:.2f} mm and "
             f"{np.degrees(turn_rad):.2f} degrees an axis: much even for a robot; a base or target "

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hand-eye before a target on the command line: recording, photographs with a table, bad input."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.cli.run import main
+from armscan.storage.documents import read_camera_calibration, read_scanner_calibration
+from rigs.drawn_arm import POSTURES, ROTATION, TRANSLATION_MM, base_from_tool, draw_postures
+from rigs.drawn_bench import TARGET, Bench
+
+Fails = Callable[..., str]
+SIGMAS = 5.0
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("target") / "scan"
+    draw_postures(folder, of_target=True)
+    return folder
+
+
+@pytest.fixture
+def poses(tmp_path: Path) -> Path:
+    rows = [np.column_stack(base_from_tool(a, b, z, 0)) for a, b, z in POSTURES]
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join(" ".join(map(repr, row.ravel().tolist())) for row in rows))
+    return path
+
+
+def words_of(*words: object) -> list[str]:
+    return ["calibrate", "hand-eye-target", "--target", TARGET, *map(str, words)]
+
+
+def test_a_recording_makes_a_scanner(
+    calibrated: Bench, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "scanner.json"
+    words = words_of("--scan", scan, "--sensor", calibrated.sensor, "-o", output, "--json")
+    assert main(words) == 0
+    told = json.loads(capsys.readouterr().out)
+    scanner = read_scanner_calibration(output)
+    pose, sigma = scanner.hand_eye.tool_from_sensor, np.sqrt(np.diag(scanner.covariance)[-6:])
+    off = pose.translation_mm - TRANSLATION_MM
+    assert (np.abs(off) < SIGMAS * sigma[3:]).all()
+    assert sigma[3:].max() < 2.0
+    assert np.abs(pose.rotation - ROTATION).max() < SIGMAS * sigma[:3].max()
+    assert scanner.sensor is not None
+    assert told["method"] == "board"
+    assert told["n_postures"] == len(POSTURES) == len(told["postures"])
+    assert told["rms_px"] < 0.2
+    assert told["target_scale"] == pytest.approx(1.0, abs=5.0 * told["target_scale_sigma"])
+    page = output.with_suffix(".html").read_text()
+    assert "from 8 views of a target at rest" in page
+
+
+def test_photographs_with_a_table_give_the_same_beside_the_camera_as_given(
+    calibrated: Bench, scan: Path, poses: Path, tmp_path: Path
+) -> None:
+    """With the sensor, camera and hand-eye move together; without one, the camera stays."""
+    both, alone = tmp_path / "both.json", tmp_path / "alone.json"
+    images = scan / "images"
+    assert main(words_of(images, "--poses", poses, "--sensor", calibrated.sensor, "-o", both)) == 0
+    assert main(words_of(images, "--poses", poses, "--camera", calibrated.camera, "-o", alone)) == 0
+    scanner, hand_eye = read_scanner_calibration(both), read_scanner_calibration(alone).hand_eye
+    assert scanner.sensor is not None
+    follow = scanner.hand_eye.dhand_eye_dsensor
+    assert follow is not None
+    given = read_camera_calibration(calibrated.camera).camera.parameters
+    step = scanner.sensor.camera.camera.parameters - given
+    assert np.abs(step).max() > 0.0
+    back = scanner.hand_eye.tool_from_sensor.retract(-follow[:, : len(step)] @ step)
+    np.testing.assert_allclose(back.matrix, hand_eye.tool_from_sensor.matrix, atol=1e-9)
+    assert (np.diag(hand_eye.covariance) >= np.diag(scanner.covariance)[-6:] * 0.999).all()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["IMAGES", "--camera", "CAMERA"], "photographs and poses belong together"),
+        (["IMAGES", "--poses", "POSES"], "need one calibration of the camera"),
+        (["--camera", "CAMERA"], "nothing to calibrate from"),
+        (["IMAGES", "--poses", "POSES", "--scan", "SCAN", "--camera", "CAMERA"], "do not mix"),
+        (["IMAGES/[0-5].png", "--poses", "POSES", "--camera", "CAMERA"], "6 photographs but 8"),
+        (
+            ["IMAGES", "--poses", "POSES", "--camera", "CAMERA", "--leave-out", "[0-4].png"],
+            "3 postures with the target",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_refused(
+    calibrated: Bench, scan: Path, poses: Path, tmp_path: Path, fails: Fails,
+    words: list[str], said: str,
+) -> None:  # fmt: skip
+    names = {"IMAGES": str(scan / "images"), "CAMERA": str(calibrated.camera)}
+    names |= {"POSES": str(poses), "SCAN": str(scan)}
+    output = tmp_path / "no.json"
+    given = [word.replace("IMAGES", names["IMAGES"]) for word in words]
+    assert said in fails(*words_of(*(names.get(word, word) for word in given), "-o", output))
+    assert not output.exists()
+
+
+def test_inverse_poses_are_refused_by_name(
+    calibrated: Bench, scan: Path, poses: Path, tmp_path: Path, fails: Fails
+) -> None:
+    matrices = np.loadtxt(poses).reshape(-1, 3, 4)
+    turned = matrices[:, :, :3].transpose(0, 2, 1)
+    places = -np.einsum("nij,nj->ni", turned, matrices[:, :, 3])
+    np.savetxt(poses, np.concatenate([turned, places[:, :, None]], axis=2).reshape(-1, 12))
+    output = tmp_path / "no.json"
+    words = words_of(scan / "images", "--poses", poses, "--camera", calibrated.camera)
+    message = fails(*words, "-o", output)
+    assert "taking the poses as tool_from_base" in message
+    assert "no.refused.html shows what was found" in message
+    assert (tmp_path / "no.refused.html").exists()
+    assert not output.exists()

@@ -421,13 +421,16 @@ class _Blocks:
         parts = tuple(np.ascontiguousarray(covariance[np.ix_(rows, rows)]) for rows in groups)
         return _Blocks(tuple(_as_slice(rows) for rows in groups), parts)
 
-    def times(self, values: FloatArray) -> FloatArray:
-        """Covariance times (M,) or (M, N) values."""
+    def times(self, values: FloatArray, product: FloatArray | None = None) -> FloatArray:
+        """Covariance times (M,) or (M, N) values, into ``product`` if there is one."""
+        product = np.zeros_like(values) if product is None else product
         if self.diagonal is not None:
-            return np.asarray((values.T * self.diagonal).T)
-        product = np.zeros_like(values)
+            np.multiply(values.T, self.diagonal, out=product.T)
         for rows, part in zip(self.rows, self.parts, strict=True):
-            product[rows] = part @ values[rows]
+            if isinstance(rows, slice):
+                np.matmul(part, values[rows], out=product[rows])
+            else:
+                product[rows] = part @ values[rows]
         return product
 
     def add_to(self, total: FloatArray, factor: float) -> None:
@@ -522,7 +525,9 @@ class _Posterior:
         projected = _projected(solved)[0]
         explained = _transposed_solve(solved.lower, solved.left)
         variances = self.sigmas(logs)[self.free] ** 2
-        products = np.stack([block.times(projected) for block in self.blocks])
+        products = np.zeros((len(self.blocks), *projected.shape))
+        for block, product in zip(self.blocks, products, strict=True):
+            block.times(projected, product)
         traces = np.einsum("kii->k", products)
         sizes = np.array([float(explained @ block.times(explained)) for block in self.blocks])
         turned = np.ascontiguousarray(products.transpose(0, 2, 1))

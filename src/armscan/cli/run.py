@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import signal
@@ -68,6 +69,9 @@ def _may_be_written(folder: Path) -> bool:
         return False
 
 
+YOUNG_OBJECTS = 20_000
+"""So many more, and cycles are looked for: imports and pages make few. At Python's 700 it took a
+twentieth of a calibration."""
 USAGE_ERROR = cast(type[Exception], typer.BadParameter.__bases__[0])
 EXIT_INPUT = 2
 EXIT_BUG = 70
@@ -114,6 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments
         Words after ``armscan``; those of the process if None.
     """
+    gc.set_threshold(YOUNG_OBJECTS)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     give_kernels_a_folder(Path(__file__).parents[1])
     if isinstance(sys.stdout, io.TextIOWrapper):

@@ -18,7 +18,7 @@ from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import SensorCalibration
-from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
+from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants, check_poses
 from armscan.pipeline.measure import (
     MeasureOptions,
     cameras_of,
@@ -27,7 +27,6 @@ from armscan.pipeline.measure import (
     summarised,
 )
 from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.scan import check_poses
 from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.reconstruction.place import delivered_points
 from armscan.reconstruction.points import MeasuredProfile, points_again

@@ -13,11 +13,11 @@ from scipy.ndimage import grey_opening
 from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError, InputError
 from armscan.geometry.arrays import BoolArray, FloatArray
-from armscan.geometry.poses import Base, Pose, Sensor
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.camera import CameraModel
 from armscan.pipeline.progress import Progress, ProgressEvent, StageClock
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile
+from armscan.records.profile import PointProfile, Profile
 from armscan.records.recording import ExposureRow
 
 ExposurePair = tuple[Exposure, Exposure | None]
@@ -509,3 +509,12 @@ class ScanInstants:
         if camera not in self._dark or self._dark[camera][0] != dark_row:
             self._dark[camera] = (dark_row, self._source.exposure(dark_row))
         return exposure, self._dark[camera][1]
+
+
+def check_poses(profiles: Sequence[PointProfile], poses: Sequence[Pose[Base, Tool]]) -> None:
+    """Raise `InputError` unless there is one pose for each profile."""
+    if len(profiles) != len(poses):
+        raise InputError(
+            f"{len(profiles)} profiles but {len(poses)} poses",
+            remedy="give one pose for each profile, in the same order",
+        )

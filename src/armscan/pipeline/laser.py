@@ -40,8 +40,9 @@ from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration, LaserColour, SensorCalibration
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, check_sizes
+from armscan.pipeline.measure import cached_profile
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.targets import cached_profile, cached_target, wrong_count
+from armscan.pipeline.targets import cached_target, wrong_count
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.storage.detection_cache import DetectionCache

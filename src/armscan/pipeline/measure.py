@@ -29,7 +29,6 @@ from armscan.pipeline.instants import (
     pair_exposures,
 )
 from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
-from armscan.pipeline.targets import cached_profile
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.label_stereo import StereoLabeller
 from armscan.reconstruction.labels import (
@@ -51,8 +50,9 @@ from armscan.reconstruction.triangulate import (
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
-from armscan.storage.detection_cache import DetectionCache
+from armscan.storage.detection_cache import DetectionCache, detection_key
 from armscan.thesis.row_rule import RowLabeller
+from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
 
 STAGE = "reconstruct"
@@ -284,6 +284,25 @@ def stripes_for(sensor: SensorCalibration, options: StripeOptions) -> StripeOpti
     if options.laser_colour != "auto":
         return options
     return replace(options, laser_colour=cast(LaserColour, sensor.laser_colour))
+
+
+def cached_profile(
+    exposure: Exposure,
+    options: StripeOptions | None = None,
+    background: Exposure | None = None,
+    cache: DetectionCache | None = None,
+) -> Profile:
+    """As `extract_stripes`; looks only if the cache does not know. None for no cache."""
+    chosen = StripeOptions() if options is None else options
+    if cache is None:
+        return extract_stripes(exposure, chosen, background)
+    key = detection_key("stripes", exposure, (chosen,), background)
+    found = cache.get(key)
+    if isinstance(found, Profile):
+        return found
+    looked = extract_stripes(exposure, chosen, background)
+    cache.put(key, looked)
+    return looked
 
 
 def stripes_as_seen(

@@ -20,7 +20,13 @@ from armscan.fusion.scan_normals import ScanNormals, choose_scan_radius_mm
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
-from armscan.pipeline.instants import PARTNER_MISSING, Instant, InstantImages, ScanInstants
+from armscan.pipeline.instants import (
+    PARTNER_MISSING,
+    Instant,
+    InstantImages,
+    ScanInstants,
+    check_poses,
+)
 from armscan.pipeline.measure import (
     PLACING,
     MeasureOptions,
@@ -577,15 +583,6 @@ def _normals_warning(share: float, radius_mm: float) -> tuple[str, ...]:
         f"{100.0 * share:.0f} % of the points have no normal: within {radius_mm:.1f} mm "
         "they lie on single lines, or on no plane",
     )
-
-
-def check_poses(profiles: Sequence[PointProfile], poses: Sequence[Pose[Base, Tool]]) -> None:
-    """Raise `InputError` unless there is one pose for each profile."""
-    if len(profiles) != len(poses):
-        raise InputError(
-            f"{len(profiles)} profiles but {len(poses)} poses",
-            remedy="give one pose for each profile, in the same order",
-        )
 
 
 def place_profiles(

@@ -15,10 +15,7 @@ import numpy as np
 from armscan.geometry.estimate import FitFailure
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile
 from armscan.storage.detection_cache import DetectionCache, detection_key
-from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import StripeOptions
 from armscan.vision.targets.detect import detect_target, settle_target
 from armscan.vision.targets.target import (
     Charuco,
@@ -40,25 +37,6 @@ def cached_target(
     if isinstance(found, TargetView | FitFailure):
         return found
     looked = detect_target(exposure, target)
-    cache.put(key, looked)
-    return looked
-
-
-def cached_profile(
-    exposure: Exposure,
-    options: StripeOptions | None = None,
-    background: Exposure | None = None,
-    cache: DetectionCache | None = None,
-) -> Profile:
-    """As `extract_stripes`; looks only if the cache does not know. None for no cache."""
-    chosen = StripeOptions() if options is None else options
-    if cache is None:
-        return extract_stripes(exposure, chosen, background)
-    key = detection_key("stripes", exposure, (chosen,), background)
-    found = cache.get(key)
-    if isinstance(found, Profile):
-        return found
-    looked = extract_stripes(exposure, chosen, background)
     cache.put(key, looked)
     return looked
 

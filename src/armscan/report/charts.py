@@ -77,8 +77,8 @@ def histogram_chart(
                 )  # fmt: skip
             else:
                 axes.hist(
-                    item.values, bins, color=item.colour, alpha=item.alpha, label=item.label,
-                    weights=item.counts,
+                    item.values, bins, histtype="stepfilled", color=item.colour, alpha=item.alpha,
+                    label=item.label, weights=item.counts,
                 )  # fmt: skip
         if curve is not None:
             axes.plot(curve[0], curve[1], color=INK, linewidth=1.2, label=curve[2])

@@ -73,6 +73,7 @@ EULER_NAMES = ("θ (about X)", "γ (about Y)", "φ (about Z)")
 SHORT_NAMES = ("rot X", "rot Y", "rot Z", "X", "Y", "Z")
 MAX_DOTS_OF_POSTURE = 400
 MAX_DOTS = 12_000
+MAX_DOTS_OF_MAP = 8_000
 FRUSTUM_SHARE = 0.3
 """Length of a drawn camera as a share of its distance from the points."""
 NOISE_TEXT = (
@@ -471,7 +472,7 @@ def _residual_map(fit: HandEyeFit, plate: Plane) -> Picture:
     local = (_points_mm(fit) - plate.point_mm) @ plate.axes[:2].T
     values = _residuals_um(fit)
     reach = max(float(np.percentile(np.abs(values), 98)), 1e-3)
-    step = max(1, len(values) // 20_000)
+    step = max(1, len(values) // MAX_DOTS_OF_MAP)
     with styled():
         figure = new_figure(6.0, 4.2)
         axes = figure.add_subplot()

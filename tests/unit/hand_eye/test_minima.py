@@ -25,6 +25,8 @@ from armscan.calibration.hand_eye.search import (
     many_placed,
     minima_on_plate,
     minima_on_sphere,
+    placed_on_plate,
+    plate_in_tool,
     rotations_all_over,
     unit_steps,
 )
@@ -144,12 +146,14 @@ def test_descents_over_points_of_their_own_are_those_made_one_by_one() -> None:
     surface, random = PlateSurface(plate), np.random.default_rng(5)
     rows = np.array([random.choice(len(observations), 18, replace=False) for _ in range(6)])
     points, stripe = observations.points_mm[rows], observations.stripe[rows]
-    poses = observations.rotations[stripe], observations.translations_mm[stripe]
+    normals, constants = (item[rows] for item in plate_in_tool(observations, plate.plane))
     starts, shifts = rotations_all_over(6), random.normal(0.0, 50.0, (6, 3))
     units = np.array([unit_steps(one, 3) for one in points])
-    together = descend_all(many_placed(points, *poses, surface), starts, shifts, 6, units)
+    place = placed_on_plate(points, normals, constants)
+    together = descend_all(place, starts, shifts, 6, units)
     for k in range(6):
-        place = many_placed(points[k], poses[0][k], poses[1][k], surface)
+        poses = observations.rotations[stripe[k]], observations.translations_mm[stripe[k]]
+        place = many_placed(points[k], *poses, surface)
         alone = descend_all(place, starts[k : k + 1], shifts[k : k + 1], 6, units[k])
         for many, one in zip(together, alone, strict=True):
             np.testing.assert_allclose(many[k], one[0], rtol=1e-9, atol=1e-9)

@@ -7,10 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import ndtri
 from scipy.stats import chi2
+from scipy.stats.qmc import Sobol
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.noise import NoiseComponent, estimate_noise, solve_linear
+from armscan.calibration.hand_eye.noise import (
+    N_DRAWS,
+    NoiseComponent,
+    _normal_draws,
+    estimate_noise,
+    solve_linear,
+)
 from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.surface import hand_eye_difference
@@ -183,3 +191,9 @@ def test_groups_of_observations_give_what_full_matrices_give(seed: int) -> None:
     sigmas, log_covariance = scored_densely(residual, slopes, components, np.zeros((n, n)))
     np.testing.assert_allclose(found.sigmas, sigmas, rtol=1e-9)
     np.testing.assert_allclose(found.log_covariance, log_covariance, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("n", range(1, 10))
+def test_draws_are_those_of_scrambled_sobol_points(n: int) -> None:
+    points = Sobol(n, rng=np.random.default_rng(0)).random(N_DRAWS)
+    np.testing.assert_array_equal(_normal_draws(n), ndtri(points))

@@ -14,8 +14,9 @@ import pytest
 
 import armscan
 from armscan.geometry.estimate import FitFailure
-from armscan.pipeline import targets
-from armscan.pipeline.targets import cached_profile, cached_target
+from armscan.pipeline import measure, targets
+from armscan.pipeline.measure import cached_profile
+from armscan.pipeline.targets import cached_target
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.storage import detection_cache
 from armscan.storage.detection_cache import SUFFIX, DetectionCache, detection_key
@@ -65,14 +66,14 @@ def assert_same(a: Any, b: Any) -> None:
 def looked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the images that were looked at."""
     names: list[str] = []
-    for function in ("detect_target", "extract_stripes"):
-        real = getattr(targets, function)
+    for module, function in ((targets, "detect_target"), (measure, "extract_stripes")):
+        real = getattr(module, function)
 
         def spy(exposure: Exposure, *rest: Any, real: Any = real) -> Any:
             names.append(exposure.source)
             return real(exposure, *rest)
 
-        monkeypatch.setattr(targets, function, spy)
+        monkeypatch.setattr(module, function, spy)
     return names
 
 

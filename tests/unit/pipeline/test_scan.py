@@ -14,7 +14,7 @@ from armscan.errors import EstimationError, InputError
 from armscan.fusion import point_spool
 from armscan.geometry.arrays import Box
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline import measure, targets
+from armscan.pipeline import measure
 from armscan.pipeline import scan as scan_module
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent, StageClock
@@ -214,7 +214,7 @@ def test_an_interrupted_scan_looks_at_each_image_once(
             raise KeyboardInterrupt
 
     whole = measure_scan(as_source(fake_scan(6)), device, options)
-    monkeypatch.setattr(targets, "extract_stripes", counted)
+    monkeypatch.setattr(measure, "extract_stripes", counted)
     cache, trimmed = DetectionCache(tmp_path / "kept"), []
     monkeypatch.setattr(DetectionCache, "trim", lambda *_: trimmed.append(len(looked)))
     with pytest.raises(KeyboardInterrupt):

@@ -77,6 +77,13 @@ MAX_LOG = 7.0
 """A standard deviation leaves its typical value by a factor of 1100 at most."""
 N_DRAWS = 128
 """Of the standard deviations, over which the covariance is integrated."""
+SOBOL_BITS = 30
+SOBOL_DIRECTIONS = (
+    (1, 1, 1, 1, 1, 1, 1), (1, 3, 5, 15, 17, 51, 85), (1, 3, 3, 9, 29, 23, 71),
+    (1, 3, 1, 5, 31, 29, 81), (1, 1, 1, 11, 31, 55, 61), (1, 1, 3, 3, 25, 9, 43),
+    (1, 3, 5, 13, 11, 37, 31), (1, 1, 5, 5, 17, 9, 9), (1, 1, 5, 5, 5, 53, 53),
+)  # fmt: skip
+"""Of as many dimensions as there are causes of scatter (Joe and Kuo 2008), for `N_DRAWS` draws."""
 INFLATION = 1.5
 """They are drawn from a normal distribution that is so much wider in variance than the posterior
 is near its highest point."""
@@ -430,13 +437,16 @@ class _Blocks:
         parts = tuple(np.ascontiguousarray(covariance[np.ix_(rows, rows)]) for rows in groups)
         return _Blocks(tuple(_as_slice(rows) for rows in groups), parts)
 
-    def times(self, values: FloatArray) -> FloatArray:
-        """Covariance times (M,) or (M, N) values."""
+    def times(self, values: FloatArray, product: FloatArray | None = None) -> FloatArray:
+        """Covariance times (M,) or (M, N) values, into ``product`` if there is one."""
+        product = np.zeros_like(values) if product is None else product
         if self.diagonal is not None:
-            return np.asarray((values.T * self.diagonal).T)
-        product = np.zeros_like(values)
+            np.multiply(values.T, self.diagonal, out=product.T)
         for rows, part in zip(self.rows, self.parts, strict=True):
-            product[rows] = part @ values[rows]
+            if isinstance(rows, slice):
+                np.matmul(part, values[rows], out=product[rows])
+            else:
+                product[rows] = part @ values[rows]
         return product
 
     def add_to(self, total: FloatArray, factor: float) -> None:
@@ -531,7 +541,9 @@ class _Posterior:
         projected = _projected(solved)[0]
         explained = _transposed_solve(solved.lower, solved.left)
         variances = self.sigmas(logs)[self.free] ** 2
-        products = np.stack([block.times(projected) for block in self.blocks])
+        products = np.zeros((len(self.blocks), *projected.shape))
+        for block, product in zip(self.blocks, products, strict=True):
+            block.times(projected, product)
         traces = np.einsum("kii->k", products)
         sizes = np.array([float(explained @ block.times(explained)) for block in self.blocks])
         turned = np.ascontiguousarray(products.transpose(0, 2, 1))
@@ -663,11 +675,22 @@ def covariance_over_noise(
 
 @cache
 def _normal_draws(n: int) -> FloatArray:
-    """(N_DRAWS, n) evenly spread draws of a standard normal distribution."""
-    from scipy.stats.qmc import Sobol  # half a second that other commands need not wait for
+    """(N_DRAWS, n) evenly spread draws of a standard normal distribution.
 
-    sobol = Sobol(n, rng=np.random.default_rng(0))
-    return np.asarray(ndtri(sobol.random(N_DRAWS)))
+    Sobol's sequence, scrambled, to the last bit as ``scipy.stats.qmc.Sobol`` has it, whose import
+    takes longer than the draws' use. Digits are binary, the highest first.
+    """
+    random, number = np.random.default_rng(0).spawn(1)[0], np.arange(N_DRAWS)
+    shift = random.integers(2, size=(n, SOBOL_BITS), dtype=np.uint32)[:, None, ::-1]
+    mixing = random.integers(2, size=(n, SOBOL_BITS, SOBOL_BITS), dtype=np.uint32)
+    mixing = np.tril(mixing, -1) + np.eye(SOBOL_BITS, dtype=np.uint32)
+    place = np.arange(SOBOL_BITS)
+    directions = np.array(SOBOL_DIRECTIONS[:n])
+    column = np.arange(directions.shape[1])
+    digits = (directions[:, :, None] << place) >> column[:, None] & 1
+    chosen = ((number ^ number >> 1)[:, None] >> column) & 1
+    mixed = (chosen @ digits @ mixing.transpose(0, 2, 1) + shift) % 2
+    return np.asarray(ndtri((mixed @ 0.5 ** (place + 1.0)).T))
 
 
 def _region_factor(mixed: FloatArray, parts: FloatArray, share: FloatArray) -> float:

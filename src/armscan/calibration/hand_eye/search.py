@@ -60,6 +60,14 @@ POINTS_OF_SECTION = 7
 OPEN_RATIO = 1e-4
 """Singular values of the linear equations below this part of the largest are taken as zero."""
 
+STILL = 1e-9
+"""A step that moves residuals by less than about so many mm is none."""
+_TURNS = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
+     [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], dtype=np.float64,
+)  # fmt: skip
+"""(3, 3, 3) derivative of a rotation at none, by its vector."""
+
 ManyPlaced = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 """From K rotations (K, 3, 3) and K further unknowns (K, U) to residuals (K, N) and their
 derivatives (K, N, 3 + U) by a turn on the left and by these unknowns: shift, then surface."""
@@ -91,9 +99,9 @@ def many_placed(
     Parameters
     ----------
     points_mm
-        (N, 3) in the Sensor frame, or (K, N, 3) of each of the K states its own.
+        (N, 3) in the Sensor frame.
     rotations, translations_mm
-        (N, 3, 3) and (N, 3) ``base_from_tool`` of each, or (K, N, 3, 3) and (K, N, 3).
+        (N, 3, 3) and (N, 3) ``base_from_tool`` of each.
     surface
         Its first parameters are unknown, as many as there are further unknowns.
     """
@@ -101,15 +109,47 @@ def many_placed(
     def place(turns: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
         turned = points_mm @ turns.transpose(0, 2, 1)
         in_tool = turned + others[:, None, :3]
-        base = np.einsum("...nij,...nj->...ni", rotations, in_tool) + translations_mm
+        base = np.einsum("nij,knj->kni", rotations, in_tool) + translations_mm
         n_free = others.shape[1] - 3
         held = np.broadcast_to(surface.start[n_free:], (len(turns), len(surface.start) - n_free))
         parameters = np.concatenate([others[:, 3:], held], axis=1)
         residual, normals, by_surface = surface.distance(base, parameters)
-        in_tool_normals = np.einsum("...nij,...ni->...nj", rotations, normals)
+        in_tool_normals = np.einsum("nij,kni->knj", rotations, normals)
         by_turn = np.cross(turned, in_tool_normals)
         return residual, np.concatenate(
             [by_turn, in_tool_normals, by_surface[..., :n_free]], axis=2
+        )
+
+    return place
+
+
+def placed_on_plate(
+    points_mm: FloatArray, normals: FloatArray, constants: FloatArray
+) -> ManyPlaced:
+    """As `many_placed` on a plate, for less: sums of squares are those of the distances.
+
+    A distance is linear in the 12 entries of rotation and shift. However many there are, 13
+    combinations of them, the rows of a QR factor, have their sum of squares for every state.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3) in the Sensor frame, or (K, N, 3) of each of the K states its own.
+    normals, constants
+        (N, 3) and (N,) of the plate in Tool (`plate_in_tool`), or (K, N, 3) and (K, N).
+    """
+    rows = (normals[..., :, None] * points_mm[..., None, :]).reshape(*points_mm.shape[:-1], 9)
+    table = np.concatenate([rows, normals, constants[..., None]], axis=-1)
+    factor = np.asarray(np.linalg.qr(table, mode="r"))
+    by_rotation, by_shift = factor[..., :9], factor[..., 9:12]
+
+    def place(turns: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
+        entries = np.concatenate([turns.reshape(-1, 9), others, np.ones((len(turns), 1))], axis=1)
+        turned = np.einsum("aij,kjl->kila", _TURNS, turns).reshape(-1, 9, 3)
+        by_turn = by_rotation @ turned
+        return (
+            (factor @ entries[:, :, None])[..., 0],
+            np.concatenate([by_turn, np.broadcast_to(by_shift, by_turn.shape)], axis=2),
         )
 
     return place
@@ -157,7 +197,10 @@ def descend_all(
         mean = np.einsum("kii->k", matrix) / n_unknown
         matrix += (damping * mean + 1e-12)[:, None, None] * diagonal
         gradient = np.einsum("kni,kn->ki", scaled, residual)
-        step = -np.linalg.solve(matrix, gradient[:, :, None])[:, :, 0] * scale
+        step = -np.linalg.solve(matrix, gradient[:, :, None])[:, :, 0]
+        if float(np.abs(step).max()) < STILL:
+            break
+        step *= scale
         tried = Rotation.from_rotvec(step[:, :3]).as_matrix() @ rotations
         moved = others + step[:, 3:]
         tried_residual, tried_jacobian = place(tried, moved)
@@ -318,15 +361,9 @@ def minima_on_plate(
     heights = np.einsum("kni,ni->kn", turned, normals) + constants
     shifts = np.asarray(-heights @ np.linalg.pinv(normals, rcond=1e-6).T)
     scale = unit_steps(few.points_mm, 3)
-    place = _placed_on(few, plate)
+    place = placed_on_plate(few.points_mm, normals, constants)
     ends = _minima(place, rotations, shifts, scale, n_go_on=N_GO_ON, apart_rad=SAME_RAD)
     return tuple(Pose(rotation, shift) for rotation, shift in zip(*ends, strict=True))
-
-
-def _placed_on(observations: CondensedObservations, plate: PlateSurface) -> ManyPlaced:
-    stripe = observations.stripe
-    poses = observations.rotations[stripe], observations.translations_mm[stripe]
-    return many_placed(observations.points_mm, *poses, plate)
 
 
 def posture_rms(observations: CondensedObservations, residual_mm: FloatArray) -> FloatArray:
@@ -341,8 +378,9 @@ def posture_rms_at(
     observations: CondensedObservations, plate: PlateSurface, pose: Pose[Tool, Sensor]
 ) -> FloatArray:
     """(n postures,) distance of each posture's points from the plate with a hand-eye."""
-    residual, _ = _placed_on(observations, plate)(pose.rotation[None], pose.translation_mm[None])
-    return posture_rms(observations, residual[0])
+    normals, constants = plate_in_tool(observations, plate.plane)
+    heights = np.einsum("ni,ni->n", pose.apply(observations.points_mm), normals) + constants
+    return posture_rms(observations, heights)
 
 
 def _are_gross(rms: FloatArray) -> BoolArray:
@@ -377,31 +415,19 @@ def _from_subsets(
     counts = np.array([len(rows) for rows in subsets])
     width = int(counts.max())
     kept = np.arange(width) < counts[:, None]
+    filled = np.array([np.resize(rows, width) for rows in subsets])
     rotations, shifts, _ = descend_all(
-        _placed_subsets(few, plate, np.array([np.resize(rows, width) for rows in subsets]), kept),
+        placed_on_plate(
+            few.points_mm[filled], normals[filled] * kept[..., None], constants[filled] * kept
+        ),
         np.array([pose.rotation for pose in starts]),
         np.array([pose.translation_mm for pose in starts]),
         4,
         np.array([unit_steps(few.points_mm[rows], 3) for rows in subsets]),
     )
-    residuals, _ = _placed_on(few, plate)(rotations, shifts)
-    typical = [np.nanmedian(posture_rms(few, residual)) for residual in residuals]
-    return [Pose(rotations[k], shifts[k]) for k in np.argsort(typical, kind="stable")[:3]]
-
-
-def _placed_subsets(
-    observations: CondensedObservations, plate: PlateSurface, rows: IntArray, kept: BoolArray
-) -> ManyPlaced:
-    """`many_placed` of (K, N) rows of the observations, those that are not ``kept`` as zeros."""
-    stripe = observations.stripe[rows]
-    poses = observations.rotations[stripe], observations.translations_mm[stripe]
-    place_rows = many_placed(observations.points_mm[rows], *poses, plate)
-
-    def place(turns: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
-        residual, jacobian = place_rows(turns, others)
-        return residual * kept, jacobian * kept[:, :, None]
-
-    return place
+    found: list[Pose[Tool, Sensor]] = [Pose(*one) for one in zip(rotations, shifts, strict=True)]
+    typical = [np.nanmedian(posture_rms_at(few, plate, pose)) for pose in found]
+    return [found[k] for k in np.argsort(typical, kind="stable")[:3]]
 
 
 def thinned(observations: CondensedObservations) -> CondensedObservations:
@@ -432,7 +458,7 @@ def _descend(
 ) -> Pose[Tool, Sensor]:
     """Plain least squares of eq. 2.76 over six parameters."""
     rotations, shifts, _ = descend_all(
-        _placed_on(observations, plate),
+        placed_on_plate(observations.points_mm, *plate_in_tool(observations, plate.plane)),
         pose.rotation[None],
         pose.translation_mm[None],
         N_DESCENT,

@@ -49,12 +49,12 @@ from armscan.storage.points import (
     read_points_or_plane,
     read_probed_points,
     read_profiles,
-    read_robot_poses,
 )
 from armscan.storage.recording import read_arm_track, read_recording
 from armscan.storage.recordings import write_mcap
 from armscan.storage.recordings.mcap_folder import folder_in
 from armscan.storage.recordings.read_mcap import extract_recording
+from armscan.storage.recordings.robot_poses import read_robot_poses
 from armscan.vision.targets.target import TargetView
 from rigs.calibration_documents import (
     camera_calibration,

@@ -187,6 +187,21 @@ def test_a_target_of_another_size_is_refused_and_told() -> None:
     assert asked == pytest.approx(1.03, abs=0.003)
 
 
+@pytest.mark.parametrize("scale", [0.1, 25.4])
+def test_a_target_in_another_unit_is_told(scale: float) -> None:
+    rig = board_rig(8)
+    looks = [
+        replace(one, base_from_tool=Pose(one.base_from_tool.rotation, place))
+        for one in rig.looks
+        for place in [scale * one.base_from_tool.translation_mm]
+    ]
+    fit = calibrate_on_board(looks, rig.camera)
+    assert isinstance(fit, FitFailure)
+    told, _, left = fit.reason.split("a target of ")[1].partition(" times the stated size would ")
+    assert float(told) == pytest.approx(scale, rel=5e-3)
+    assert left.startswith("leave 0.") or scale > 1.0
+
+
 def test_turns_about_one_axis_are_refused() -> None:
     fit = calibrate_on_board(board_rig(9, one_axis=True).looks, board_rig(9).camera)
     assert isinstance(fit, FitFailure)
@@ -216,9 +231,20 @@ def _kuka_as_fanuc(look: BoardLook) -> BoardLook:
     return replace(look, base_from_tool=Pose(read, pose.translation_mm))
 
 
+def _in_radians(look: BoardLook) -> BoardLook:
+    pose = look.base_from_tool
+    angles = np.radians(euler_from_rotations(pose.rotation[None], "extrinsic-xyz"))
+    read = rotations_from_euler(angles, "extrinsic-xyz")[0]
+    return replace(look, base_from_tool=Pose(read, pose.translation_mm))
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
-    [(_inverse, "as tool_from_base"), (_kuka_as_fanuc, "as intrinsic-zyx")],
+    [
+        (_in_radians, "the angles (extrinsic-xyz) as radians"),
+        (_inverse, "as tool_from_base"),
+        (_kuka_as_fanuc, "as intrinsic-zyx"),
+    ],
 )
 def test_poses_that_mean_something_else_are_recognised(change, said: str) -> None:  # type: ignore[no-untyped-def]
     rig = board_rig(11, arm_mm=0.3)

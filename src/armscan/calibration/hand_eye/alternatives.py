@@ -568,6 +568,15 @@ def other_readings(
                 )
                 for branch in (angles, _other_branch(angles, read)):
                     yield words, remedy, rotations_from_euler(branch, meant), translations
+    for meant in names:
+        angles = np.degrees(euler_from_rotations(rotations, meant))
+        if np.abs(angles).max() <= 2.0 * np.pi:
+            yield (
+                f"reading the angles ({meant}) as radians",
+                "write angles in degrees; of robot poses a header with a_rad, b_rad, c_rad will do",
+                rotations_from_euler(angles, meant),
+                translations,
+            )
     back = rotations.transpose(0, 2, 1)
     yield (
         "taking the poses as tool_from_base",

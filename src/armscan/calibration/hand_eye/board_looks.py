@@ -365,7 +365,7 @@ def _refuse_turns(rows: _Candidates) -> FitFailure:
 
 
 def refuse_far(start: BoardStart, looks: Sequence[BoardLook]) -> FitFailure | None:
-    """Refuse looks that stay away from any board at rest."""
+    """Refuse looks that stay away from any board at rest; say whether another size would do."""
     near = [
         look.poses[k].sensor_from_board.apply(middle_of(look.poses[k].view))
         for look, k in zip(looks, start.chosen, strict=True)
@@ -373,13 +373,41 @@ def refuse_far(start: BoardStart, looks: Sequence[BoardLook]) -> FitFailure | No
     distance_mm = float(np.median(np.linalg.norm(near, axis=1)))
     if start.typical_rad <= FAR_RAD and start.typical_mm <= FAR_PART * distance_mm:
         return None
-    return FitFailure(
+    reason = (
         f"no hand-eye makes the arm's poses and the views agree: the target, {distance_mm:.0f} mm "
         f"away, stays off its place by {start.typical_mm:.1f} mm and "
-        f"{np.degrees(start.typical_rad):.1f} degrees (medians)",
+        f"{np.degrees(start.typical_rad):.1f} degrees (medians)"
+    )
+    scale, left_mm = _size_that_fits(start, looks)
+    if start.typical_rad <= FAR_RAD and left_mm < FAR_PART * min(scale, 1.0) * distance_mm:
+        return FitFailure(
+            f"{reason}; a target of {scale:.3g} times the stated size would leave {left_mm:.1f} mm",
+            "measure the target's print and say its size (--target); check that the arm's "
+            "positions are in mm",
+        )
+    return FitFailure(
+        reason,
         "check the convention of the arm's angles (--euler), that positions are in mm, that poses "
         "and images have the same order, and that target and base did not move",
     )
+
+
+def _size_that_fits(start: BoardStart, looks: Sequence[BoardLook]) -> tuple[float, float]:
+    """Size of the target over the stated one that suits the arm's shifts, and the median left."""
+    arm = np.array([look.base_from_tool.rotation for look in looks])
+    arm_mm = np.array([look.base_from_tool.translation_mm for look in looks])
+    seen = np.array(
+        [
+            look.poses[k].sensor_from_board.translation_mm
+            for look, k in zip(looks, start.chosen, strict=True)
+        ]
+    )
+    along = np.einsum("nij,nj->ni", arm, seen @ start.tool_from_sensor.rotation.T)
+    minus = np.broadcast_to(-np.eye(3), arm.shape)
+    matrix = np.concatenate([arm, minus, along[:, :, None]], axis=2)
+    found = np.linalg.lstsq(matrix.reshape(-1, 7), -arm_mm.reshape(-1), rcond=None)[0]
+    left = np.linalg.norm(matrix @ found + arm_mm, axis=1)
+    return float(found[6]), float(np.median(left))
 
 
 MUCH_BETTER = 0.2

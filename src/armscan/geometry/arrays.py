@@ -117,6 +117,12 @@ def _check_finite(
         )
 
 
+def extents(points: FloatArray) -> FloatArray:
+    """(2, D) lowest and highest coordinates of points (N, D); of short rows numpy is slow at it."""
+    columns = np.ascontiguousarray(points.T)
+    return np.stack([columns.min(axis=1), columns.max(axis=1)])
+
+
 def homogeneous(points: FloatArray) -> FloatArray:
     """Points (N, D) with a last coordinate of 1, (N, D + 1); of normalised (x, y) the rays."""
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
@@ -394,5 +400,9 @@ class Box(ArrayRecord, kw_only=False):
 
     def holds(self, points_mm: FloatArray) -> BoolArray:
         """(N,) True for those of (N, 3) points that lie inside or on the border."""
-        points = np.asarray(points_mm)
-        return np.asarray(((points >= self.low_mm) & (points <= self.high_mm)).all(axis=1))
+        columns = np.asarray(points_mm).T
+        inside = [
+            (column >= low) & (column <= high)
+            for column, low, high in zip(columns, self.low_mm, self.high_mm, strict=True)
+        ]
+        return np.asarray(inside[0] & inside[1] & inside[2])

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, given_away
 from armscan.geometry.rotations import skew
 from armscan.kernels.fusing import N_PARAMETERS, N_SENSOR, fuse_stripes
 from armscan.kernels.naming import mark_beside
@@ -128,7 +128,7 @@ def _on_sheets(
         )
         status[row[is_lost]] = PointStatus.NO_LASER_RAY
     kept = found.select(status[found.row] == PointStatus.MEASURED)
-    return MeasuredProfile(replace(labelled, status=status), kept)
+    return MeasuredProfile(replace(labelled, status=given_away(status)), kept)
 
 
 @lru_cache(maxsize=64)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, given_away
 from armscan.kernels.stripe.column_runs import (
     BACK,
     CELL_PX,
@@ -599,17 +599,17 @@ def _to_profile(
     short = is_short(at, segment)
     if short.any():
         flags = flags | np.where(short, int(StripeFlag.SHORT_SEGMENT), 0)
-    binning = exposure.window.binning
+    binning, levels = exposure.window.binning, exposure.full_scale / NORMAL_SCALE
     profile = Profile(
         source=exposure.source,
-        points_px=exposure.window.to_full_sensor(at),
-        normals_px=normals,
-        sigma_px=np.maximum(kept.sigma * across, LEAST_SIGMA_PX) * binning,
-        width_px=kept.table[SIGMA] * across * binning,
-        intensity=np.maximum(kept.table[AMPLITUDE], 0.0) * (exposure.full_scale / NORMAL_SCALE),
-        flags=flags,
-        segment=segment,
-        noise_length=kept.noise_length,
+        points_px=given_away(exposure.window.to_full_sensor(at)),
+        normals_px=given_away(normals),
+        sigma_px=given_away(np.maximum(kept.sigma * across, LEAST_SIGMA_PX) * binning),
+        width_px=given_away(kept.table[SIGMA] * across * binning),
+        intensity=given_away(np.maximum(kept.table[AMPLITUDE], 0.0) * levels),
+        flags=given_away(flags),
+        segment=given_away(segment),
+        noise_length=given_away(kept.noise_length),
     )
     if plane is None or not len(at):
         return profile

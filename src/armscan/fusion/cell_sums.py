@@ -19,9 +19,8 @@ import numpy as np
 
 from armscan.errors import InputError, OutputError
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.kernels.grids import add_to_cells
+from armscan.kernels.grids import BLOCK_BITS, PART_BITS, add_to_cells, number_cells
 
-BLOCK_BITS, PART_BITS = 16, 5
 IN_BLOCK_BITS = 3 * PART_BITS
 AXIS_CELLS = 2 ** (BLOCK_BITS + PART_BITS)
 """Cells along an axis that can be numbered."""
@@ -42,16 +41,36 @@ def cell_numbers(cell: IntArray) -> IntArray:
         If a cell lies beyond `AXIS_CELLS`.
     """
     if len(cell) and not 0 <= int(cell.min()) <= int(cell.max()) < AXIS_CELLS:
-        raise InputError(
-            f"the points reach over more than {AXIS_CELLS:,} cells along an axis",
-            remedy="choose larger cells, or cut away far points",
-        )
+        raise _too_far()
     block, part = cell >> PART_BITS, cell & (2**PART_BITS - 1)
     number = block[:, 0] << BLOCK_BITS | block[:, 1]
     number = number << BLOCK_BITS | block[:, 2]
     for axis in range(3):
         number = number << PART_BITS | part[:, axis]
     return np.asarray(number)
+
+
+def numbers_at(points: FloatArray, low: FloatArray, size: float) -> IntArray:
+    """(N,) numbers, as `cell_numbers`, of the cells of a size that points (N, 3) lie in.
+
+    ``low`` (3,) is the corner of the first cell.
+
+    Raises
+    ------
+    InputError
+        If a cell lies beyond `AXIS_CELLS`.
+    """
+    numbers = np.zeros(len(points), dtype=np.int64)
+    if not number_cells(np.ascontiguousarray(points), low, size, numbers):
+        raise _too_far()
+    return numbers
+
+
+def _too_far() -> InputError:
+    return InputError(
+        f"the points reach over more than {AXIS_CELLS:,} cells along an axis",
+        remedy="choose larger cells, or cut away far points",
+    )
 
 
 def cells_of(numbers: IntArray) -> IntArray:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import InputError, OutputError
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import FloatArray, IntArray, extents
 from armscan.records.cloud import CalibrationErrors, CloudFrame, PointCloud
 
 PIECE_POINTS = 100_000
@@ -176,8 +176,7 @@ class PointSpool:
         self._sources.append(cloud.exposure_sources[0])
         self._ends.append(self._ends[-1] + len(cloud))
         self._instants.append(-1 - n if instant is None else instant)
-        points = cloud.points_mm if len(cloud) else np.zeros((1, 3))
-        self._corners.append(np.stack([points.min(axis=0), points.max(axis=0)]))
+        self._corners.append(extents(cloud.points_mm if len(cloud) else np.zeros((1, 3))))
 
     def keep(self, exposures: Sequence[int]) -> None:
         """Leave out all other exposures from now on; rising numbers, as appended."""
@@ -237,6 +236,11 @@ class PointSpool:
         for _, exposures in self._groups():
             yield self._read(self._sigmas, SIGMAS, exposures)
 
+    def rest(self) -> Iterator[NDArray[Any]]:
+        """(N,) of `REST`: all else that is kept of the points, as it was given, piece by piece."""
+        for _, exposures in self._groups():
+            yield self._read(self._rest, REST, exposures)
+
     def pieces(self) -> Iterator[SpoolPiece]:
         """All that is kept, piece by piece."""
         names, start = self.without_points(), 0
@@ -256,7 +260,7 @@ class PointSpool:
     def _append(self, file: BinaryIO, values: NDArray[Any]) -> None:
         try:
             file.seek(0, io.SEEK_END)
-            file.write(np.ascontiguousarray(values).tobytes())
+            file.write(np.ascontiguousarray(values).data)
         except OSError as error:
             raise OutputError(
                 f"the growing cloud cannot be kept ({error.strerror})",

@@ -15,13 +15,18 @@ from dataclasses import dataclass, field
 from typing import BinaryIO
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from armscan.errors import OutputError
-from armscan.fusion.cell_sums import IN_BLOCK_BITS, PART_BITS, CellSums, cell_numbers, cells_of
+from armscan.fusion.cell_sums import (
+    IN_BLOCK_BITS,
+    CellSums,
+    cell_numbers,
+    cells_of,
+    numbers_at,
+)
 from armscan.fusion.point_spool import PointSpool
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.kernels.grids import PART_BITS
 from armscan.reconstruction.place import (
     LARGEST_RADIUS_MM,
     LOOKED_AT,
@@ -30,6 +35,7 @@ from armscan.reconstruction.place import (
     NeighbourBins,
     cell_keys,
     radius_of_spacings,
+    spacings_mm,
 )
 
 MOST_KEYS = 2**20
@@ -53,13 +59,16 @@ def choose_scan_radius_mm(spool: PointSpool) -> float:
         return SMALLEST_RADIUS_MM
     with ExitStack() as files:
         means = files.enter_context(_MeansFile(spool))
-        sample = _sampled(spool, means)
-        return radius_of_spacings(_spacings(means, sample))
+        asked = _rows_of(means, _sampled(spool, means))
+        return radius_of_spacings(spacings_mm(asked, means, LOOKED_AT, LARGEST_RADIUS_MM))
 
 
 @dataclass(slots=True, eq=False)
 class _MeansFile:
-    """One mean a cell and exposure, on disk, with its exposure; parts of whole exposures."""
+    """One mean a cell and exposure, on disk, with its exposure; parts of whole exposures.
+
+    Iterating gives each part as (M, 4), by rising number of the exposures.
+    """
 
     spool: PointSpool
     file: BinaryIO = field(init=False)
@@ -86,11 +95,10 @@ class _MeansFile:
             ) from error
         self.parts.append(len(means))
 
-    def read(self) -> Iterator[tuple[FloatArray, IntArray]]:
+    def __iter__(self) -> Iterator[FloatArray]:
         self.file.seek(0)
         for n in self.parts:
-            rows = np.frombuffer(self.file.read(32 * n)).reshape(n, 4)
-            yield rows[:, :3], rows[:, 3].astype(np.int64)
+            yield np.frombuffer(self.file.read(32 * n)).reshape(n, 4)
 
 
 def _sampled(spool: PointSpool, means: _MeansFile) -> IntArray:
@@ -122,46 +130,14 @@ def _sampled(spool: PointSpool, means: _MeansFile) -> IntArray:
     return np.asarray(rows[order][:: max(1, len(keys) // SAMPLED)])
 
 
-def _spacings(means: _MeansFile, sample: IntArray) -> FloatArray:
-    """Distance of sampled means to the next one of another exposure, infinite if it is not among
-    the `LOOKED_AT` nearest.
-    """
-    place, owner = _rows_of(means, sample)
-    spacing = np.full(len(sample), np.inf)
-    own_reach = np.full(len(sample), np.inf)
-    for cells, exposure in means.read():
-        tree = cKDTree(cells)
-        is_here = (owner >= exposure.min()) & (owner <= exposure.max())
-        away = np.flatnonzero(~is_here)
-        if len(away):
-            distance, _ = tree.query(place[away], distance_upper_bound=LARGEST_RADIUS_MM)
-            spacing[away] = np.minimum(spacing[away], distance)
-        here = np.flatnonzero(is_here)
-        if not len(here):
-            continue
-        count = min(LOOKED_AT, len(cells))
-        distance, neighbour = tree.query(place[here], k=np.arange(1, count + 1))
-        is_other = exposure[neighbour] != owner[here, None]
-        nearest = np.where(is_other, distance, np.inf).min(axis=1)
-        spacing[here] = np.minimum(spacing[here], nearest)
-        for number in np.unique(owner[here]):
-            of = here[owner[here] == number]
-            own = cells[slice(*np.searchsorted(exposure, [number, number + 1]))]
-            if len(own) >= LOOKED_AT:
-                away_mm = cdist(place[of], own)
-                own_reach[of] = np.partition(away_mm, LOOKED_AT - 1, axis=1)[:, LOOKED_AT - 1]
-    return np.where(spacing < own_reach, spacing, np.inf)
-
-
-def _rows_of(means: _MeansFile, rows: IntArray) -> tuple[FloatArray, IntArray]:
-    """Places and exposures of rows of the file."""
-    place, owner = np.zeros((len(rows), 3)), np.zeros(len(rows), dtype=np.int64)
-    first = 0
-    for cells, exposure in means.read():
-        inside = np.flatnonzero((rows >= first) & (rows < first + len(cells)))
-        place[inside], owner[inside] = cells[rows[inside] - first], exposure[rows[inside] - first]
-        first += len(cells)
-    return place, owner
+def _rows_of(means: _MeansFile, rows: IntArray) -> FloatArray:
+    """(S, 4) rows of the file."""
+    found, first = np.zeros((len(rows), 4)), 0
+    for part in means:
+        inside = np.flatnonzero((rows >= first) & (rows < first + len(part)))
+        found[inside] = part[rows[inside] - first]
+        first += len(part)
+    return found
 
 
 @dataclass(slots=True, eq=False)
@@ -193,7 +169,7 @@ class ScanNormals:
         try:
             for points, _ in self.spool.places():
                 values = np.column_stack([points, np.ones(len(points))])
-                sums.add(cell_numbers(self._cell(points)), values)
+                sums.add(self._numbers(points), values)
             self._write(sums)
         finally:
             sums.close()
@@ -218,8 +194,8 @@ class ScanNormals:
             self._bins = bins = NeighbourBins.of(cells, self._low_mm, self.radius_mm)
         return bins
 
-    def _cell(self, points: FloatArray) -> IntArray:
-        return np.floor((points - self._low_mm) / (self.radius_mm / 4.0)).astype(np.int64)
+    def _numbers(self, points: FloatArray) -> IntArray:
+        return numbers_at(points, self._low_mm, self.radius_mm / 4.0)
 
     def _write(self, sums: CellSums) -> None:
         """Means of the cells, block by block, and where each block begins."""
@@ -243,7 +219,9 @@ class ScanNormals:
 
         A neighbour lies four cells away at most, a mean anywhere in its cell.
         """
-        cell = self._cell(points)
+        number = self._numbers(points)
+        # neighbours along a stripe mostly share their cell
+        cell = cells_of(number[np.flatnonzero(np.diff(number, prepend=-1))])
         # where in a block's third a cell lies tells which blocks are near it
         block, part = cell >> PART_BITS, cell & (2**PART_BITS - 1)
         third = 1 + (part >= 2**PART_BITS - EDGE) - (part < EDGE).astype(np.int64)

@@ -57,6 +57,7 @@ A = TypeVar("A", bound=Frame)
 B = TypeVar("B", bound=Frame)
 C = TypeVar("C", bound=Frame)
 
+UNTURNED = np.eye(3)
 ORTHONORMAL_TOLERANCE = 1e-6
 """Rotations are computed, or were made exact when read: what is left is rounding, so that this is
 stricter than what `armscan.storage.points` grants to printed decimals."""
@@ -89,11 +90,12 @@ class Pose(ArrayRecord, Generic[A, B], kw_only=False):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        defect = float(np.abs(self.rotation @ self.rotation.T - np.eye(3)).max())
-        if defect > ORTHONORMAL_TOLERANCE or np.linalg.det(self.rotation) < 0.0:
+        defect = float(np.abs(self.rotation @ self.rotation.T - UNTURNED).max())
+        (a, b, c), (d, e, f), (g, h, i) = self.rotation.tolist()
+        determinant = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+        if defect > ORTHONORMAL_TOLERANCE or determinant < 0.0:
             raise InputError(
-                f"matrix is not a rotation: |R R' - 1| = {defect:.2g}, "
-                f"det = {np.linalg.det(self.rotation):.3f}",
+                f"matrix is not a rotation: |R R' - 1| = {defect:.2g}, det = {determinant:.3f}",
                 remedy="check row/column order and handedness",
             )
 

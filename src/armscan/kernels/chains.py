@@ -260,6 +260,24 @@ def measure_chains(
 
 
 @compiled()
+def set_between(flags: Bytes, chain: Ints, span: Floats, closed: BytesOut) -> None:
+    """Set 1 also between two points of a chain with 1 that lie no farther apart than ``span`` (N,).
+
+    ``flags``: (N,). ``chain``: (N,) numbers; a chain's points are consecutive. ``closed``: (N,) of
+    the same flags, input and output.
+    """
+    last = NONE
+    for i in range(flags.shape[0]):
+        if flags[i] == 0:
+            continue
+        if last != NONE and chain[last] == chain[i]:
+            for k in range(last + 1, i):
+                if i - last <= span[k]:
+                    closed[k] = 1
+        last = i
+
+
+@compiled()
 def compare_light(light: Floats, is_cut: Bytes, reach: int, change: FloatsOut) -> None:
     """Difference of the means of ``reach`` points before each point and from it on.
 

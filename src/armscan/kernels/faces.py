@@ -302,30 +302,111 @@ def _bound(
 
 
 @compiled()
-def next_stripes(
-    points: Table, exposure: Ints, sample: Ints, looked_at: int, spacing: FloatsOut
+def nearest_others(
+    asked: Table,
+    low: Floats,
+    width: float,
+    slots: Ints,
+    bin_keys: Ints,
+    starts: Ints,
+    places: Table,
+    nearest: FloatsOut,
 ) -> None:
-    """Distance of sampled points to the next one of another exposure, of those nearest to each.
+    """Distance of places to the nearest one of another exposure, sought in bins ring by ring.
 
-    ``points``, ``exposure``: (N, 3) and (N,). ``sample``: (S,) rows. ``looked_at``: points among
-    which it is sought, the sampled one counted. ``spacing``: (S,) output; infinite where none is
-    among these.
+    Parameters
+    ----------
+    asked
+        (S, 4) places and their exposures.
+    low, width
+        (3,) as of `sort_into_bins`, and the width of a bin.
+    slots, bin_keys, starts, places
+        What `sort_into_bins` made of (M, 4) places and exposures.
+    nearest
+        (S,) input: how far is looked; output: the distance where it is less.
     """
-    for s in range(len(sample)):
-        row = sample[s]
-        x, y, z, own = points[row, 0], points[row, 1], points[row, 2], exposure[row]
-        best = math.inf
-        for n in range(len(points)):
-            if exposure[n] != own:
-                dx, dy, dz = points[n, 0] - x, points[n, 1] - y, points[n, 2] - z
-                best = min(best, dx * dx + dy * dy + dz * dz)
-        nearer = 0
-        for n in range(len(points)):
-            # no other one is nearer than the nearest other one
-            if exposure[n] == own:
-                dx, dy, dz = points[n, 0] - x, points[n, 1] - y, points[n, 2] - z
-                nearer += 1 if dx * dx + dy * dy + dz * dz < best else 0
-        spacing[s] = math.sqrt(best) if nearer < looked_at else math.inf
+    mask = len(slots) - 1
+    for s in range(len(asked)):
+        x, y, z, own = asked[s, 0], asked[s, 1], asked[s, 2], asked[s, 3]
+        u, v, w = (x - low[0]) / width, (y - low[1]) / width, (z - low[2]) / width
+        bin_x, bin_y, bin_z = math.floor(u), math.floor(v), math.floor(w)
+        # of its bin's least far side
+        u, v, w = u - bin_x, v - bin_y, w - bin_z
+        room = width * min(u, v, w, 1.0 - u, 1.0 - v, 1.0 - w)
+        best, ring = nearest[s] * nearest[s], 0
+        while ring == 0 or (room + (ring - 1) * width) ** 2 < best:
+            for i in range(-ring, ring + 1):
+                for j in range(-ring, ring + 1):
+                    # inside of the ring all was looked at before
+                    step = 1 if max(abs(i), abs(j)) == ring else 2 * ring
+                    for k in range(-ring, ring + 1, step):
+                        key = (bin_x + i + 1) << BIN_BITS | (bin_y + j + 1)
+                        key = key << BIN_BITS | (bin_z + k + 1)
+                        row = slots[_slot_of(key, slots, bin_keys, mask)]
+                        if row < 0:
+                            continue
+                        for m in range(starts[row], starts[row + 1]):
+                            if places[m, 3] != own:
+                                dx, dy, dz = places[m, 0] - x, places[m, 1] - y, places[m, 2] - z
+                                best = min(best, dx * dx + dy * dy + dz * dz)
+            ring += 1
+        nearest[s] = math.sqrt(best)
+
+
+@compiled()
+def drop_hidden(
+    asked: Table, first: Ints, stop: Ints, places: Table, looked_at: int, nearest: FloatsOut
+) -> None:
+    """Infinite distances of places that as many of their own exposure, or more, are nearer to.
+
+    ``asked``: (S, 4). ``first``, ``stop``: (S,) rows of its own exposure in ``places`` (M, 4).
+    ``looked_at``: The place itself is counted. ``nearest``: (S,) of `nearest_others`.
+    """
+    for s in range(len(asked)):
+        nearer, square = 0, nearest[s] * nearest[s]
+        for m in range(first[s], stop[s]):
+            dx, dy, dz = (
+                places[m, 0] - asked[s, 0],
+                places[m, 1] - asked[s, 1],
+                places[m, 2] - asked[s, 2],
+            )
+            nearer += 1 if dx * dx + dy * dy + dz * dz < square else 0
+        if nearer >= looked_at:
+            nearest[s] = math.inf
+
+
+@compiled()
+def first_in_cells(
+    points: Table,
+    exposure: Ints,
+    low: Floats,
+    size: float,
+    slots: IntsOut,
+    keys: IntsOut,
+    rows: IntsOut,
+) -> int:
+    """Rows of the first point of each cell of each exposure, rising.
+
+    ``points``: (N, 3), none below ``low`` (3,). ``exposure``: (N,). ``size``: Width of a cell.
+    ``slots``: (S,) of -1, S a power of two of at least 2 N. ``keys``: (N,) for what is found.
+    ``rows``: (N,) output. Returns how many rows there are.
+    """
+    mask, count = len(slots) - 1, 0
+    for n in range(len(points)):
+        key = 0
+        for k in range(3):
+            key = key << BIN_BITS | int((points[n, k] - low[k]) / size)
+        mixed = (key + exposure[n] * SPREAD) * SPREAD
+        slot = (mixed ^ (mixed >> 29)) & mask
+        row = slots[slot]
+        while row >= 0 and (keys[row] != key or exposure[rows[row]] != exposure[n]):
+            slot = (slot + 1) & mask
+            row = slots[slot]
+        if row < 0:
+            slots[slot] = count
+            keys[count], rows[count] = key, n
+            count += 1
+    return count
 
 
 @compiled(error_model="numpy")

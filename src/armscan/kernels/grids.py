@@ -217,6 +217,29 @@ def add_to_cells(
 
 
 @compiled()
+def number_cells(points: Table, low: Floats, size: float, numbers: IntsOut) -> bool:
+    """Numbers (N,) of the cells that points (N, 3) lie in, block by block.
+
+    ``low``, ``size``: (3,) corner of the first cell, and width of a cell. ``numbers``: (N,) output.
+    Returns False where a point lies below the corner, or beyond the last cell of an axis.
+    """
+    most, part_mask = float(2 ** (BLOCK_BITS + PART_BITS)), 2**PART_BITS - 1
+    is_inside = True
+    for n in range(len(points)):
+        block = part = 0
+        for k in range(3):
+            place = math.floor((points[n, k] - low[k]) / size)
+            if not 0.0 <= place < most:
+                is_inside = False
+                place = 0.0
+            cell = int(place)
+            block = block << BLOCK_BITS | cell >> PART_BITS
+            part = part << PART_BITS | (cell & part_mask)
+        numbers[n] = block << 3 * PART_BITS | part
+    return is_inside
+
+
+@compiled()
 def add_heights(
     points: Table,
     normals: Table,

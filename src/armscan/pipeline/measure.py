@@ -253,11 +253,11 @@ def _in_order(
     reads_ahead: bool,
 ) -> Iterator[tuple[InstantImages, list[Profile]]]:
     """Profiles of each instant, in order, with few instants in memory; ends at the first error."""
-    if not reads_ahead:
+    n_threads = min(count_cores(), MOST_THREADS)
+    if not reads_ahead or n_threads == 1:
         yield from ((images, extract(images)) for images in instants)
         return
     pending: deque[tuple[InstantImages, Future[list[Profile]]]] = deque()
-    n_threads = min(count_cores(), MOST_THREADS)
     with ThreadPoolExecutor(n_threads) as pool:
         try:
             for images in instants:

@@ -353,10 +353,10 @@ def measure_long_scan(
         instants, labeller, sensor, options.measure, is_pass=True, cache=cache, clock=clock
     ):
         rows = one.images.instant.rows
+        base_from_tool = poses.pose(rows[0])
         for row, measured in zip(rows, one.profiles, strict=True):
             found.rows.append(row)
             with clock.stage(PLACING):
-                base_from_tool = poses.pose(rows[0])
                 placed = _place(measured, base_from_tool, transform, options.volume, found)
                 points.add(*placed, instant=rows[0])
             if row in shown:
@@ -571,7 +571,7 @@ def _add_normals(points: PointSpool, cameras: FloatArray, progress: Progress) ->
             normals = np.concatenate(list(pool.map(near.normals, *parts)))
             points.add_normals(normals)
             n_done += len(places)
-            n_without += int((~normals.any(axis=1)).sum())
+            n_without += int((np.einsum("ni,ni->n", normals, normals) == 0.0).sum())
             progress(ProgressEvent("normals", n_done, len(points)))
     return _normals_warning(n_without / n_done, radius_mm)
 

@@ -190,11 +190,11 @@ def _thinned(
     wanted = _compared_rows(points, pose_rows, source)
     low_mm = points.corners_mm[0]
     columns: list[list[NDArray[Any]]] = [[] for _ in range(5)]
-    for piece in points.pieces():
-        cloud, row_of = piece.cloud, pose_rows[piece.cloud.exposure]
-        kept = thinned_rows(cloud.points_mm, row_of, low_mm=low_mm)
+    for (places, exposure), rest in zip(points.places(), points.rest(), strict=True):
+        row_of = pose_rows[exposure]
+        kept = thinned_rows(places, row_of, low_mm=low_mm)
         kept = kept[np.isin(row_of[kept], wanted)]
-        found = (cloud.points_mm, cloud.covariance_mm2, piece.pixel_px, row_of, cloud.sheet)
+        found = (places, rest["covariance_mm2"], rest["pixel_px"], row_of, rest["sheet"])
         for column, values in zip(columns, found, strict=True):
             column.append(values[kept])
     # one after another, so that no more than one is in memory twice
@@ -215,7 +215,7 @@ def _thinned(
         rotations,
         places,
     )
-    return _Scan(source, scanner, rows, poses, stripes, pixels, sheet)
+    return _Scan(source, scanner, rows, poses, stripes, pixels, sheet.astype(np.int64))
 
 
 def _compared_rows(points: PointSpool, pose_rows: IntArray, source: ScanSource) -> IntArray:

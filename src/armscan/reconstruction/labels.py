@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from armscan.errors import EstimationError, OptionError
-from armscan.geometry.arrays import ArrayRecord, BoolArray, IntArray, ints
+from armscan.geometry.arrays import ArrayRecord, BoolArray, IntArray, given_away, ints
 from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.epipolar import EpipolarOffset
@@ -322,5 +322,9 @@ class SingleLabeller:
 def _labelled(profile: Profile, sheet: IntArray, status: IntArray, reason: str) -> LabelledInstant:
     status[~profile.is_accepted] = PointStatus.FLAGGED
     return LabelledInstant(
-        (LabelledProfile(profile=profile, sheet=sheet, status=status, reason=reason),)
+        (
+            LabelledProfile(
+                profile=profile, sheet=given_away(sheet), status=given_away(status), reason=reason
+            ),
+        )
     )

@@ -15,10 +15,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray, extents
 from armscan.geometry.least_squares import robust_sigma
-from armscan.kernels.faces import next_stripes, quadric_offsets
-from armscan.reconstruction.place import NeighbourBins
+from armscan.kernels.faces import first_in_cells, quadric_offsets
+from armscan.reconstruction.place import NeighbourBins, free_slots, spacings_mm
 
 PAUSE_PERIODS = 4.0
 """A pause of so many median periods between exposures begins a new pass."""
@@ -206,14 +206,13 @@ def thinned_rows(
     ``low_mm`` (3,) is the lowest corner of the cloud of which the points are a part; None if they
     are all of it.
     """
-    low = points_mm.min(axis=0) if low_mm is None else low_mm
-    cell = np.floor((points_mm - low) / size_mm).astype(np.int64)
-    spans = cell.max(axis=0) + 1
-    key = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
-    order = np.lexsort((key, exposure))
-    is_first = np.ones(len(order), dtype=np.bool_)
-    is_first[1:] = (np.diff(key[order]) != 0) | (np.diff(exposure[order]) != 0)
-    return np.asarray(np.sort(order[is_first]))
+    n, low = len(points_mm), extents(points_mm)[0] if low_mm is None else low_mm
+    slots = np.full(free_slots(n), -1)
+    keys, rows = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+    count = first_in_cells(
+        np.ascontiguousarray(points_mm), exposure, low, size_mm, slots, keys, rows
+    )
+    return rows[:count]
 
 
 def pass_agreement(stripes: Stripes) -> PassAgreement | None:
@@ -298,9 +297,8 @@ class _PassSurfaces:
         points = self.points[own]
         radius = _radius_mm(points, self.stripes.exposure[own])
         self.radii_mm[number] = radius
-        asked = self.points[rows]
-        is_near = (asked >= points.min(axis=0) - radius) & (asked <= points.max(axis=0) + radius)
-        return np.asarray(rows[is_near.all(axis=1)])
+        low, high = extents(points)
+        return np.asarray(rows[Box(low - radius, high + radius).holds(self.points[rows])])
 
     def of(self, number: int) -> _PassSurface | None:
         """The surface of a pass; None if it has none."""
@@ -333,7 +331,7 @@ class _PassSurface:
         """The surface of the points ``own``; None if its stripes do not lie side by side."""
         rows = own[thinned_rows(points[own], stripes.exposure[own], radius / CELLS)]
         table = np.column_stack([points[rows], stripes.exposure[rows], rows])
-        near = NeighbourBins.of(table, points[rows].min(axis=0), radius)
+        near = NeighbourBins.of(table, extents(points[rows])[0], radius)
         bare = _PassSurface(stripes, points, near)
         some = rows[:: max(1, len(rows) // MOST_OWN)]
         left_out = bare.distances(some, -1, is_own=True).distance_mm
@@ -378,9 +376,9 @@ class _PassSurface:
 
 def _radius_mm(points: FloatArray, exposure: IntArray) -> float:
     """Reach that holds the next stripes of the same pass."""
-    sample = np.arange(0, len(points), max(1, len(points) // SAMPLED))
-    spacing = np.zeros(len(sample))
-    next_stripes(points, exposure, sample, LOOKED_AT, spacing)
-    spacing = np.minimum(spacing, LARGEST_RADIUS_MM)
-    wanted = SPACINGS * float(np.median(spacing))
+    places = np.column_stack([points, exposure])
+    asked = places[:: max(1, len(points) // SAMPLED)]
+    own_first = places[np.argsort(exposure, kind="stable")]
+    spacing = spacings_mm(asked, [own_first], LOOKED_AT, LARGEST_RADIUS_MM)
+    wanted = SPACINGS * float(np.median(np.minimum(spacing, LARGEST_RADIUS_MM)))
     return float(np.clip(wanted, LEAST_RADIUS_MM, LARGEST_RADIUS_MM))

@@ -4,20 +4,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import Box, FloatArray, IntArray
+from armscan.geometry.arrays import Box, FloatArray, IntArray, extents
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.shapes import fit_plane
-from armscan.kernels.faces import sort_into_bins, tangent_normals
+from armscan.kernels.faces import (
+    drop_hidden,
+    nearest_others,
+    sort_into_bins,
+    tangent_normals,
+)
 from armscan.kernels.fusing import carry_fused
 from armscan.kernels.placing import carry_stripe, propagate_points
 from armscan.models.calibration import (
@@ -499,12 +503,44 @@ def choose_radius_mm(points_mm: FloatArray, exposure: IntArray) -> float:
     # one mean of the points of each cell and exposure
     n_exposures = int(exposure.max()) + 1
     keys = cell_keys(points_mm, SMALLEST_RADIUS_MM / 4.0) * n_exposures + exposure
-    cells, owner = cell_means(points_mm, keys), np.unique(keys) % n_exposures
-    sample = np.arange(0, len(cells), max(1, len(cells) // SAMPLED))
-    count = min(LOOKED_AT, len(cells))
-    distance, neighbour = cKDTree(cells).query(cells[sample], k=np.arange(1, count + 1))
-    is_other = owner[neighbour] != owner[sample, None]
-    return radius_of_spacings(np.where(is_other, distance, np.inf).min(axis=1))
+    cells = np.column_stack([cell_means(points_mm, keys), np.unique(keys) % n_exposures])
+    asked = cells[:: max(1, len(cells) // SAMPLED)]
+    own_first = cells[np.argsort(cells[:, 3], kind="stable")]
+    return radius_of_spacings(spacings_mm(asked, [own_first], LOOKED_AT, LARGEST_RADIUS_MM))
+
+
+RINGS = 4
+"""Bins from a place to as far as the next stripe is sought."""
+
+
+def spacings_mm(
+    asked: FloatArray, parts: Iterable[FloatArray], looked_at: int, farthest_mm: float
+) -> FloatArray:
+    """(S,) distance of places to the next one of another exposure.
+
+    Parameters
+    ----------
+    asked
+        (S, 4) places and the numbers of their exposures.
+    parts
+        (M, 4) each, all places by rising number of their exposures, of which none is in two parts;
+        gone through twice.
+    looked_at
+        Infinite is the distance of a place where the next one is not among so many that are
+        nearest to it, itself counted.
+    farthest_mm
+        Told where nothing is nearer.
+    """
+    spacing = np.full(len(asked), farthest_mm)
+    for places in parts:
+        near = NeighbourBins.of(places, extents(places[:, :3])[0], farthest_mm / RINGS)
+        bins = (near.low_mm, near.radius_mm, near.slots, near.keys, near.starts, near.cells)
+        nearest_others(np.ascontiguousarray(asked), *bins, spacing)
+    for places in parts:
+        first = np.searchsorted(places[:, 3], asked[:, 3])
+        stop = np.searchsorted(places[:, 3], asked[:, 3], "right")
+        drop_hidden(np.ascontiguousarray(asked), first, stop, places, looked_at, spacing)
+    return spacing
 
 
 def radius_of_spacings(spacing: FloatArray) -> float:
@@ -589,8 +625,7 @@ class NeighbourBins:
     @staticmethod
     def of(cells: FloatArray, low_mm: FloatArray, radius_mm: float) -> NeighbourBins:
         """Sort means (M, 3), which may lack those farther than the radius from all points asked."""
-        n_slots = 2 ** int(np.ceil(np.log2(2 * max(len(cells), 1))))
-        slots, keys = np.full(n_slots, -1), np.zeros(len(cells), dtype=np.int64)
+        slots, keys = np.full(free_slots(len(cells)), -1), np.zeros(len(cells), dtype=np.int64)
         starts, ordered = np.zeros(len(cells) + 1, dtype=np.int64), np.zeros_like(cells)
         sort_into_bins(cells, low_mm, radius_mm, slots, keys, starts, ordered)
         return NeighbourBins(low_mm, radius_mm, ordered, slots, keys, starts)
@@ -614,6 +649,11 @@ class NeighbourBins:
             normals,
         )
         return normals
+
+
+def free_slots(n: int) -> int:
+    """Places of a hash table of ``n`` numbers: a power of two, so that half or more stay free."""
+    return 1 << (2 * max(n, 1) - 1).bit_length()
 
 
 def cell_keys(

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, given_away
 from armscan.geometry.rotations import skew
 from armscan.kernels.fusing import N_PARAMETERS, N_SENSOR, fuse_stripes
 from armscan.kernels.naming import mark_beside
@@ -45,6 +45,7 @@ from armscan.reconstruction.triangulate import (
     sensor_covariance,
     shapes_mm,
     sheet_numbers,
+    sheet_rows,
     triangulate_stripe,
 )
 from armscan.records.profile import Profile
@@ -117,8 +118,7 @@ def _on_sheets(
     is_inside = depths.holds(found.points_mm, found.sheet, sensor)
     status[found.row] = np.where(is_inside, PointStatus.MEASURED, PointStatus.OUT_OF_DEPTH)
     found = found.select(is_inside)
-    for k in range(len(sensor.sheets)):
-        of_sheet = np.flatnonzero(found.sheet == k)
+    for k, of_sheet in sheet_rows(found.sheet):
         row = found.row[of_sheet]
         is_lost = is_without_ray(
             found.points_mm[of_sheet],
@@ -128,9 +128,10 @@ def _on_sheets(
         )
         status[row[is_lost]] = PointStatus.NO_LASER_RAY
     kept = found.select(status[found.row] == PointStatus.MEASURED)
-    return MeasuredProfile(replace(labelled, status=status), kept)
+    return MeasuredProfile(replace(labelled, status=given_away(status)), kept)
 
 
+@lru_cache(maxsize=64)
 def known_rays(sensor: SensorCalibration, sheet: int) -> tuple[LightSheet, float]:
     """The sheet of that number, and the tangent by which a ray may leave the one that its fan says.
 
@@ -173,7 +174,7 @@ def is_without_ray(
         Tangent by which rays may leave those of the sheet.
     """
     lost = np.zeros(len(points_mm), dtype=np.bool_)
-    if len(np.unique(segment)) < 2:
+    if bool((segment == segment[:1]).all()):
         return lost
     ray, depth = _rays(points_mm, sheet)
     apart_mm = np.abs(np.diff(ray))[np.diff(segment) == 0]
@@ -353,7 +354,8 @@ def _left_points(
 
 def _mean_length(left: FloatArray, right: FloatArray, noise_mm: FloatArray) -> FloatArray:
     """(M,) mean by variance of the noise's lengths (M,) of both cameras; noises (M, 3, 2)."""
-    variance = np.maximum((noise_mm**2).sum(axis=1), np.finfo(np.float64).tiny)
+    x, y, z = np.moveaxis(noise_mm * noise_mm, 1, 0)
+    variance = np.maximum(x + y + z, np.finfo(np.float64).tiny)
     total = left * variance[:, 0] + right * variance[:, 1]
     return np.asarray(total / variance.sum(axis=1))
 

@@ -187,7 +187,8 @@ def _places(arm: ArmTrack) -> FloatArray:
 
 def _largest(differences: FloatArray) -> FloatArray:
     """(N,) length of the longest of the four vectors of each row (N, 12)."""
-    return np.asarray(np.linalg.norm(differences.reshape(-1, 4, 3), axis=2).max(axis=1))
+    x, y, z = np.moveaxis((differences * differences).reshape(-1, 4, 3), 2, 0)
+    return np.asarray(np.sqrt(np.ascontiguousarray((x + y + z).T).max(axis=0)))
 
 
 def _resolution_mm(places: FloatArray) -> float:

@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
+from armscan.geometry.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    floats,
+    given_away,
+    ints,
+)
 from armscan.geometry.poses import Pose, Sensor
 from armscan.kernels.fusing import ACROSS, N_PARAMETERS, N_SENSOR, RIGHT, SHEET
 from armscan.kernels.placing import spread_stripe
@@ -272,19 +280,20 @@ def stripe_cloud(
 ) -> PointCloud:
     """The points of one exposure, given in a frame with symmetric covariances, as a cloud."""
     if isinstance(profile, Profile):
+        segment, intensity = profile.segment, profile.intensity
         # what is complete is not copied
-        chosen = slice(None) if len(stripe) == len(profile) else stripe.row
-        segment, intensity = profile.segment[chosen], profile.intensity[chosen]
+        if len(stripe) != len(profile):
+            segment, intensity = segment[stripe.row], intensity[stripe.row]
     else:
         segment, intensity = np.zeros_like(stripe.row), np.zeros(len(stripe))
     return PointCloud(
         frame=frame,
         points_mm=points_mm,
         covariance_mm2=covariance_mm2,
-        sigma_noise_mm=noise_size_mm(stripe.noise_mm),
+        sigma_noise_mm=given_away(noise_size_mm(stripe.noise_mm)),
         sheet=stripe.sheet,
         sheet_names=sheet_names,
-        exposure=np.zeros(len(stripe), dtype=np.int64),
+        exposure=given_away(np.zeros(len(stripe), dtype=np.int64)),
         exposure_sources=(profile.source,),
         segment=segment,
         intensity=intensity,

@@ -229,10 +229,9 @@ def largest_eigenvalue(matrices: FloatArray) -> FloatArray:
 
     It is right to 2e-8 of itself and takes a third of the time of a general solver.
     """
-    diagonal = np.einsum("nii->ni", matrices)
-    middle = diagonal.sum(axis=1) / 3.0
-    x, y, z = (diagonal - middle[:, None]).T
-    a, b, c = matrices[:, 0, 1], matrices[:, 0, 2], matrices[:, 1, 2]
+    xx, a, b, _, yy, c, _, _, zz = np.ascontiguousarray(matrices.reshape(-1, 9).T)
+    middle = (xx + yy + zz) / 3.0
+    x, y, z = xx - middle, yy - middle, zz - middle
     spread = np.sqrt((x * x + y * y + z * z + 2.0 * (a * a + b * b + c * c)) / 6.0)
     half_det = 0.5 * (x * (y * z - c * c) - a * (a * z - b * c) + b * (a * c - b * y))
     cosine = half_det / np.maximum(spread**3, np.finfo(np.float64).tiny)

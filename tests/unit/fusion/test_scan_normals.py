@@ -10,7 +10,7 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.fusion import point_spool, scan_normals
-from armscan.fusion.cell_sums import AXIS_CELLS, CellSums, cell_numbers, cells_of
+from armscan.fusion.cell_sums import AXIS_CELLS, CellSums, cell_numbers, cells_of, numbers_at
 from armscan.fusion.point_spool import PointSpool
 from armscan.fusion.scan_normals import ScanNormals, choose_scan_radius_mm
 from armscan.geometry.arrays import FloatArray
@@ -63,6 +63,16 @@ def test_a_lonely_line_has_the_largest_radius() -> None:
     (one,) = stripes(1)
     spool = spool_of([one])
     assert choose_scan_radius_mm(spool) == choose_radius_mm(one.points_mm, one.exposure)
+
+
+def test_points_are_numbered_as_their_cells_are() -> None:
+    points, low = np.random.default_rng(4).uniform(-50.0, 900.0, (2000, 3)), np.full(3, -60.0)
+    cell = np.floor((points - low) / 0.7).astype(np.int64)
+    np.testing.assert_array_equal(numbers_at(points, low, 0.7), cell_numbers(cell))
+    for far in (-60.1, 0.7 * AXIS_CELLS, 1e300):
+        points[7, 1] = far
+        with pytest.raises(InputError, match="cells along an axis"):
+            numbers_at(points, low, 0.7)
 
 
 def table_of(sums: CellSums) -> tuple[FloatArray, FloatArray]:

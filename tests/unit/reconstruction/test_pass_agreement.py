@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import FloatArray
-from armscan.kernels.faces import next_stripes, quadric_offsets
+from armscan.kernels.faces import quadric_offsets
 from armscan.reconstruction.pass_agreement import (
     Stripes,
     pass_agreement,
@@ -16,7 +16,7 @@ from armscan.reconstruction.pass_agreement import (
     passes_of,
     thinned_rows,
 )
-from armscan.reconstruction.place import NeighbourBins
+from armscan.reconstruction.place import NeighbourBins, spacings_mm
 
 RADIUS_MM, NOISE_MM = 17.5, 0.005
 
@@ -174,14 +174,17 @@ def test_spacings_of_stripes_are_those_of_a_tree() -> None:
     stripes = ball_passes(np.zeros(3))
     points = stripes.points_base_mm + rng.normal(0.0, 0.05, (1600, 3))
     sample = np.arange(0, 1600, 13)
-    for looked_at in (3, 1600):
-        found = np.zeros(len(sample))
-        next_stripes(points, stripes.exposure, sample, looked_at, found)
+    places = np.column_stack([points, stripes.exposure])
+    at = np.searchsorted(stripes.exposure, stripes.exposure.max() // 2)
+    for looked_at, farthest_mm in ((3, 40.0), (1600, 40.0), (1600, 1.0)):
+        found = spacings_mm(places[sample], [places[:at], places[at:]], looked_at, farthest_mm)
         distance, near = cKDTree(points).query(points[sample], k=looked_at)
         is_other = stripes.exposure[near] != stripes.exposure[sample, None]
         expected = np.where(is_other, distance, np.inf).min(axis=1)
+        expected = np.where(np.isinf(expected), expected, np.minimum(expected, farthest_mm))
         np.testing.assert_allclose(found, expected, rtol=1e-12)
         assert np.isinf(found).any() == (looked_at < 1600)
+        assert (found == farthest_mm).any() == (farthest_mm < 40.0)
 
 
 def test_passes_that_lie_far_apart_say_nothing_of_each_other() -> None:

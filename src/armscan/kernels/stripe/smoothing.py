@@ -533,9 +533,12 @@ def filter_residuals(
         first, i = last - size + 1, last - half
         if first <= unused or chain[first] != chain[last]:
             continue
-        off_x = points[i, 0] - sum_products(x, first, weights)
         off_y = points[i, 1] - sum_products(y, first, weights)
-        residual[i] = (off_x * normals[i, 0] + off_y * normals[i, 1]) / sigma[i]
+        if normals[i, 0] == 0.0:
+            residual[i] = off_y * normals[i, 1] / sigma[i]
+        else:
+            off_x = points[i, 0] - sum_products(x, first, weights)
+            residual[i] = (off_x * normals[i, 0] + off_y * normals[i, 1]) / sigma[i]
         told[count] = abs(residual[i])
         count += 1
     return count

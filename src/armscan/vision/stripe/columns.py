@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, given_away
 from armscan.kernels.stripe.column_runs import (
     BACK,
     CELL_PX,
@@ -337,6 +337,8 @@ def _find_chains(pixels: Pixels, level: ImageLevel) -> _Chains:
 def _cells_of(runs: NDArray[np.int32], shape: tuple[int, ...]) -> MaskImage:
     """Cells (rows, columns) that runs (N, 3) of more than one pixel touch."""
     runs = runs[runs[:, 2] > runs[:, 1]] // CELL_PX
+    if not len(runs):
+        return np.zeros(shape, np.uint8)
     change = np.zeros((shape[0] + 1, shape[1]), np.int64)
     np.add.at(change, (runs[:, 1], runs[:, 0]), 1)
     np.add.at(change, (runs[:, 2] + 1, runs[:, 0]), -1)
@@ -470,10 +472,7 @@ def _smooth(chains: _Chains, found: ColumnPoints, smoothing_px: float) -> Column
     sigma, noise_length = np.sqrt(variance * correlation[0]), np.full(len(points), alike)
     slope, table = found.slope.copy(), table.copy()
     if smoothing_px > 0.0:
-        halves = np.unique(np.maximum(half.astype(np.int64), 1))
-        weights = np.zeros((len(halves), halves[-1] + 1))
-        for k, one in enumerate(halves):
-            weights[k, : one + 1] = _half_weights(int(one))
+        halves, weights = _half_windows(max(smoothing_px, 1.0))
         inflation = np.array([inflation_of(correlation, one) for one in halves])
         smoothed = np.zeros((SMOOTH_ROWS, len(rows)))
         own = own * correlation[0]
@@ -518,6 +517,17 @@ def _half_weights(half: int) -> FloatArray:
     weights = quadratic_weights(half)[half:].copy()
     weights.flags.writeable = False
     return weights
+
+
+@cache
+def _half_windows(largest_px: float) -> tuple[IntArray, FloatArray]:
+    """Half windows (K,) in whole columns, and the weights (K, H + 1) of `_half_weights` of each."""
+    halves = np.unique(np.maximum(windows(largest_px).astype(np.int64), 1))
+    weights = np.zeros((len(halves), halves[-1] + 1))
+    for k, one in enumerate(halves):
+        weights[k, : one + 1] = _half_weights(int(one))
+    halves.flags.writeable = weights.flags.writeable = False
+    return halves, weights
 
 
 def _correlation(
@@ -589,17 +599,17 @@ def _to_profile(
     short = is_short(at, segment)
     if short.any():
         flags = flags | np.where(short, int(StripeFlag.SHORT_SEGMENT), 0)
-    binning = exposure.window.binning
+    binning, levels = exposure.window.binning, exposure.full_scale / NORMAL_SCALE
     profile = Profile(
         source=exposure.source,
-        points_px=exposure.window.to_full_sensor(at),
-        normals_px=normals,
-        sigma_px=np.maximum(kept.sigma * across, LEAST_SIGMA_PX) * binning,
-        width_px=kept.table[SIGMA] * across * binning,
-        intensity=np.maximum(kept.table[AMPLITUDE], 0.0) * (exposure.full_scale / NORMAL_SCALE),
-        flags=flags,
-        segment=segment,
-        noise_length=kept.noise_length,
+        points_px=given_away(exposure.window.to_full_sensor(at)),
+        normals_px=given_away(normals),
+        sigma_px=given_away(np.maximum(kept.sigma * across, LEAST_SIGMA_PX) * binning),
+        width_px=given_away(kept.table[SIGMA] * across * binning),
+        intensity=given_away(np.maximum(kept.table[AMPLITUDE], 0.0) * levels),
+        flags=given_away(flags),
+        segment=given_away(segment),
+        noise_length=given_away(kept.noise_length),
     )
     if plane is None or not len(at):
         return profile

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
-from armscan.kernels.chains import REACH_PX
+from armscan.kernels.chains import REACH_PX, set_between
 from armscan.kernels.stripe.profile_fit import REACH_SIGMAS
 from armscan.kernels.stripe.section import (
     MARK_COLUMNS,
@@ -21,7 +21,7 @@ from armscan.kernels.stripe.section import (
 )
 from armscan.records.profile import StripeFlag
 from armscan.vision.stripe.fit import ProfileFits
-from armscan.vision.stripe.ridge import SHORTEST_PX, chain_bounds, chain_extents
+from armscan.vision.stripe.ridge import SHORTEST_PX, chain_extents
 
 MERGED_SIGMAS = 20.0
 """Where two lines cross at a small angle they run as one over about this many sigmas."""
@@ -66,12 +66,9 @@ def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:
 
 def close_gaps(flags: BoolArray, chain: IntArray, span: FloatArray) -> BoolArray:
     """Set also the points between two flagged ones of a chain that are within ``span`` (N,)."""
-    place = np.arange(len(flags))
-    first, stop = chain_bounds(chain)
-    before = np.maximum.accumulate(np.where(flags, place, -1))
-    after = np.minimum.accumulate(np.where(flags, place, len(flags))[::-1])[::-1]
-    is_between = (before >= first) & (after < stop)
-    return np.asarray(flags | (is_between & (after - before <= span)))
+    closed = flags.copy()
+    set_between(flags.view(np.uint8), chain, span, closed.view(np.uint8))
+    return closed
 
 
 def is_short(points: FloatArray, chain: IntArray) -> BoolArray:

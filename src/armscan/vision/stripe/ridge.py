@@ -10,7 +10,6 @@ from typing import TypeAlias, TypeGuard
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter
 
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA, robust_sigma
@@ -37,6 +36,7 @@ from armscan.kernels.stripe.ridge import (
 FloatImage: TypeAlias = NDArray[np.float32]
 
 CELL_PX = 64
+AROUND = np.ones((3, 3), np.uint8)
 SQRT2 = math.sqrt(2.0)
 SAMPLE_STEP_PX = 4
 """What holds for the whole image is told from every fourth row and column."""
@@ -101,7 +101,7 @@ def measure_level(
         threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
         is_noisy = noise > NOISY and THRESHOLD_SIGMAS * noise > NOISY_SHARE * peak
     # between cells the background is linear: never below the least of them
-    least = minimum_filter(background, 3, mode="nearest") + (threshold - ROUNDING)
+    least = cv2.erode(background, AROUND) + (threshold - ROUNDING)
     lit = np.asarray(peaks * factor > least).astype(np.uint8)
     brightest = float(peaks.max())
     return ImageLevel(background, noise, clutter, threshold, lit, brightest, is_noisy)
@@ -204,14 +204,14 @@ def _brightest(
     k = int(0.98 * (len(few) - 1))
     n_above = (1.0 - PEAK_QUANTILE) * (sample.size - 1)
     if is_of_bytes(image):
-        limit = float(_level_at(np.bincount(few), k))
+        (limit,) = map(float, _levels_at(np.bincount(few), [k]))
         counts = np.zeros(256, np.int64)
         is_bright_cell = (peaks > limit).view(np.uint8)
         count_bright(image, is_bright_cell, CELL_PX, pixel_step, int(limit), counts)
         n_bright = int(counts.sum())
         if n_bright - 1 > n_above:
             place = n_bright - 1 - n_above
-            low, high = _level_at(counts, int(place)), _level_at(counts, int(place) + 1)
+            low, high = _levels_at(counts, [int(place), int(place) + 1])
             return float(factor) * (low + (place - int(place)) * (high - low))
     else:
         limit = float(np.partition(few.astype(np.float32), k)[k])
@@ -221,9 +221,10 @@ def _brightest(
     return float(np.quantile(sample.astype(np.float32) * factor, PEAK_QUANTILE))
 
 
-def _level_at(counts: IntArray, place: int) -> int:
-    """Level at a place, from 0 on, in the order of levels of which there are so many."""
-    return int(np.searchsorted(np.cumsum(counts), place, side="right"))
+def _levels_at(counts: IntArray, places: list[int]) -> list[int]:
+    """Levels at places, from 0 on, in the order of levels of which there are so many."""
+    found: list[int] = np.searchsorted(np.cumsum(counts), places, side="right").tolist()
+    return found
 
 
 NOISE_STEP_PX, NOISE_ROW_STEP_PX = 3, 2 * SAMPLE_STEP_PX
@@ -241,7 +242,7 @@ def _noise(image: FloatImage | ImageArray, lag: int, factor: np.float32, sparse:
         read_steps(image, row_step, NOISE_STEP_PX, lag, step, counts)
         if factor != 1.0:
             step *= factor
-        middle = _level_at(counts, step.size // 2) + _level_at(counts, (step.size - 1) // 2)
+        middle = sum(_levels_at(counts, [(step.size - 1) // 2, step.size // 2]))
         typical = MAD_TO_SIGMA * 0.5 * middle * float(factor)
     else:
         levels = image[::NOISE_ROW_STEP_PX].astype(np.float32) * factor
@@ -249,7 +250,7 @@ def _noise(image: FloatImage | ImageArray, lag: int, factor: np.float32, sparse:
             levels[:, lag::NOISE_STEP_PX] - levels[:, : levels.shape[1] - lag : NOISE_STEP_PX]
         )
         typical = robust_sigma(step)
-    mean = float(np.minimum(step, max(2.5 * typical, 2.0)).mean())
+    mean = float(np.minimum(step, max(2.5 * typical, 2.0), out=step).mean())
     trimmed = mean * math.sqrt(math.pi / 2.0)
     return max(typical, trimmed, LEAST_NOISE * SQRT2) / SQRT2
 

@@ -132,10 +132,13 @@ class SmoothedCentres:
     is_noise_measured: bool
 
 
+@cache
 def windows(largest_px: float) -> FloatArray:
     """Half windows from small to ``largest_px``, growing by a constant ratio."""
     steps = max(round(np.log(largest_px / SMALLEST_WINDOW_PX) / np.log(WINDOW_RATIO)), 0)
-    return np.geomspace(min(SMALLEST_WINDOW_PX, largest_px), largest_px, steps + 1)
+    half = np.geomspace(min(SMALLEST_WINDOW_PX, largest_px), largest_px, steps + 1)
+    half.flags.writeable = False
+    return half
 
 
 def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
@@ -197,11 +200,19 @@ def quadratic_weights(half: int) -> FloatArray:
 
 def inflation_of(correlation: FloatArray, half_px: float) -> float:
     """Variance of a uniform local quadratic's centre, divided by its value for white noise."""
-    weights = quadratic_weights(max(int(half_px), 2))
-    overlap = np.correlate(weights, weights, "full")[len(weights) - 1 :][:LAGS]
-    factor = np.where(np.arange(len(overlap)) == 0, 1.0, 2.0)
+    overlap = _overlap(max(int(half_px), 2))
     shape = correlation[: len(overlap)] / correlation[0]
-    return max(float((factor * overlap * shape).sum() / overlap[0]), 0.3)
+    return max(float((overlap * shape).sum() / overlap[0]), 0.3)
+
+
+@cache
+def _overlap(half: int) -> FloatArray:
+    """Sums (<= LAGS,) of products of a quadratic's weights at each distance, to both sides."""
+    weights = quadratic_weights(half)
+    overlap = np.correlate(weights, weights, "full")[len(weights) - 1 :][:LAGS]
+    overlap[1:] *= 2.0
+    overlap.flags.writeable = False
+    return overlap
 
 
 def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float | None:

@@ -19,6 +19,7 @@ OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
 CAMERA, STEREO, LASER = ("calibrate", "camera"), ("calibrate", "stereo"), ("calibrate", "laser")
 HAND_EYE, VERIFY, RECONSTRUCT = ("calibrate", "hand-eye"), ("verify",), ("reconstruct",)
+TARGET = ("calibrate", "hand-eye-target")
 PLANE, SPHERE, STEP = ("inspect", "plane"), ("inspect", "sphere"), ("inspect", "step")
 
 SHOWN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
@@ -28,6 +29,8 @@ SHOWN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
     "calibration/cameras/pairs": (STEREO,),
     "calibration/sheets/": (LASER,),
     "calibration/hand_eye/probed": (("probe",), HAND_EYE, VERIFY, PLANE),
+    "calibration/hand_eye/board": (TARGET,),
+    "calibration/hand_eye/on_board": (TARGET,),
     "calibration/hand_eye/": (HAND_EYE,),
     "inspection/plane": (PLANE, VERIFY),
     "inspection/sphere": (SPHERE, VERIFY),
@@ -37,6 +40,7 @@ SHOWN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
     "jobs/stereo": (STEREO,),
     "jobs/sheets": (LASER,),
     "jobs/hand_eye": (HAND_EYE,),
+    "jobs/board_hand_eye": (TARGET,),
     "jobs/verify": (VERIFY,),
     "jobs/photographs": (("markers",), ("stripes",)),
     "jobs/register": (("register",),),

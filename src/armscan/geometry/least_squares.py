@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Generic, TypeVar
 
 import numpy as np
 from scipy.linalg import eigh, solve_triangular
+from scipy.special import ndtri
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
@@ -274,3 +276,33 @@ def minimise(
         if gain <= settled * chi2 or chi2 == 0.0:
             return Minimum(state=state, system=system, chi2=chi2, is_settled=True)
     return Minimum(state=state, system=system, chi2=chi2, is_settled=False)
+
+
+N_DRAWS = 128
+SOBOL_BITS = 30
+SOBOL_DIRECTIONS = (
+    (1, 1, 1, 1, 1, 1, 1), (1, 3, 5, 15, 17, 51, 85), (1, 3, 3, 9, 29, 23, 71),
+    (1, 3, 1, 5, 31, 29, 81), (1, 1, 1, 11, 31, 55, 61), (1, 1, 3, 3, 25, 9, 43),
+    (1, 3, 5, 13, 11, 37, 31), (1, 1, 5, 5, 17, 9, 9), (1, 1, 5, 5, 5, 53, 53),
+)  # fmt: skip
+"""Of up to nine dimensions (Joe and Kuo 2008), for `N_DRAWS` draws."""
+
+
+@cache
+def normal_draws(n: int) -> FloatArray:
+    """(N_DRAWS, n) evenly spread draws of a standard normal distribution, n up to nine.
+
+    Sobol's sequence, scrambled, to the last bit as ``scipy.stats.qmc.Sobol`` has it, whose import
+    takes longer than the draws' use. Digits are binary, the highest first.
+    """
+    random, number = np.random.default_rng(0).spawn(1)[0], np.arange(N_DRAWS)
+    shift = random.integers(2, size=(n, SOBOL_BITS), dtype=np.uint32)[:, None, ::-1]
+    mixing = random.integers(2, size=(n, SOBOL_BITS, SOBOL_BITS), dtype=np.uint32)
+    mixing = np.tril(mixing, -1) + np.eye(SOBOL_BITS, dtype=np.uint32)
+    place = np.arange(SOBOL_BITS)
+    directions = np.array(SOBOL_DIRECTIONS[:n])
+    column = np.arange(directions.shape[1])
+    digits = (directions[:, :, None] << place) >> column[:, None] & 1
+    chosen = ((number ^ number >> 1)[:, None] >> column) & 1
+    mixed = (chosen @ digits @ mixing.transpose(0, 2, 1) + shift) % 2
+    return np.asarray(ndtri((mixed @ 0.5 ** (place + 1.0)).T))

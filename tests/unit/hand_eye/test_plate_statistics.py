@@ -13,9 +13,7 @@ from scipy.stats.qmc import Sobol
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.noise import (
-    N_DRAWS,
     NoiseComponent,
-    _normal_draws,
     estimate_noise,
     solve_linear,
 )
@@ -23,6 +21,7 @@ from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.least_squares import N_DRAWS, normal_draws
 from rigs.plate_bound import cramer_rao, plain_least_squares, scored_densely
 from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
 
@@ -196,4 +195,4 @@ def test_groups_of_observations_give_what_full_matrices_give(seed: int) -> None:
 @pytest.mark.parametrize("n", range(1, 10))
 def test_draws_are_those_of_scrambled_sobol_points(n: int) -> None:
     points = Sobol(n, rng=np.random.default_rng(0)).random(N_DRAWS)
-    np.testing.assert_array_equal(_normal_draws(n), ndtri(points))
+    np.testing.assert_array_equal(normal_draws(n), ndtri(points))

@@ -382,7 +382,7 @@ def refuse_far(start: BoardStart, looks: Sequence[BoardLook]) -> FitFailure | No
     if start.typical_rad <= FAR_RAD and left_mm < FAR_PART * min(scale, 1.0) * distance_mm:
         return FitFailure(
             f"{reason}; a target of {scale:.3g} times the stated size would leave {left_mm:.1f} mm",
-            "measure the target's print and say its size (--target); check that the arm's "
+            "measure the target's print and give its size (--target); check that the arm's "
             "positions are in mm",
         )
     return FitFailure(

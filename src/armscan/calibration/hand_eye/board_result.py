@@ -187,7 +187,7 @@ def refuse_scale(asked: AskedScale) -> FitFailure | None:
         return None
     return FitFailure(
         f"the arm's shifts ask for a target of {asked}",
-        "measure the target's print and say its size (--target); check that the camera's "
+        "measure the target's print and give its size (--target); check that the camera's "
         "calibration is this one, and that the arm's positions are in mm",
     )
 

@@ -18,14 +18,13 @@ of every standard deviation is held near its typical value by a wide normal dist
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 from scipy.optimize import brentq
-from scipy.special import chdtr, chdtri, ndtri
+from scipy.special import chdtr, chdtri
 
 from armscan.calibration.hand_eye.observations import (
     CondensedObservations,
@@ -39,6 +38,7 @@ from armscan.calibration.hand_eye.surface import (
 )
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.least_squares import normal_draws
 from armscan.models.calibration import SHEET_PARAMETER_NAMES, ArmNoise
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
 
@@ -75,15 +75,6 @@ SCORING_SETTLED = 1e-3
 LONGEST_STEP = 1.0
 MAX_LOG = 7.0
 """A standard deviation leaves its typical value by a factor of 1100 at most."""
-N_DRAWS = 128
-"""Of the standard deviations, over which the covariance is integrated."""
-SOBOL_BITS = 30
-SOBOL_DIRECTIONS = (
-    (1, 1, 1, 1, 1, 1, 1), (1, 3, 5, 15, 17, 51, 85), (1, 3, 3, 9, 29, 23, 71),
-    (1, 3, 1, 5, 31, 29, 81), (1, 1, 1, 11, 31, 55, 61), (1, 1, 3, 3, 25, 9, 43),
-    (1, 3, 5, 13, 11, 37, 31), (1, 1, 5, 5, 17, 9, 9), (1, 1, 5, 5, 5, 53, 53),
-)  # fmt: skip
-"""Of as many dimensions as there are causes of scatter (Joe and Kuo 2008), for `N_DRAWS` draws."""
 INFLATION = 1.5
 """They are drawn from a normal distribution that is so much wider in variance than the posterior
 is near its highest point."""
@@ -657,7 +648,7 @@ def covariance_over_noise(
             remedy="take more postures, or give the arm's scatter",
         ) from None
     mode, parts, moved, weights = posterior.logs(estimate.sigmas), [], [], []
-    for draw in _normal_draws(len(free)):
+    for draw in normal_draws(len(free)):
         logs = mode + factor @ draw
         one = _solve(residual, jacobian, posterior.covariance(logs), n_unit)
         if one is not None:
@@ -671,26 +662,6 @@ def covariance_over_noise(
     errors = np.array(parts) + steps[:, :, None] * steps[:, None, :]
     mixed = np.einsum("m,mij->ij", share, errors)
     return SolutionCovariance(mixed, _region_factor(mixed, errors, share))
-
-
-@cache
-def _normal_draws(n: int) -> FloatArray:
-    """(N_DRAWS, n) evenly spread draws of a standard normal distribution.
-
-    Sobol's sequence, scrambled, to the last bit as ``scipy.stats.qmc.Sobol`` has it, whose import
-    takes longer than the draws' use. Digits are binary, the highest first.
-    """
-    random, number = np.random.default_rng(0).spawn(1)[0], np.arange(N_DRAWS)
-    shift = random.integers(2, size=(n, SOBOL_BITS), dtype=np.uint32)[:, None, ::-1]
-    mixing = random.integers(2, size=(n, SOBOL_BITS, SOBOL_BITS), dtype=np.uint32)
-    mixing = np.tril(mixing, -1) + np.eye(SOBOL_BITS, dtype=np.uint32)
-    place = np.arange(SOBOL_BITS)
-    directions = np.array(SOBOL_DIRECTIONS[:n])
-    column = np.arange(directions.shape[1])
-    digits = (directions[:, :, None] << place) >> column[:, None] & 1
-    chosen = ((number ^ number >> 1)[:, None] >> column) & 1
-    mixed = (chosen @ digits @ mixing.transpose(0, 2, 1) + shift) % 2
-    return np.asarray(ndtri((mixed @ 0.5 ** (place + 1.0)).T))
 
 
 def _region_factor(mixed: FloatArray, parts: FloatArray, share: FloatArray) -> float:

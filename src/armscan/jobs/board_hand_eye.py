@@ -251,6 +251,8 @@ def _scan_views(source: LookSource) -> _Views:
         )
     n_used = min(len(posed), MOST_ROWS)
     chosen = [posed[k] for k in np.linspace(0, len(posed) - 1, n_used).round().astype(int)]
+    n_other = sum(row.camera != 0 for row in recording.rows)
+    note = f"{n_other} exposures of other cameras than camera 0, which gives the hand-eye, not used"
     without = [(names[k], "the arm gave no pose for it") for k in dark or left if k not in posed]
     return _Views(
         exposures=tuple(recording.exposure(k) for k in chosen),
@@ -259,7 +261,12 @@ def _scan_views(source: LookSource) -> _Views:
         paths=tuple(folder / names[k] for k in chosen),
         tables=(*recording_tables(folder), *(() if source.arm is None else (source.arm,))),
         is_simulated=recording.is_simulated,
-        warnings=(*recording.warnings, *recording.session.assumed, *poses.warnings),
+        warnings=(
+            *recording.warnings,
+            *recording.session.assumed,
+            *poses.warnings,
+            *((note,) if n_other else ()),
+        ),
         not_used=tuple(without),
     )
 

@@ -209,6 +209,15 @@ def test_turns_about_one_axis_are_refused() -> None:
     assert "two of its axes" in fit.remedy
 
 
+def test_a_camera_without_uncertainty_is_taken_as_exact_and_told() -> None:
+    rig = board_rig(14)
+    bare = replace(rig.camera, covariance=np.zeros((9, 9)), has_covariance=False)
+    fit = calibrate_on_board(rig.looks, bare)
+    assert isinstance(fit, BoardHandEyeFit)
+    np.testing.assert_array_equal(fit.camera_step, np.zeros(9))
+    assert "taken as exact" in fit.warnings[0]
+
+
 def test_three_postures_are_too_few() -> None:
     rig = board_rig(10, 4)
     assert isinstance(calibrate_on_board(rig.looks, rig.camera), BoardHandEyeFit)

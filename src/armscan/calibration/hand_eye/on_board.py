@@ -123,6 +123,11 @@ def calibrate_on_board(
         better = better_reading(used, "the arm's poses and the views hardly agree")
         if better is not None:
             return better
+    if not camera.has_covariance:
+        notes += (
+            "the camera's calibration came without uncertainty and is taken as exact: the "
+            "hand-eye's sigmas do not hold what it errs by",
+        )
     return replace(found, warnings=(*notes, *found.warnings))
 
 

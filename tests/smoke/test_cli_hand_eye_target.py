@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from armscan.cli.run import main
 from armscan.storage.documents import read_camera_calibration, read_scanner_calibration
@@ -120,3 +122,23 @@ def test_inverse_poses_are_refused_by_name(
     assert "no.refused.html shows what was found" in message
     assert (tmp_path / "no.refused.html").exists()
     assert not output.exists()
+
+
+@pytest.mark.parametrize("convention", ["rotation-vector", "intrinsic-zyx"])
+def test_a_table_in_metres_and_radians_is_told_what_to_type(
+    calibrated: Bench, scan: Path, poses: Path, tmp_path: Path, fails: Fails, convention: str
+) -> None:
+    """As Universal Robots' programs print it, without a header; what is told works then."""
+    matrices = np.loadtxt(poses).reshape(-1, 3, 4)
+    turns = Rotation.from_matrix(matrices[:, :, :3])
+    angles = turns.as_rotvec() if convention == "rotation-vector" else turns.as_euler("ZYX")
+    numbers = np.column_stack([matrices[:, :, 3] / 1000.0, angles])
+    np.savetxt(poses, numbers, delimiter=",")
+    words = words_of(scan / "images", "--poses", poses, "--camera", calibrated.camera)
+    message = fails(*words, "-o", tmp_path / "no.json")
+    header = "x_m,y_m,z_m,a_rad,b_rad,c_rad"
+    assert f"put the header {header} above the table" in message
+    told = re.search(r"give --euler ([a-z-]+)", message)
+    assert told is not None
+    np.savetxt(poses, numbers, delimiter=",", header=header, comments="")
+    assert main([*words, "--euler", told[1], "-o", str(tmp_path / "yes.json")]) == 0

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from armscan.calibration.hand_eye.board_looks import BoardLook, board_poses
+from armscan.calibration.hand_eye.board_looks import BoardLook, Reading, board_poses
 from armscan.calibration.hand_eye.board_result import BoardHandEyeFit
 from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.on_board import (
@@ -45,7 +45,7 @@ from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording, recording_tables
-from armscan.storage.recordings.robot_poses import read_robot_poses
+from armscan.storage.recordings.robot_poses import other_table_readings, read_robot_poses
 from armscan.vision.targets.detect import settle_target
 from armscan.vision.targets.target import Target, describe_target, format_target, parse_target
 
@@ -113,7 +113,8 @@ class LookSource:
 class _Views:
     """Photographs with the arm's poses, and what else was read.
 
-    ``poses`` and ``postures`` are those of ``exposures``; ``not_used`` are (source, reason).
+    ``poses`` and ``postures`` are those of ``exposures``, ``rows`` their lines in the table of
+    photographs; ``not_used`` are (source, reason).
     """
 
     exposures: tuple[Exposure, ...]
@@ -124,6 +125,7 @@ class _Views:
     is_simulated: bool
     warnings: tuple[str, ...] = ()
     not_used: tuple[tuple[str, str], ...] = ()
+    rows: tuple[int, ...] = ()
 
 
 def calibrate_hand_eye_on_board(
@@ -163,7 +165,9 @@ def calibrate_hand_eye_on_board(
     found = find_targets(views.exposures, plate, cache=job.cache, progress=job.progress)
     bow = find_board_bow(found.views, HeadCameras.of(camera))
     looks, unclear = _looks(found, views, plate, camera, bow)
-    fit = calibrate_on_board(looks, camera, options, bow)
+    fit = calibrate_on_board(
+        looks, camera, options, bow=bow, target=plate, readings=_readings(looks, source, views)
+    )
     parents = ((sensor or camera).provenance,)
     calibrated = source.sensor if source.camera is None else source.camera
     files = [path for path in (*views.paths, *views.tables, calibrated) if path is not None]
@@ -227,6 +231,7 @@ def _photographs(source: LookSource, image_options: ImageOptions) -> _Views:
         paths=tuple(paths),
         tables=(source.poses,),
         is_simulated=are_simulated(paths),
+        rows=tuple(kept),
     )
 
 
@@ -291,6 +296,16 @@ def _looks(
     return looks, tuple(unclear)
 
 
+def _readings(looks: Sequence[BoardLook], source: LookSource, views: _Views) -> Iterator[Reading]:
+    """Other ways to read the looks' poses, of the table that they are from."""
+    if source.poses is None:
+        return
+    row_of = dict(zip(views.postures, views.rows, strict=True))
+    rows = [row_of[look.posture] for look in looks]
+    for words, remedy, turns, shifts in other_table_readings(source.poses, source.euler):
+        yield words, remedy, turns[rows], shifts[rows]
+
+
 def _explained(failure: FitFailure, found: FoundTargets) -> FitFailure:
     """A failure with what may be its cause: no target in some views, or one of another count."""
     if found.wrong_count is not None:
@@ -340,7 +355,10 @@ def _look_data(fit: BoardHandEyeFit, k: int) -> dict[str, Any]:
     return {
         "name": item.posture,
         "source": item.source,
+        "n_points": item.n_points,
         "rms_px": item.rms_px,
+        "tilt_deg": item.tilt_deg,
+        "stand_off_mm": item.stand_off_mm,
         "shift_mm": item.shift_mm,
         "turn_deg": item.turn_deg,
         "left_out_rotation_deg": item.left_out_rotation_deg,

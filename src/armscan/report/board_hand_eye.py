@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -57,7 +58,7 @@ from armscan.vision.targets.target import Target, describe_target
 
 NOISE_TEXT = (
     "The reported pose of a posture is off by a shift, a turn about the origin of Tool and a turn "
-    "about the middle of the target's places. The target's pose in a view has the covariance of "
+    "about the middle of the target's places, the scan point. The target's pose in a view has the covariance of "
     "its points and of the camera. Whatever the poses do not agree about beyond that counts as "
     "scatter of the arm: a target or a base that moved as well."
 )
@@ -173,7 +174,7 @@ def board_hand_eye_page(
         sections,
         cards=(
             *sigma_cards(scanner),
-            *only(told, "arm_position_mm"),
+            *(replace(one, meaning="an axis") for one in only(told, "arm_position_mm")),
             *(item for item in told if item.label in ("Residual", "Condition")),
             *only(of_target, "rms_px"),
         ),

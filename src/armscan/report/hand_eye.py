@@ -93,6 +93,7 @@ def total_covariance(scanner: ScannerCalibration) -> FloatArray:
 def hand_eye_quantities(scanner: ScannerCalibration) -> tuple[Quantity, ...]:
     """What is told of a hand-eye: the transformation, what it rests on, what was left over."""
     hand_eye = scanner.hand_eye
+    is_board = hand_eye.diagnostics is not None and hand_eye.diagnostics.method == "board"
     numbers = hand_eye_numbers(hand_eye, total_covariance(scanner))
     rotation = hand_eye.tool_from_sensor.rotation
     matrix = "\n".join("  ".join(f"{v:+.6f}" for v in row) for row in np.round(rotation, 6))
@@ -132,7 +133,7 @@ def hand_eye_quantities(scanner: ScannerCalibration) -> tuple[Quantity, ...]:
             "Residual",
             hand_eye.rms_mm,
             shown=f"{significant(hand_eye.rms_mm)} mm rms",
-            meaning="from the reference",
+            meaning="from the target's mean place" if is_board else "from the reference",
         ),
         *_evidence(hand_eye),
     )
@@ -286,17 +287,21 @@ def sigma_cards(scanner: ScannerCalibration) -> tuple[Quantity, Quantity]:
     hand_eye = scanner.hand_eye
     alone = hand_eye_numbers(hand_eye, hand_eye.covariance)
     total = hand_eye_numbers(hand_eye, total_covariance(scanner))
+    turn, shift = f"{significant(alone.rotation_sigma_deg, digits=2)}°", alone.size_sigma_mm
+    beside = ["", ""]
+    if scanner.sensor is not None:
+        words = (turn, significant(shift, "mm", 2))
+        beside = [f"; {word} without the sensor's own" for word in words]
     return (
         fact(
             "Sigma of the rotation",
             f"{significant(total.rotation_sigma_deg, digits=2)}°",
-            f"about an axis; {significant(alone.rotation_sigma_deg, digits=2)}° without the "
-            "sensor's own",
+            f"about an axis{beside[0]}",
         ),
         fact(
             "Sigma of the translation",
             significant(total.size_sigma_mm, "mm", 2),
-            f"along an axis; {significant(alone.size_sigma_mm, 'mm', 2)} without the sensor's own",
+            f"along an axis{beside[1]}",
         ),
     )
 

@@ -18,6 +18,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import euler_from_rotations, rotations_from_euler
+from armscan.vision.targets.target import parse_target
 from rigs.board_postures import TRUE_CAMERA, BoardRig, board_rig, misread
 
 
@@ -181,10 +182,24 @@ def test_wrong_poses_do_not_hide_each_other() -> None:
 
 
 def test_a_target_of_another_size_is_refused_and_told() -> None:
-    fit = calibrate_on_board(board_rig(8, scale=1.03).looks, board_rig(8).camera)
+    rig = board_rig(8, scale=1.03)
+    fit = calibrate_on_board(rig.looks, rig.camera)
     assert isinstance(fit, FitFailure)
     asked = float(fit.reason.split("a target of ")[1].split()[0])
     assert asked == pytest.approx(1.03, abs=0.003)
+    told = calibrate_on_board(rig.looks, rig.camera, target=parse_target("chessboard:9x6:25"))
+    assert isinstance(told, FitFailure)
+    assert f"(--target chessboard:9x6:{25.0 * asked:.4g} would suit)" in told.remedy
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.7])
+def test_a_size_that_is_said_too_large_is_not_blamed_on_the_postures(scale: float) -> None:
+    rig = board_rig(15, scale=scale)
+    fit = calibrate_on_board(rig.looks, rig.camera)
+    assert isinstance(fit, FitFailure)
+    assert "times the stated size" in fit.reason and "determine" not in fit.reason
+    told = fit.reason.split("a target of ")[1].split()[0]
+    assert float(told) == pytest.approx(scale, rel=0.01)
 
 
 @pytest.mark.parametrize("scale", [0.1, 25.4])

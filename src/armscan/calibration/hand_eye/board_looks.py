@@ -7,9 +7,10 @@ every pose that their view allows: which one is right, the other looks tell.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain, combinations
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,7 +25,7 @@ from armscan.geometry.poses import Base, Board, Pose, Sensor, Tool
 from armscan.geometry.rotations import nearest_rotation, skew
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.detect import numberings
-from armscan.vision.targets.target import Target, TargetView
+from armscan.vision.targets.target import Target, TargetView, format_target
 
 N_POSE = 6
 MAX_TRIPLES, MAX_SUBSETS = 300, 60
@@ -364,7 +365,9 @@ def _refuse_turns(rows: _Candidates) -> FitFailure:
     )
 
 
-def refuse_far(start: BoardStart, looks: Sequence[BoardLook]) -> FitFailure | None:
+def refuse_far(
+    start: BoardStart, looks: Sequence[BoardLook], target: Target | None = None
+) -> FitFailure | None:
     """Refuse looks that stay away from any board at rest; say whether another size would do."""
     near = [
         look.poses[k].sensor_from_board.apply(middle_of(look.poses[k].view))
@@ -382,14 +385,26 @@ def refuse_far(start: BoardStart, looks: Sequence[BoardLook]) -> FitFailure | No
     if start.typical_rad <= FAR_RAD and left_mm < FAR_PART * min(scale, 1.0) * distance_mm:
         return FitFailure(
             f"{reason}; a target of {scale:.3g} times the stated size would leave {left_mm:.1f} mm",
-            "measure the target's print and give its size (--target); check that the arm's "
-            "positions are in mm",
+            f"measure the target's print and give its size{resized(target, scale)}; check that the "
+            "arm's positions are in mm",
         )
     return FitFailure(
         reason,
         "check the convention of the arm's angles (--euler), that positions are in mm, that poses "
         "and images have the same order, and that target and base did not move",
     )
+
+
+def resized(target: Target | None, scale: float) -> str:
+    """What to type for a target of another size; empty if it is not known."""
+    if target is None:
+        return ""
+    lengths: dict[str, Any] = {
+        one.name: float(f"{scale * getattr(target, one.name):.4g}")
+        for one in fields(target)
+        if one.name.endswith("_mm")
+    }
+    return f" (--target {format_target(replace(target, **lengths))} would suit)"
 
 
 def _size_that_fits(start: BoardStart, looks: Sequence[BoardLook]) -> tuple[float, float]:
@@ -415,16 +430,32 @@ MUCH_BETTER = 0.2
 TRIPLES_OF_READING = 60
 
 
-def better_reading(looks: Sequence[BoardLook], fact: str) -> FitFailure | None:
+Reading: TypeAlias = tuple[str, str, FloatArray, FloatArray]
+"""Words, what to do, and rotations (N, 3, 3) and translations (N, 3) of ``base_from_tool``."""
+CLEARLY = 0.9
+"""Part of what the best reading so far leaves that another one must leave, to be told instead."""
+
+
+def better_reading(
+    looks: Sequence[BoardLook], fact: str, readings: Iterable[Reading] = ()
+) -> FitFailure | None:
     """Refuse in favour of another way to read the arm's poses, if it makes the looks agree.
 
-    Convention, direction, unit and order are tried. ``fact`` says what is wrong as they are read.
+    Parameters
+    ----------
+    looks
+        As they were read.
+    fact
+        What is wrong so.
+    readings
+        Of the table that they are from, the likelier first; after them convention, direction,
+        unit and order are tried.
     """
     given, found = find_board_start(looks), None
     least_mm = np.inf if isinstance(given, FitFailure) else MUCH_BETTER * given.typical_at_lever_mm
     rotations = np.array([look.base_from_tool.rotation for look in looks])
     translations = np.array([look.base_from_tool.translation_mm for look in looks])
-    for words, remedy, turns, shifts in other_readings(rotations, translations):
+    for words, remedy, turns, shifts in chain(readings, other_readings(rotations, translations)):
         read = [
             replace(look, base_from_tool=Pose(turn, shift))
             for look, turn, shift in zip(looks, turns, shifts, strict=True)
@@ -433,7 +464,7 @@ def better_reading(looks: Sequence[BoardLook], fact: str) -> FitFailure | None:
         if isinstance(start, FitFailure) or isinstance(refuse_far(start, read), FitFailure):
             continue
         if start.typical_at_lever_mm < least_mm:
-            least_mm = start.typical_at_lever_mm
+            least_mm = CLEARLY * start.typical_at_lever_mm
             found = FitFailure(
                 f"{fact}; {words} would leave {start.typical_mm:.2f} mm and "
                 f"{np.degrees(start.typical_rad):.2f} degrees (medians)",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.hand_eye.board_looks import BoardLook, BoardPose
+from armscan.calibration.hand_eye.board_looks import BoardLook, BoardPose, resized
 from armscan.calibration.hand_eye.estimate import Conditioning
 from armscan.errors import InputError
 from armscan.geometry.arrays import ArrayRecord, FloatArray, floats
@@ -21,6 +21,7 @@ from armscan.models.calibration import (
     SensorCalibration,
 )
 from armscan.models.camera import CameraModel
+from armscan.vision.targets.target import Target
 
 WRONG_SCALE, NO_SCALE, NO_SCALE_PART = 4.0, 10.0, 0.01
 """As of a sphere's diameter: a size that the poses contradict by so many standard deviations is
@@ -178,7 +179,7 @@ class BoardHandEyeFit(ArrayRecord):
         return ScannerCalibration(moved, replace(hand_eye, dhand_eye_dsensor=wide), provenance)
 
 
-def refuse_scale(asked: AskedScale) -> FitFailure | None:
+def refuse_scale(asked: AskedScale, target: Target | None) -> FitFailure | None:
     """Refuse a target of which the arm's shifts say that it has quite another size."""
     off = abs(asked.scale - 1.0)
     if asked.sigma > TOLD_SCALE or off < max(
@@ -187,17 +188,18 @@ def refuse_scale(asked: AskedScale) -> FitFailure | None:
         return None
     return FitFailure(
         f"the arm's shifts ask for a target of {asked}",
-        "measure the target's print and give its size (--target); check that the camera's "
+        f"measure the target's print and give its size{resized(target, asked.scale)}; check that "
+        "the camera's "
         "calibration is this one, and that the arm's positions are in mm",
     )
 
 
-def scale_warnings(asked: AskedScale) -> tuple[str, ...]:
+def scale_warnings(asked: AskedScale, target: Target | None) -> tuple[str, ...]:
     """Warn of a target that the arm's shifts say has another size."""
     off = abs(asked.scale - 1.0)
     if asked.sigma > TOLD_SCALE or off < WRONG_SCALE * max(asked.if_known, asked.sigma):
         return ()
     return (
-        f"the arm's shifts ask for a target of {asked}: check the print's size, and the camera's "
-        "focal length",
+        f"the arm's shifts ask for a target of {asked}: check the print's size"
+        f"{resized(target, asked.scale)}, and the camera's focal length",
     )

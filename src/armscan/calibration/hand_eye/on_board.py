@@ -11,7 +11,7 @@ the problem robot-world and hand-eye).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from armscan.calibration.hand_eye.board_looks import (
     BoardLook,
     BoardPose,
     BoardStart,
+    Reading,
     better_reading,
     find_board_start,
     middle_of,
@@ -42,7 +43,12 @@ from armscan.calibration.hand_eye.checks import (
     influence_warnings,
     refuse_hardly_determined,
 )
-from armscan.calibration.hand_eye.estimate import Conditioning, LeftOut, conditioning_of
+from armscan.calibration.hand_eye.estimate import (
+    LEVER_MM,
+    Conditioning,
+    LeftOut,
+    conditioning_of,
+)
 from armscan.calibration.hand_eye.noise import (
     NoiseComponent,
     NoiseEstimate,
@@ -69,6 +75,7 @@ from armscan.models.calibration import (
     HandEyeDiagnostics,
 )
 from armscan.models.camera import CameraModel
+from armscan.vision.targets.target import Target
 
 N_UNKNOWN = 12
 LEAST_LOOKS = 4
@@ -85,7 +92,10 @@ def calibrate_on_board(
     looks: Sequence[BoardLook],
     camera: CameraCalibration,
     options: HandEyeOptions | None = None,
+    *,
     bow: BoardBow | None = None,
+    target: Target | None = None,
+    readings: Iterable[Reading] = (),
 ) -> BoardHandEyeFit | FitFailure:
     """Find where the camera sits on the arm's last link from looks at a target that stays put.
 
@@ -99,6 +109,10 @@ def calibrate_on_board(
         The arm's scatter, where it is known; else it is estimated.
     bow
         Of the target, with which its poses were found; None if it is flat.
+    target
+        For the words about its size.
+    readings
+        Other ways to read the arm's poses, of all looks, that are tried where they do not fit.
 
     Returns
     -------
@@ -115,12 +129,13 @@ def calibrate_on_board(
     notes: tuple[str, ...] = ()
     if len(used) < len(looks):
         notes = (f"{len(used)} of {len(looks)} looks at the target were used, evenly spread",)
-    found = _calibrated(used, camera, options, bow)
+    others = ((words, do, turns[spread], shifts[spread]) for words, do, turns, shifts in readings)
+    found = _calibrated(used, camera, options, bow, target)
     if isinstance(found, FitFailure):
-        better = better_reading(used, found.reason)
+        better = better_reading(used, found.reason, others)
         return found if better is None else better
     if found.not_used or is_wide(found.calibration.arm_noise):
-        better = better_reading(used, "the arm's poses and the views hardly agree")
+        better = better_reading(used, "the arm's poses and the views hardly agree", others)
         if better is not None:
             return better
     if not camera.has_covariance:
@@ -136,12 +151,13 @@ def _calibrated(
     camera: CameraCalibration,
     options: HandEyeOptions,
     bow: BoardBow | None,
+    target: Target | None,
 ) -> BoardHandEyeFit | FitFailure:
     """The hand-eye of poses that mean what they are read as."""
     start = find_board_start(looks)
     if isinstance(start, FitFailure):
         return start
-    refused = refuse_far(start, looks)
+    refused = refuse_far(start, looks, target)
     if refused is not None:
         return refused
     # A scatter that was given does not make looks wrong: which are, the others' own scatter says.
@@ -152,7 +168,7 @@ def _calibrated(
     solution = _solve(replace(problem.without(list(wrong)), options=options))
     if isinstance(solution, FitFailure):
         return solution
-    return _evidence(solution, tuple(wrong.values()))
+    return _evidence(solution, tuple(wrong.values()), target)
 
 
 def _refuse_few(looks: Sequence[BoardLook]) -> FitFailure | None:
@@ -470,7 +486,7 @@ def _middle_off_mm(problem: _Problem, row: int) -> float:
 
 
 def _evidence(
-    solution: _Solution, not_used: tuple[tuple[str, str], ...]
+    solution: _Solution, not_used: tuple[tuple[str, str], ...], target: Target | None
 ) -> BoardHandEyeFit | FitFailure:
     """The result with what it rests on, or why it cannot be trusted."""
     system, problem = solution.system, solution.system.problem
@@ -482,8 +498,10 @@ def _evidence(
         asked = _asked_scale(solution)
     except (EstimationError, np.linalg.LinAlgError) as error:
         return FitFailure(f"{_NOTHING.reason} ({error})", TURN_MORE)
-    refused = refuse_hardly_determined(conditioning, MOST_OPEN_MM, "", TURN_MORE)
-    refused = refused if refused is not None else refuse_scale(asked)
+    # a wrong size swells the scatter, so that the postures seem to determine little
+    refused = refuse_scale(asked, target)
+    if refused is None:
+        refused = refuse_hardly_determined(conditioning, MOST_OPEN_MM, "", TURN_MORE)
     if refused is not None:
         return refused
     root = problem.root[: len(problem.camera.covariance)]
@@ -515,7 +533,8 @@ def _evidence(
         *(f"{source} {reason}" for source, reason in not_used),
         *conditioning_warnings(conditioning.under(covariance), len(problem.looks), ""),
         *influence_warnings(names, left, own),
-        *scale_warnings(asked),
+        *scale_warnings(asked, target),
+        *_camera_warnings(own + follow @ problem.camera.covariance @ follow.T),
         *_scatter_warnings(solution),
     )
     return BoardHandEyeFit(
@@ -637,6 +656,19 @@ def _asked_scale(solution: _Solution) -> AskedScale:
         float(np.sqrt(matrix[-1, -1])) for matrix in (whole.matrix, linear.covariance)
     )
     return AskedScale(1.0 + float(linear.step[-1]), sigma, if_known)
+
+
+def _camera_warnings(beside_camera: FloatArray) -> tuple[str, ...]:
+    """Warn of a hand-eye that the camera's own uncertainty leaves nearly open."""
+    scale = np.array([LEVER_MM] * 3 + [1.0] * 3)
+    worst = np.linalg.eigvalsh(beside_camera * scale[:, None] * scale)[-1]
+    if worst < MOST_OPEN_MM**2:
+        return ()
+    return (
+        f"beside the camera as it was given, the hand-eye is known to {np.sqrt(worst):.0f} mm only "
+        f"in one direction (turns counted at {LEVER_MM:.0f} mm): the camera's calibration decides "
+        "that; calibrate it from more views, tilted to all sides",
+    )
 
 
 LARGE_ARM_MM, LARGE_ARM_RAD = 0.5, np.radians(0.2)

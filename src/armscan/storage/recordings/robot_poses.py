@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -181,6 +183,9 @@ HEADERS = (
 """Headers that are understood, without units and case."""
 METRES = re.compile(r"^x[_ (\[]*m\b", re.IGNORECASE)
 """The first word of a header whose positions are in metres."""
+METRES_COMMENT = re.compile(rb"^[ \t]*#.*\bmet(re|er)s\b", re.IGNORECASE | re.MULTILINE)
+OF_MATRIX = re.compile(r"^[a-z]+_?[0-4]_?[0-4]$", re.IGNORECASE)
+"""Names of a matrix's numbers, which stand row by row."""
 UNIT_OF_ANGLE = re.compile(r"[_ (\[](rad|deg)", re.IGNORECASE)
 N_ANGLES, N_QUATERNION, N_ROWS, N_MATRIX = 6, 7, 12, 16
 HOW_TO_WRITE = (
@@ -200,7 +205,7 @@ def read_robot_poses(path: Path, convention: EulerConvention) -> tuple[Pose[Base
     ``extrinsic-xyz``), or a rotation vector in rad, or as a header's ``a_rad`` or ``rx [deg]``
     says; or the matrix of ``base_from_tool``, 3 x 4 or 4 x 4, in one line or one line
     a row; or x, y, z and a quaternion, whose order the header says. Positions are in metres under a
-    header that begins with ``x_m`` or ``x [m]``.
+    header that begins with ``x_m`` or ``x [m]``, and where a comment says ``metres``.
 
     Raises
     ------
@@ -208,43 +213,101 @@ def read_robot_poses(path: Path, convention: EulerConvention) -> tuple[Pose[Base
         If the file is missing, cut, or a pose is none of these or not finite, or positions are in
         metres under the name of millimetres.
     """
-    data = read_bytes(path)
-    where = str(path)
-    is_json = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
-    header, rows, places = _from_json(data, where) if is_json else _from_text(data, where)
-    if not rows:
-        raise FileFormatError("the file holds no pose", where=where, remedy=HOW_TO_WRITE)
-    factor = 1000.0 if header and METRES.match(header[0]) else 1.0
-    positions, rotations = _poses_of(header, rows, places, convention)
-    positions = factor * positions
+    table, where = _read_table(path), str(path)
+    positions, rotations = table.poses(convention)
     refuse_beyond_reach(positions, where)
     if are_surely_metres(rotations, positions):
         raise FileFormatError(
             "the tool turns but stays within 10 mm of Base's origin: positions look like metres",
             where=where,
-            remedy=f"say so in a header, x_m,y_m,z_m and so on, or {METRES_REMEDY}",
+            remedy=f"say so in a header, x_m,y_m,z_m and so on, or above matrices in a comment "
+            f"(# metres), or {METRES_REMEDY}",
         )
     return tuple(Pose(one, place) for one, place in zip(rotations, positions, strict=True))
 
 
-def _poses_of(
-    header: Sequence[str],
-    rows: Sequence[Sequence[float]],
-    places: Sequence[str],
-    convention: EulerConvention,
-) -> tuple[FloatArray, FloatArray]:
+def other_table_readings(
+    path: Path, convention: EulerConvention
+) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
+    """Other ways to read a table that `read_robot_poses` has read with a convention.
+
+    Yields
+    ------
+    words, remedy
+        What is read otherwise, and what to type.
+    rotations, translations_mm
+        (N, 3, 3) and (N, 3) of ``base_from_tool`` then.
+    """
+    table = _read_table(path)
+    if len(table.rows[0]) != N_ANGLES:
+        if not table.is_metres:
+            rotations, positions = table.poses(convention)[::-1]
+            words = "reading the positions as metres"
+            yield words, "write # metres above the matrices", rotations, 1000.0 * positions
+        return
+    numbers = np.array(table.rows)
+    first = (convention, *(one for one in get_args(EulerConvention) if one != convention))
+    for meant, is_rad, is_metres in product(first, (False, True), (False, True)):
+        if (meant, is_rad, is_metres) == (convention, table.is_rad(convention), table.is_metres):
+            continue
+        angles = numbers[:, 3:] if is_rad else np.radians(numbers[:, 3:])
+        units = f"{'metres' if is_metres else 'mm'} and {'radians' if is_rad else 'degrees'}"
+        header = ("x_m,y_m,z_m," if is_metres else "x,y,z,") + (
+            "a_rad,b_rad,c_rad" if is_rad else "a_deg,b_deg,c_deg"
+        )
+        yield (
+            f"reading the table in {units}, its angles as {meant},",
+            f"put the header {header} above the table, and give --euler {meant}",
+            rotations_from_euler(angles, meant),
+            (1000.0 if is_metres else 1.0) * numbers[:, :3],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PoseTable:
+    """Numbers of poses as they are written; ``places`` are their lines, for messages."""
+
+    header: list[str]
+    rows: list[list[float]]
+    places: list[str]
+    is_metres: bool
+
+    def is_rad(self, convention: EulerConvention) -> bool:
+        """Whether angles are in radians; rotation vectors are, unless the header says else."""
+        unit = UNIT_OF_ANGLE.search(self.header[3]) if len(self.header) > 3 else None
+        return convention == "rotation-vector" if unit is None else unit[1].lower() == "rad"
+
+    def poses(self, convention: EulerConvention) -> tuple[FloatArray, FloatArray]:
+        """Positions (N, 3) in mm, and rotations (N, 3, 3)."""
+        positions, rotations = _poses_of(self, convention)
+        return (1000.0 if self.is_metres else 1.0) * positions, rotations
+
+
+def _read_table(path: Path) -> _PoseTable:
+    data, where = read_bytes(path), str(path)
+    is_json = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
+    header, rows, places = _from_json(data, where) if is_json else _from_text(data, where)
+    if not rows:
+        raise FileFormatError("the file holds no pose", where=where, remedy=HOW_TO_WRITE)
+    is_metres = bool(header and METRES.match(header[0])) or bool(METRES_COMMENT.search(data))
+    return _PoseTable(header, rows, places, is_metres)
+
+
+def _poses_of(given: _PoseTable, convention: EulerConvention) -> tuple[FloatArray, FloatArray]:
     """Positions (N, 3) as written, and rotations (N, 3, 3)."""
-    n, names = len(rows[0]), _plain(header)
+    rows, places = given.rows, given.places
+    n, names = len(rows[0]), _plain(given.header)
     counts = (N_QUATERNION,) if names[3:4] in (("qw",), ("qx",)) else (N_ANGLES, N_ROWS, N_MATRIX)
     for row, place in zip(rows, places, strict=True):
         if len(row) != n or n not in counts:
             kind = "seven" if N_QUATERNION in counts else "six"
-            raise FileFormatError(f"a pose is not {kind} numbers", where=place, remedy=HOW_TO_WRITE)
+            count = f": here are {len(row)}" if len(row) != 1 else ""
+            raise FileFormatError(
+                f"a pose is not {kind} numbers{count}", where=place, remedy=HOW_TO_WRITE
+            )
     table = np.array(rows)
     if n == N_ANGLES:
-        unit = UNIT_OF_ANGLE.search(header[3]) if header else None
-        is_rad = convention == "rotation-vector" if unit is None else unit[1].lower() == "rad"
-        angles = np.degrees(table[:, 3:]) if is_rad else table[:, 3:]
+        angles = np.degrees(table[:, 3:]) if given.is_rad(convention) else table[:, 3:]
         return table[:, :3], rotations_of_form(angles, "euler", convention, places)
     if n == N_QUATERNION:
         turn = table[:, 3:] if names[3] == "qw" else np.roll(table[:, 3:], 1, axis=1)
@@ -304,7 +367,8 @@ def _from_text(data: bytes, where: str) -> tuple[list[str], list[list[float]], l
         titles = re.split(r"\s*[,;]\s*|\s+(?![(\[])", line.strip())
         if not words:
             continue
-        if not rows and not header and _plain(titles) in HEADERS:
+        is_header = _plain(titles) in HEADERS or all(map(OF_MATRIX.match, words))
+        if not rows and not header and is_header:
             header = titles
             continue
         places.append(f"{where}, line {number}")

@@ -217,7 +217,7 @@ def stereo(
     )
 
 
-@job_command(Document, Path("scanner.json"), also=OF_CALIBRATIONS)
+@job_command(Document, Path("scanner.json"), also="force cache")
 def hand_eye_target(
     *,
     images: Photographs = None,
@@ -241,7 +241,10 @@ def hand_eye_target(
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
 ) -> Work:
-    """Find where the camera sits on the arm, from views of a target at rest."""
+    """Find where the camera sits on the arm.
+
+    From views of a target at rest and the arm's poses, without a laser.
+    """
     from armscan.calibration.hand_eye.observations import HandEyeOptions
     from armscan.geometry.rotations import check_convention
     from armscan.jobs.board_hand_eye import LookSource, calibrate_hand_eye_on_board

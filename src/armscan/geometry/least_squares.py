@@ -81,6 +81,17 @@ def pseudo_inverse(matrix: FloatArray, share: float) -> FloatArray:
     return np.asarray((vectors[:, kept] / values[kept]) @ vectors[:, kept].T)
 
 
+def scaled_inverse(covariance: FloatArray) -> FloatArray:
+    """Pseudo-inverse (P, P) of a covariance of parameters of different units.
+
+    It is found in units that make the diagonal one, so that no parameter is lost for its unit.
+    """
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    unit = np.where(scale > 0.0, scale, 1.0)
+    units = np.outer(unit, unit)
+    return np.asarray(pseudo_inverse(covariance / units, 1e-12) / units)
+
+
 def square_root(covariance: FloatArray, name: str = "the covariance") -> FloatArray:
     """(P, R) matrix L with ``L L' = covariance`` (P, P), also for one without full rank R.
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from armscan.calibration.hand_eye.alternatives import other_readings
 from armscan.calibration.hand_eye.board_looks import BoardLook, Reading, board_poses
 from armscan.calibration.hand_eye.board_result import BoardHandEyeFit
 from armscan.calibration.hand_eye.observations import HandEyeOptions
@@ -34,7 +35,7 @@ from armscan.records.exposure import Exposure
 from armscan.report.board_hand_eye import board_hand_eye_page, board_quantities, look_table
 from armscan.report.hand_eye import TITLE, hand_eye_quantities
 from armscan.report.photographs import refused_page, tried_targets
-from armscan.report.quantity import Quantity, Summary, sentences
+from armscan.report.quantity import Quantity, Summary, sentences, without_source
 from armscan.storage.arm import read_arm_model
 from armscan.storage.documents import (
     read_camera_calibration,
@@ -42,13 +43,14 @@ from armscan.storage.documents import (
     scanner_document,
 )
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
-from armscan.storage.images import ImageOptions, check_same_size, read_exposures
+from armscan.storage.images import ImageOptions, check_same_size, read_exposures, source_names
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording, recording_tables
 from armscan.storage.recordings.robot_poses import other_table_readings, read_robot_poses
 from armscan.vision.targets.detect import settle_target
 from armscan.vision.targets.target import Target, describe_target, format_target, parse_target
 
+EULER: EulerConvention = "extrinsic-xyz"
 MOST_ROWS = 2 * MAX_LOOKS
 """Of a longer recording, the target is looked for in so many exposures, evenly spread."""
 
@@ -64,7 +66,7 @@ class LookSource:
     poses
         Table of the robot's poses, one a photograph.
     euler
-        What angles in ``poses`` mean.
+        What angles in ``poses`` mean; None for ``extrinsic-xyz``.
     scan
         Recording with an arm, instead of photographs.
     arm
@@ -82,7 +84,7 @@ class LookSource:
 
     images: tuple[str, ...] = ()
     poses: Path | None = None
-    euler: EulerConvention = "extrinsic-xyz"
+    euler: EulerConvention | None = None
     scan: Path | None = None
     arm: Path | None = None
     camera: Path | None = None
@@ -102,6 +104,11 @@ class LookSource:
                 else "nothing to calibrate from",
                 remedy="name a recording's folder, or photographs with --poses",
             )
+        vain = ("--arm", self.arm) if self.images else ("--euler", self.euler)
+        if vain[1] is not None:
+            other = "photographs have a table of poses" if self.images else "a recording says so"
+            fact = f"{vain[0]} is without effect: {other}"
+            raise OptionError(fact, remedy=f"leave {vain[0]} out")
         if bool(self.images) != (self.poses is not None):
             raise OptionError(
                 "photographs and poses belong together",
@@ -114,7 +121,7 @@ class _Views:
     """Photographs with the arm's poses, and what else was read.
 
     ``poses`` and ``postures`` are those of ``exposures``, ``rows`` their lines in the table of
-    photographs; ``not_used`` are (source, reason).
+    photographs; ``not_used`` are (source, reason); ``convention`` is that of a recording's angles.
     """
 
     exposures: tuple[Exposure, ...]
@@ -126,6 +133,7 @@ class _Views:
     warnings: tuple[str, ...] = ()
     not_used: tuple[tuple[str, str], ...] = ()
     rows: tuple[int, ...] = ()
+    convention: EulerConvention | None = None
 
 
 def calibrate_hand_eye_on_board(
@@ -163,7 +171,9 @@ def calibrate_hand_eye_on_board(
     check_same_size(views.exposures)
     plate = settle_target(views.exposures, plate)
     found = find_targets(views.exposures, plate, cache=job.cache, progress=job.progress)
-    bow = find_board_bow(found.views, HeadCameras.of(camera))
+    # views of a target that quarter turns leave alike do not tell along which side it is bowed
+    is_square = any(turns % 2 for turns in plate.symmetric_turns)
+    bow = None if is_square else find_board_bow(found.views, HeadCameras.of(camera))
     looks, unclear = _looks(found, views, plate, camera, bow)
     fit = calibrate_on_board(
         looks, camera, options, bow=bow, target=plate, readings=_readings(looks, source, views)
@@ -183,7 +193,7 @@ def calibrate_hand_eye_on_board(
         )  # fmt: skip
         job.refuse(page, _explained(fit, found))
     fit = replace(fit, not_used=(*not_used, *fit.not_used))
-    warnings = (*views.warnings, *fit.warnings)
+    warnings = (*views.warnings, *_not_used_warnings(not_used), *fit.warnings)
     provenance = job.provenance(
         files,
         (plate, options, image_options),
@@ -213,22 +223,22 @@ def _photographs(source: LookSource, image_options: ImageOptions) -> _Views:
     if source.poses is None:
         raise OptionError("photographs need a table of poses", remedy="give --poses")
     paths = expand_paths(source.images)
-    poses = read_robot_poses(source.poses, source.euler)
+    poses = read_robot_poses(source.poses, source.euler or EULER)
     if len(poses) != len(paths):
         raise InputError(
             f"{len(paths)} photographs but {len(poses)} poses",
             where=str(source.poses),
             remedy="give one pose a photograph, in the photographs' order",
         )
-    exposures = read_exposures(paths, image_options)
-    sources = [exposure.source for exposure in exposures]
-    gone = set(named_by(source.leave_out, sources, "--leave-out"))
-    kept = [k for k, name in enumerate(sources) if name not in gone]
+    names = source_names(paths)
+    gone = set(named_by(source.leave_out, names, "--leave-out"))
+    kept = [k for k, name in enumerate(names) if name not in gone]
+    exposures = read_exposures([paths[k] for k in kept], image_options)
     return _Views(
-        exposures=tuple(exposures[k] for k in kept),
+        exposures=exposures,
         poses=tuple(poses[k] for k in kept),
-        postures=tuple(sources[k] for k in kept),
-        paths=tuple(paths),
+        postures=tuple(exposure.source for exposure in exposures),
+        paths=tuple(paths[k] for k in kept),
         tables=(source.poses,),
         is_simulated=are_simulated(paths),
         rows=tuple(kept),
@@ -273,6 +283,7 @@ def _scan_views(source: LookSource) -> _Views:
             *((note,) if n_other else ()),
         ),
         not_used=tuple(without),
+        convention=recording.session.rotation if recording.session.pose_form == "euler" else None,
     )
 
 
@@ -299,11 +310,24 @@ def _looks(
 def _readings(looks: Sequence[BoardLook], source: LookSource, views: _Views) -> Iterator[Reading]:
     """Other ways to read the looks' poses, of the table that they are from."""
     if source.poses is None:
+        if views.convention is not None:
+            turns = np.array([look.base_from_tool.rotation for look in looks])
+            shifts = np.array([look.base_from_tool.translation_mm for look in looks])
+            yield from other_readings(turns, shifts, views.convention)
         return
     row_of = dict(zip(views.postures, views.rows, strict=True))
     rows = [row_of[look.posture] for look in looks]
-    for words, remedy, turns, shifts in other_table_readings(source.poses, source.euler):
+    for words, remedy, turns, shifts in other_table_readings(source.poses, source.euler or EULER):
         yield words, remedy, turns[rows], shifts[rows]
+
+
+def _not_used_warnings(not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:
+    """Name the views that give no pose of the target, with the reasons of the first."""
+    if not not_used:
+        return ()
+    named = ", ".join(f"{source} ({without_source(source, why)})" for source, why in not_used[:4])
+    more = f" and {len(not_used) - 4} more" if len(not_used) > 4 else ""
+    return (f"{len(not_used)} views were not used: {named}{more}",)
 
 
 def _explained(failure: FitFailure, found: FoundTargets) -> FitFailure:

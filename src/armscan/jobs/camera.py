@@ -277,8 +277,8 @@ def _camera_summary(
         tables=(table,) if rows else (),
         warnings=sentences((*read.warnings, *fit.warnings)),
         written=tuple(written),
-        next_step=f"open {written[-1]}, then `armscan calibrate laser --camera {written[0]} -h`, or on "
-        f"an arm without a laser `armscan calibrate hand-eye-target --camera {written[0]} -h`",
+        next_step=f"open {written[-1]}, then `armscan calibrate laser --camera {written[0]} -h`; "
+        f"on an arm without a laser `armscan calibrate hand-eye-target --camera {written[0]} -h`",
         extra={
             "kind": "camera calibration",
             "simulated": read.is_simulated,

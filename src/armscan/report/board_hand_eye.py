@@ -58,9 +58,9 @@ from armscan.vision.targets.target import Target, describe_target
 
 NOISE_TEXT = (
     "The reported pose of a posture is off by a shift, a turn about the origin of Tool and a turn "
-    "about the middle of the target's places, the scan point. The target's pose in a view has the covariance of "
-    "its points and of the camera. Whatever the poses do not agree about beyond that counts as "
-    "scatter of the arm: a target or a base that moved as well."
+    "about the middle of the target's places, the scan point. The target's pose in a view has the "
+    "covariance of its points and of the camera. Whatever the poses do not agree about beyond that "
+    "counts as scatter of the arm: a target or a base that moved as well."
 )
 
 

@@ -10,16 +10,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from armscan.calibration.hand_eye.alternatives import other_readings
 from armscan.calibration.hand_eye.board_looks import BoardLook, find_board_start
 from armscan.calibration.hand_eye.board_result import BoardHandEyeFit
 from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.on_board import _Problem, calibrate_on_board
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotations import euler_from_rotations, rotations_from_euler
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import (
+    EulerConvention,
+    euler_from_rotations,
+    rotations_from_euler,
+)
 from armscan.vision.targets.target import parse_target
 from rigs.board_postures import TRUE_CAMERA, BoardRig, board_rig, misread
+from rigs.calibration_documents import sensor_calibration
 
 
 def solved(rig: BoardRig) -> BoardHandEyeFit:
@@ -172,7 +178,7 @@ def test_a_third_of_wrong_poses_is_refused() -> None:
         rig = misread(rig, row, 15.0 + row)
     fit = calibrate_on_board(rig.looks, rig.camera)
     assert isinstance(fit, FitFailure)
-    assert "4 of 12 looks contradict the others (1.png, 4.png, 6.png, 9.png ...)" in fit.reason
+    assert "4 of 12 postures contradict the others (1.png, 4.png, 6.png, 9.png ...)" in fit.reason
 
 
 def test_wrong_poses_do_not_hide_each_other() -> None:
@@ -241,42 +247,106 @@ def test_three_postures_are_too_few() -> None:
     assert fit.reason.startswith("3 postures with the target and the arm's pose are too few")
 
 
-def _inverse(look: BoardLook) -> BoardLook:
-    pose = look.base_from_tool
-    return replace(
-        look, base_from_tool=Pose(pose.rotation.T, -pose.rotation.T @ pose.translation_mm)
-    )
-
-
-def _kuka_as_fanuc(look: BoardLook) -> BoardLook:
-    pose = look.base_from_tool
-    angles = euler_from_rotations(pose.rotation[None], "intrinsic-zyx")
-    read = rotations_from_euler(angles, "extrinsic-xyz")[0]
-    return replace(look, base_from_tool=Pose(read, pose.translation_mm))
-
-
-def _in_radians(look: BoardLook) -> BoardLook:
-    pose = look.base_from_tool
-    angles = np.radians(euler_from_rotations(pose.rotation[None], "extrinsic-xyz"))
-    read = rotations_from_euler(angles, "extrinsic-xyz")[0]
-    return replace(look, base_from_tool=Pose(read, pose.translation_mm))
+def as_read(
+    rig: BoardRig, read: EulerConvention, meant: EulerConvention
+) -> tuple[list[BoardLook], FloatArray, FloatArray]:
+    """The looks of a table that was written in one convention and is read in another."""
+    rotations = np.array([look.base_from_tool.rotation for look in rig.looks])
+    places = np.array([look.base_from_tool.translation_mm for look in rig.looks])
+    misread = rotations_from_euler(euler_from_rotations(rotations, meant), read)
+    looks = [
+        replace(look, base_from_tool=Pose(turn, place))
+        for look, turn, place in zip(rig.looks, misread, places, strict=True)
+    ]
+    return looks, misread, places
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("read", "meant"),
     [
-        (_in_radians, ") as radians"),
-        (_inverse, "as tool_from_base"),
-        (_kuka_as_fanuc, "as intrinsic-zyx"),
+        ("extrinsic-xyz", "intrinsic-zyx"),
+        ("intrinsic-zyx", "extrinsic-xyz"),
+        ("extrinsic-xyz", "intrinsic-xyz"),
+        ("intrinsic-zxz", "intrinsic-zyx"),
+        ("intrinsic-xyz", "intrinsic-zxz"),
     ],
 )
-def test_poses_that_mean_something_else_are_recognised(change, said: str) -> None:  # type: ignore[no-untyped-def]
+def test_the_convention_that_is_told_is_the_right_one(
+    read: EulerConvention, meant: EulerConvention
+) -> None:
     rig = board_rig(11, arm_mm=0.3)
-    looks = [change(look) for look in rig.looks]
+    looks, turns, places = as_read(rig, read, meant)
+    told = calibrate_on_board(looks, rig.camera, readings=other_readings(turns, places, read))
+    assert isinstance(told, FitFailure)
+    assert f"were read as {read}, reading them as {meant} would leave " in told.reason
+    assert told.remedy.startswith(f"give the rotation convention {meant}")
+
+
+def test_inverse_poses_are_told_with_what_they_may_be() -> None:
+    rig = board_rig(11, arm_mm=0.3)
+    looks = [replace(one, base_from_tool=inverse(one.base_from_tool)) for one in rig.looks]
     told = calibrate_on_board(looks, rig.camera)
     assert isinstance(told, FitFailure)
-    assert said in told.reason and "would leave 0." in told.reason
-    assert told.remedy.startswith(("give ", "write "))
+    assert "as tool_from_base would leave 0." in told.reason
+    assert "a camera at rest before a target that the arm holds" in told.remedy
+
+
+def inverse(pose: Pose[Base, Tool]) -> Pose[Base, Tool]:
+    return Pose(pose.rotation.T, -pose.rotation.T @ pose.translation_mm)
+
+
+def with_images(rig: BoardRig, count: int) -> BoardRig:
+    """Every posture with so many images: the arm's error is the posture's."""
+    names = [f"p{k // count}" for k in range(len(rig.looks))]
+    held = [rig.looks[count * (k // count)] for k in range(len(rig.looks))]
+    looks = []
+    for look, first, name in zip(rig.looks, held, names, strict=True):
+        looks.append(replace(first, posture=name, poses=first.poses))
+        assert look is not None
+    return replace(rig, looks=tuple(looks))
+
+
+def test_images_of_one_posture_do_not_vouch_for_its_pose() -> None:
+    """Twelve postures of three images each, one posture thrown: it goes, with all its images."""
+    rig = with_images(board_rig(16, 36), 3)
+    for row in (12, 13, 14):
+        rig = misread(rig, row, 3.0)
+    fit = solved(rig)
+    assert {source for source, _ in fit.not_used} == {"12.png"} and len(fit.not_used) == 3
+    assert fit.calibration.n_postures == 11
+    single = board_rig(16, 36)
+    once = calibrate_on_board(
+        [look for k, look in enumerate(single.looks) if k % 3 == 0 and k != 12], single.camera
+    )
+    assert isinstance(once, BoardHandEyeFit)
+    ratio = np.diag(covariance(fit)) / np.diag(covariance(once))
+    assert ratio.min() > 0.6  # images of one posture tell nothing more of the arm
+
+
+def test_the_scanner_moves_with_the_camera() -> None:
+    """What the sheets share with the camera follows it, by the sensor's covariance."""
+    rig = board_rig(17)
+    fit = solved(rig)
+    sensor = sensor_calibration()
+    generator = np.random.default_rng(0)
+    n = len(sensor.parameter_names)
+    mix = np.eye(n) + 0.1 * generator.normal(size=(n, n))
+    whole = mix @ np.diag(np.full(n, 1e-4)) @ mix.T
+    scale = np.sqrt(np.diag(rig.camera.covariance)[:4] / np.diag(whole)[:4])
+    whole[:4] *= scale[:, None]
+    whole[:, :4] *= scale
+    sensor = replace(sensor, covariance=whole)
+    scanner = fit.scanner(sensor, rig.camera.provenance)
+    moved = scanner.sensor
+    assert moved is not None
+    by_camera = whole[:, :9] @ np.linalg.inv(whole[:9, :9])
+    after = whole + by_camera @ (fit.camera_covariance - whole[:9, :9]) @ by_camera.T
+    np.testing.assert_allclose(moved.covariance, after, rtol=1e-6, atol=1e-12)
+    step = by_camera @ fit.camera_step
+    np.testing.assert_allclose(
+        moved.camera.camera.parameters - sensor.camera.camera.parameters, step[:9], atol=1e-9
+    )
+    assert moved.sheets[0].sheet != sensor.sheets[0].sheet
 
 
 def test_nothing_is_told_of_poses_that_fit_in_no_way() -> None:

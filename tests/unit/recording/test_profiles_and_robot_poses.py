@@ -144,7 +144,11 @@ def test_the_convention_decides_what_the_angles_mean(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("1 2 3 4 5\n", "line 1: a pose is not six numbers"),
-        ("Z,Y,X,W,P,R\n1 2 3 4 5 6\n", "line 1: a pose is not six numbers"),
+        ("Z,Y,X,W,P,R\n1 2 3 4 5 6\n", "line 1: the header Z,Y,X,W,P,R is not understood"),
+        ("x_cm,y_cm,z_cm,a,b,c\n1 2 3 4 5 6\n", "the units of the header"),
+        ("x_mm,y_m,z_mm,a,b,c\n1 2 3 4 5 6\n", "the units of the header"),
+        ("x,y,z,a_gon,b_gon,c_gon\n1 2 3 4 5 6\n", "the units of the header"),
+        ("1 2 3 nan 5 6\n", "line 1: a pose is not six numbers"),
         ('{"RobPoses": [[1, 2, 3, 4, 5, null]]}', "pose 1: a pose is not six numbers"),
         ('{"Poses": []}', "no list called RobPoses"),
         ("# nothing\n", "no pose"),

@@ -553,11 +553,14 @@ def find_reading(
 
 
 def other_readings(
-    rotations: FloatArray, translations: FloatArray
+    rotations: FloatArray, translations: FloatArray, convention: EulerConvention | None = None
 ) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
-    """Other ways to read (N, 3, 3) and (N, 3) of ``base_from_tool``: words, remedy, and both so."""
+    """Other ways to read (N, 3, 3) and (N, 3) of ``base_from_tool``: words, remedy, and both so.
+
+    ``convention`` is that of the angles as they were read; None tries each.
+    """
     names: tuple[EulerConvention, ...] = get_args(EulerConvention)
-    for read in names:
+    for read in names if convention is None else (convention,):
         angles = euler_from_rotations(rotations, read)
         for meant in names:
             if meant != read:

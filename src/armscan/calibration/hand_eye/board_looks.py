@@ -430,6 +430,10 @@ MUCH_BETTER = 0.2
 TRIPLES_OF_READING = 60
 
 
+AT_REST = (
+    "; a camera at rest before a target that the arm holds looks so, too: that is no scanner on an "
+    "arm, and not solved here"
+)
 Reading: TypeAlias = tuple[str, str, FloatArray, FloatArray]
 """Words, what to do, and rotations (N, 3, 3) and translations (N, 3) of ``base_from_tool``."""
 CLEARLY = 0.9
@@ -468,6 +472,6 @@ def better_reading(
             found = FitFailure(
                 f"{fact}; {words} would leave {start.typical_mm:.2f} mm and "
                 f"{np.degrees(start.typical_rad):.2f} degrees (medians)",
-                remedy,
+                remedy + (AT_REST if "tool_from_base" in words else ""),
             )
     return found

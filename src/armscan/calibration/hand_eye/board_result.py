@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.calibration.hand_eye.board_looks import BoardLook, BoardPose, resized
-from armscan.calibration.hand_eye.estimate import Conditioning
+from armscan.calibration.hand_eye.checks import MOST_OPEN_MM
+from armscan.calibration.hand_eye.estimate import LEVER_MM, Conditioning
 from armscan.errors import InputError
 from armscan.geometry.arrays import ArrayRecord, FloatArray, floats
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import scaled_inverse
 from armscan.geometry.poses import Base, Board, Pose
 from armscan.models.calibration import (
+    ArmNoise,
     CameraCalibration,
     HandEyeCalibration,
     Provenance,
@@ -26,6 +29,8 @@ from armscan.vision.targets.target import Target
 WRONG_SCALE, NO_SCALE, NO_SCALE_PART = 4.0, 10.0, 0.01
 """As of a sphere's diameter: a size that the poses contradict by so many standard deviations is
 named, and refused where it is off by so many, and by a part of it."""
+NAMED_SCALE_PART = 1e-3
+UNLIKELY = 1e-3
 TOLD_SCALE = 0.02
 """Standard deviation from which on the arm's shifts do not tell the size."""
 
@@ -171,7 +176,8 @@ class BoardHandEyeFit(ArrayRecord):
             return ScannerCalibration(None, alone, provenance)
         n = len(self.camera_step)
         given = sensor.covariance[:n, :n]
-        by_camera = sensor.covariance[:, :n] @ np.linalg.pinv(given, rcond=1e-12, hermitian=True)
+        by_sheets = sensor.covariance[n:, :n] @ scaled_inverse(given)
+        by_camera = np.vstack([np.eye(n), by_sheets])
         after = sensor.covariance + by_camera @ (self.camera_covariance - given) @ by_camera.T
         moved = sensor.updated(by_camera @ self.camera_step, 0.5 * (after + after.T))
         wide = np.zeros((len(follow), len(sensor.parameter_names)))
@@ -197,9 +203,43 @@ def refuse_scale(asked: AskedScale, target: Target | None) -> FitFailure | None:
 def scale_warnings(asked: AskedScale, target: Target | None) -> tuple[str, ...]:
     """Warn of a target that the arm's shifts say has another size."""
     off = abs(asked.scale - 1.0)
-    if asked.sigma > TOLD_SCALE or off < WRONG_SCALE * max(asked.if_known, asked.sigma):
+    least = max(NAMED_SCALE_PART, WRONG_SCALE * asked.if_known, WRONG_SCALE * asked.sigma)
+    if asked.sigma > TOLD_SCALE or off < least:
         return ()
     return (
         f"the arm's shifts ask for a target of {asked}: check the print's size"
         f"{resized(target, asked.scale)}, and the camera's focal length",
     )
+
+
+def camera_warnings(beside_camera: FloatArray) -> tuple[str, ...]:
+    """Warn of a hand-eye that the camera's own uncertainty leaves nearly open."""
+    scale = np.array([LEVER_MM] * 3 + [1.0] * 3)
+    worst = np.linalg.eigvalsh(beside_camera * scale[:, None] * scale)[-1]
+    if worst < MOST_OPEN_MM**2:
+        return ()
+    return (
+        f"beside the camera as it was given, the hand-eye is known to {np.sqrt(worst):.0f} mm only "
+        f"in one direction (turns counted at {LEVER_MM:.0f} mm): the camera's calibration decides "
+        "that; calibrate it from more views, tilted to all sides",
+    )
+
+
+def given_scatter_warnings(calibration: HandEyeCalibration) -> tuple[str, ...]:
+    """Warn of a scatter that was given and that the views contradict: all sigmas rest on it."""
+    known = calibration.diagnostics
+    if known is None or known.is_noise_estimated or not known.chi2_probability < UNLIKELY:
+        return ()
+    return (
+        "the arm scatters more than was given: the sigmas stated are too small; leave "
+        "--arm-position-mm and --arm-rotation-deg out to have it estimated",
+    )
+
+
+LARGE_ARM_MM, LARGE_ARM_RAD = 0.5, np.radians(0.2)
+
+
+def is_wide(noise: ArmNoise) -> bool:
+    """Whether an arm scatters more than robots do."""
+    turn_rad = float(np.hypot(noise.rotation_rad, noise.tool_rotation_rad))
+    return noise.position_mm > LARGE_ARM_MM or turn_rad > LARGE_ARM_RAD

@@ -628,7 +628,8 @@ def influence_warnings(
     far = sorted((k for k in moves if moves[k] > MAX_MOVE_SIGMA), key=lambda k: -moves[k])
     return tuple(
         f"without posture {postures[k]} the hand-eye would move by {moves[k]:.0f} of its "
-        "stated sigmas: it rests on this posture; check its pose and stripes, or scan more like it"
+        "stated sigmas: it rests on this posture; check its pose and exposures, or take more like "
+        "it"
         for k in far[:3]
     )
 

@@ -11,8 +11,9 @@ the problem robot-world and hand-eye).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,6 +35,9 @@ from armscan.calibration.hand_eye.board_result import (
     AskedScale,
     BoardHandEyeFit,
     BoardPosture,
+    camera_warnings,
+    given_scatter_warnings,
+    is_wide,
     refuse_scale,
     scale_warnings,
 )
@@ -44,7 +48,6 @@ from armscan.calibration.hand_eye.checks import (
     refuse_hardly_determined,
 )
 from armscan.calibration.hand_eye.estimate import (
-    LEVER_MM,
     Conditioning,
     LeftOut,
     conditioning_of,
@@ -65,11 +68,10 @@ from armscan.calibration.sheets.board_points import BoardBow
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.least_squares import Whitening, square_root
+from armscan.geometry.least_squares import Whitening, pseudo_inverse, scaled_inverse, square_root
 from armscan.geometry.poses import Base, Board, Pose, Sensor, Tool
 from armscan.geometry.rotations import skew
 from armscan.models.calibration import (
-    ArmNoise,
     CameraCalibration,
     HandEyeCalibration,
     HandEyeDiagnostics,
@@ -78,7 +80,7 @@ from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Target
 
 N_UNKNOWN = 12
-LEAST_LOOKS = 4
+LEAST_POSTURES = 4
 """Three have six numbers to spare, of which the scatter of the arm would have to be told."""
 MAX_LOOKS = 100
 """Of more, so many are used, evenly spread."""
@@ -165,21 +167,21 @@ def _calibrated(
     wrong = _find_wrong(problem, start.is_suspect)
     if isinstance(wrong, FitFailure):
         return wrong
-    solution = _solve(replace(problem.without(list(wrong)), options=options))
+    solution = _solve(replace(problem.without(wrong), options=options))
     if isinstance(solution, FitFailure):
         return solution
-    return _evidence(solution, tuple(wrong.values()), target)
+    return _evidence(solution, tuple(chain(*wrong.values())), target)
 
 
 def _refuse_few(looks: Sequence[BoardLook]) -> FitFailure | None:
     n = len({look.posture for look in looks})
-    if n >= LEAST_LOOKS:
+    if n >= LEAST_POSTURES:
         return None
     return FitFailure(
         f"{n} posture{'s' if n != 1 else ''} with the target and the arm's pose "
         f"{'are' if n != 1 else 'is'} too few: two poses are unknown, 12 numbers, and the arm's "
         "scatter",
-        f"{LEAST_LOOKS} are the least; {TURN_MORE}",
+        f"{LEAST_POSTURES} are the least; {TURN_MORE}",
     )
 
 
@@ -225,9 +227,17 @@ class _Problem:
             units=np.zeros(root.shape[1]),
         )
 
-    def without(self, rows: Sequence[int]) -> _Problem:
-        """All but some looks."""
-        keep = [k for k in range(len(self.looks)) if k not in rows]
+    @property
+    def postures(self) -> dict[str, list[int]]:
+        """Rows of the looks of each posture."""
+        rows: dict[str, list[int]] = {}
+        for k, look in enumerate(self.looks):
+            rows.setdefault(look.posture, []).append(k)
+        return rows
+
+    def without(self, postures: Collection[str]) -> _Problem:
+        """All but some postures."""
+        keep = [k for k, look in enumerate(self.looks) if look.posture not in postures]
         return replace(
             self,
             looks=tuple(self.looks[k] for k in keep),
@@ -410,71 +420,78 @@ def _solve(problem: _Problem) -> _Solution | FitFailure:
 
 def _find_wrong(
     problem: _Problem, is_suspect: BoolArray
-) -> dict[int, tuple[str, str]] | FitFailure:
-    """Looks that all others together call wrong, by their rows: (source, reason).
+) -> dict[str, tuple[tuple[str, str], ...]] | FitFailure:
+    """Postures that all others together call wrong: (source, reason) of their looks.
 
     Those that the start calls suspect are judged by the others first: together they could hide each
-    other. Then the worst that is left, as long as it is wrong.
+    other. Then the worst that is left, as long as it is wrong. Looks of one posture share the arm's
+    error, and would vouch for each other: they are judged together.
     """
-    n, out = len(problem.looks), [int(k) for k in np.flatnonzero(is_suspect)]
-    found: dict[int, tuple[str, str]] = {}
-    others = _solve(problem.without(out)) if n - len(out) >= LEAST_LOOKS else _NOTHING
+    postures = problem.postures
+    n, out = len(postures), [name for name, rows in postures.items() if is_suspect[rows].any()]
+    found: dict[str, tuple[tuple[str, str], ...]] = {}
+    others = _solve(problem.without(out)) if n - len(out) >= LEAST_POSTURES else _NOTHING
     if not isinstance(others, FitFailure):
-        found = {k: told for k in out if (told := _contradiction(problem, k, others, n))}
-    while n - len(found) > LEAST_LOOKS + 1:
-        solution = _solve(problem.without(list(found)))
+        found = {name: told for name in out if (told := _contradiction(problem, name, others))}
+    while n - len(found) > LEAST_POSTURES + 1:
+        solution = _solve(problem.without(found))
         if isinstance(solution, FitFailure):
             return solution
-        left, rows = _left_out(solution), [k for k in range(n) if k not in found]
-        worst = rows[max(left, key=lambda k: left[k].normalised, default=0)]
+        left = _left_out(solution)
+        worst = max(left, key=lambda name: left[name].normalised, default="")
         others = _solve(problem.without([*found, worst]))
-        told = None if isinstance(others, FitFailure) else _contradiction(problem, worst, others, n)
-        if told is None:
+        told = () if isinstance(others, FitFailure) else _contradiction(problem, worst, others)
+        if not told:
             break
         found[worst] = told
     if len(found) <= MOST_WRONG * n:
         return found
-    named = ", ".join(source for source, _ in list(found.values())[:4])
+    named = ", ".join(source for told in list(found.values())[:4] for source, _ in told[:1])
     return FitFailure(
-        f"{len(found)} of {n} looks contradict the others ({named} ...)",
+        f"{len(found)} of {n} postures contradict the others ({named} ...)",
         "check that poses and images have the same order, and that target and base did not move",
     )
 
 
 def _contradiction(
-    problem: _Problem, row: int, others: _Solution, n_looks: int
-) -> tuple[str, str] | None:
-    """Source and reason of a look that cannot belong to the others, the worst of ``n_looks``."""
-    chance, off_mm, off_deg = _chance(problem, row, others)
-    if chance * n_looks > WRONG_CHANCE:
-        return None
-    return problem.chosen[row].view.source, (
+    problem: _Problem, posture: str, others: _Solution
+) -> tuple[tuple[str, str], ...]:
+    """(Source, reason) of a posture's looks if it cannot belong to the others; empty if it may."""
+    chance, off_mm, off_deg = _chance(problem, posture, others)
+    if chance * len(problem.postures) > WRONG_CHANCE:
+        return ()
+    reason = (
         f"contradicts the others by {off_mm:.2f} mm and {off_deg:.2f} degrees: a wrong pose, a "
         "moved target, or another numbering of its points"
     )
+    rows = problem.postures[posture]
+    return tuple((problem.chosen[k].view.source, reason) for k in rows)
 
 
-def _chance(problem: _Problem, row: int, others: _Solution) -> tuple[float, float, float]:
-    """How likely a look is so far off what the others say, and how far that is, in mm and degrees.
+def _chance(problem: _Problem, posture: str, others: _Solution) -> tuple[float, float, float]:
+    """How likely a posture is so far off what the others say, and how far, in mm and degrees.
 
-    By Hotelling's T^2: the scatter of six numbers is known from as many others as the rest has to
-    spare.
+    By Hotelling's T^2: the scatter of a posture's numbers is known from as many others as the rest
+    has to spare.
     """
+    rows = problem.postures[posture]
     alone = replace(
-        others.system.problem, looks=(problem.looks[row],), chosen=(problem.chosen[row],)
+        others.system.problem,
+        looks=tuple(problem.looks[k] for k in rows),
+        chosen=tuple(problem.chosen[k] for k in rows),
     )
     alone = alone.moved(np.zeros(N_UNKNOWN + len(alone.units)))
-    system, own = alone.system(), _rows(0)
+    system, own = alone.system(), slice(0, N_POSE * len(rows))
     residual, jacobian = system.residual[own], system.jacobian[own, :-1]
     linear = solve_linear(others.system.residual, others.jacobian, others.total)
     scatter = (total_covariance(system.components, others.noise.sigmas) + system.known)[own, own]
     if linear is not None:
         scatter = scatter + jacobian @ linear.covariance @ jacobian.T
     square = float(residual @ np.linalg.solve(scatter, residual))
-    n_free = max(N_POSE * len(others.system.problem.looks) - N_UNKNOWN, 1)
-    chance = float(betainc(0.5 * n_free, 0.5 * N_POSE, n_free / (n_free + square)))
-    off = _middle_off_mm(alone, 0)
-    return chance, off, float(np.degrees(np.linalg.norm(residual[:3])))
+    n_free = max(N_POSE * len(others.system.problem.postures) - N_UNKNOWN, 1)
+    chance = float(betainc(0.5 * n_free, 0.5 * len(residual), n_free / (n_free + square)))
+    turn_deg = float(np.degrees(np.linalg.norm(residual[:3])))
+    return chance, _middle_off_mm(alone, 0), turn_deg
 
 
 def _middle_off_mm(problem: _Problem, row: int) -> float:
@@ -507,13 +524,14 @@ def _evidence(
     root = problem.root[: len(problem.camera.covariance)]
     after = root @ stated.matrix[N_UNKNOWN:, N_UNKNOWN:] @ root.T
     between = stated.matrix[:N_POSE, N_UNKNOWN:] @ root.T
-    follow = between @ np.linalg.pinv(after, rcond=1e-12, hermitian=True)
+    follow = between @ scaled_inverse(after)
     covariance = stated.matrix[:N_POSE, :N_POSE]
     own = covariance - follow @ between.T
     left = _left_out(solution)
     misclosures = tuple(map(problem.misclosure_px, problem.looks, problem.chosen))
     postures = tuple(
-        _posture(problem, k, left[k], misclosures[k]) for k in range(len(problem.looks))
+        _posture(problem, k, left[look.posture], misclosures[k])
+        for k, look in enumerate(problem.looks)
     )
     calibration = HandEyeCalibration(
         tool_from_sensor=problem.tool_from_sensor,
@@ -528,13 +546,16 @@ def _evidence(
             solution, conditioning.under(covariance), postures, stated.region_factor
         ),
     )
-    names = [pose.view.source for pose in problem.chosen]
+    numbered = dict(enumerate(left.values()))
+    told = (
+        *influence_warnings(list(left), numbered, own),
+        *scale_warnings(asked, target),
+    )
     warnings = (
         *(f"{source} {reason}" for source, reason in not_used),
-        *conditioning_warnings(conditioning.under(covariance), len(problem.looks), ""),
-        *influence_warnings(names, left, own),
-        *scale_warnings(asked, target),
-        *_camera_warnings(own + follow @ problem.camera.covariance @ follow.T),
+        *conditioning_warnings(conditioning.under(covariance), len(left), ""),
+        *camera_warnings(own + follow @ problem.camera.covariance @ follow.T),
+        *(given_scatter_warnings(calibration) or told),
         *_scatter_warnings(solution),
     )
     return BoardHandEyeFit(
@@ -569,21 +590,21 @@ def _conditioning(solution: _Solution) -> Conditioning:
     return conditioning_of(whitened[:, :N_POSE], whitened[:, N_POSE:])
 
 
-def _left_out(solution: _Solution) -> dict[int, LeftOut]:
-    """What changes without each look, as `armscan.calibration.hand_eye.estimate.leave_out`."""
-    residual = solution.system.residual
+def _left_out(solution: _Solution) -> dict[str, LeftOut]:
+    """What changes without each posture, as `armscan.calibration.hand_eye.estimate.leave_out`."""
+    residual, problem = solution.system.residual, solution.system.problem
     linear = solve_linear(residual, solution.jacobian, solution.total)
     if linear is None:
         return {}
     explained, found = linear.projected @ residual, {}
-    for k in range(len(solution.system.problem.looks)):
-        block = _rows(k)
-        own = np.linalg.pinv(linear.projected[block, block], rcond=1e-10, hermitian=True)
-        predicted = own @ explained[block]
-        square = float(explained[block] @ predicted)
-        size = float(np.sqrt(max(square, 0.0) / N_POSE))
-        chance = float(chdtrc(N_POSE, square))
-        found[k] = LeftOut(linear.gain[:, block] @ predicted, size, size, chance)
+    for posture, looks in problem.postures.items():
+        rows = (N_POSE * np.array(looks)[:, None] + np.arange(N_POSE)).ravel()
+        own = pseudo_inverse(linear.projected[np.ix_(rows, rows)], 1e-10)
+        predicted = own @ explained[rows]
+        square = float(explained[rows] @ predicted)
+        size = float(np.sqrt(max(square, 0.0) / len(rows)))
+        chance = float(chdtrc(len(rows), square))
+        found[posture] = LeftOut(linear.gain[:, rows] @ predicted, size, size, chance)
     return found
 
 
@@ -656,28 +677,6 @@ def _asked_scale(solution: _Solution) -> AskedScale:
         float(np.sqrt(matrix[-1, -1])) for matrix in (whole.matrix, linear.covariance)
     )
     return AskedScale(1.0 + float(linear.step[-1]), sigma, if_known)
-
-
-def _camera_warnings(beside_camera: FloatArray) -> tuple[str, ...]:
-    """Warn of a hand-eye that the camera's own uncertainty leaves nearly open."""
-    scale = np.array([LEVER_MM] * 3 + [1.0] * 3)
-    worst = np.linalg.eigvalsh(beside_camera * scale[:, None] * scale)[-1]
-    if worst < MOST_OPEN_MM**2:
-        return ()
-    return (
-        f"beside the camera as it was given, the hand-eye is known to {np.sqrt(worst):.0f} mm only "
-        f"in one direction (turns counted at {LEVER_MM:.0f} mm): the camera's calibration decides "
-        "that; calibrate it from more views, tilted to all sides",
-    )
-
-
-LARGE_ARM_MM, LARGE_ARM_RAD = 0.5, np.radians(0.2)
-
-
-def is_wide(noise: ArmNoise) -> bool:
-    """Whether an arm scatters more than robots do."""
-    turn_rad = float(np.hypot(noise.rotation_rad, noise.tool_rotation_rad))
-    return noise.position_mm > LARGE_ARM_MM or turn_rad > LARGE_ARM_RAD
 
 
 def _scatter_warnings(solution: _Solution) -> tuple[str, ...]:

@@ -186,6 +186,9 @@ METRES = re.compile(r"^x[_ (\[]*m\b", re.IGNORECASE)
 METRES_COMMENT = re.compile(rb"^[ \t]*#.*\bmet(re|er)s\b", re.IGNORECASE | re.MULTILINE)
 OF_MATRIX = re.compile(r"^[a-z]+_?[0-4]_?[0-4]$", re.IGNORECASE)
 """Names of a matrix's numbers, which stand row by row."""
+NUMBER = re.compile(r"^[+-]?\.?\d|^[+-]?(nan|inf)", re.IGNORECASE)
+UNIT = re.compile(r"[_ (\[]+([a-z°]+)", re.IGNORECASE)
+PLACE_UNITS, TURN_UNITS = {"mm", "m"}, {"deg", "rad", "°"}
 UNIT_OF_ANGLE = re.compile(r"[_ (\[](rad|deg)", re.IGNORECASE)
 N_ANGLES, N_QUATERNION, N_ROWS, N_MATRIX = 6, 7, 12, 16
 HOW_TO_WRITE = (
@@ -362,20 +365,39 @@ def _from_text(data: bytes, where: str) -> tuple[list[str], list[list[float]], l
     header: list[str] = []
     rows: list[list[float]] = []
     places: list[str] = []
-    for number, line in enumerate(lines, start=1):
-        words = [word for word in re.split(r"[\s,;\[\]]+", line.split("#")[0]) if word]
-        titles = re.split(r"\s*[,;]\s*|\s+(?![(\[])", line.strip())
+    for number, whole in enumerate(lines, start=1):
+        line = whole.split("#")[0].replace('"', "").strip().rstrip(",;")
+        words = [word for word in re.split(r"[\s,;\[\]]+", line) if word]
         if not words:
             continue
-        is_header = _plain(titles) in HEADERS or all(map(OF_MATRIX.match, words))
-        if not rows and not header and is_header:
-            header = titles
+        if not rows and not header and not any(map(NUMBER.match, words)):
+            header = _header(line, words, f"{where}, line {number}")
             continue
         places.append(f"{where}, line {number}")
         rows.append(_numbers(words, places[-1]))
     if rows and all(len(row) == 4 for row in rows):
         return header, *_joined(rows, places)
     return header, rows, places
+
+
+def _header(line: str, words: list[str], where: str) -> list[str]:
+    """Names of columns, whose units are known ones and alike."""
+    titles = re.split(r"\s*[,;]\s*|\s+(?![(\[])", line)
+    if all(map(OF_MATRIX.match, words)):
+        return words
+    if _plain(titles) not in HEADERS:
+        raise FileFormatError(
+            f"the header {line} is not understood", where=where, remedy=HOW_TO_WRITE
+        )
+    units = [UNIT.search(title) for title in titles]
+    places, turns = ({unit[1].lower() for unit in some if unit} for some in (units[:3], units[3:]))
+    if len(places) > 1 or len(turns) > 1 or places - PLACE_UNITS or turns - TURN_UNITS:
+        raise FileFormatError(
+            f"the units of the header {line} are not understood",
+            where=where,
+            remedy="write positions in mm or m and angles in deg or rad, all in the same",
+        )
+    return titles
 
 
 def _joined(rows: list[list[float]], places: list[str]) -> tuple[list[list[float]], list[str]]:
@@ -403,5 +425,6 @@ def _numbers(row: Sequence[Any], where: str) -> list[float]:
     except (TypeError, ValueError):
         values = []
     if not values or not bool(np.isfinite(values).all()):
-        raise FileFormatError("a pose is not six numbers", where=where, remedy=HOW_TO_WRITE)
+        fact = "a pose is not six numbers"
+        raise FileFormatError(fact, where=where, remedy=HOW_TO_WRITE)
     return values

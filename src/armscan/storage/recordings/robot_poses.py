@@ -260,7 +260,7 @@ def other_table_readings(
         )
         yield (
             f"reading the table in {units}, its angles as {meant},",
-            f"put the header {header} above the table, and give --euler {meant}",
+            f"put the header {header} above the table, in place of any, and give --euler {meant}",
             rotations_from_euler(angles, meant),
             (1000.0 if is_metres else 1.0) * numbers[:, :3],
         )

@@ -44,8 +44,9 @@ def board_rig(
     scale: float = 1.0,
     turned: bool = False,
     one_axis: bool = False,
+    images: int = 1,
 ) -> BoardRig:
-    """Draw ``n`` postures; ``scale`` is the true size over the stated one.
+    """Draw ``n`` postures with so many images each; ``scale`` is the true size over the stated.
 
     ``turned`` numbers every second view of a symmetric target from its other end; ``one_axis`` has
     the camera turn about its optical axis only.
@@ -61,7 +62,7 @@ def board_rig(
         Rotation.random(random_state=seed + 1).as_matrix(), generator.uniform(-600, 600, 3)
     )
     looks: list[BoardLook] = []
-    while len(looks) < n:
+    while len(looks) < n * images:
         seen = _seen_from(generator, scale * points.mean(axis=0), one_axis=one_axis)
         pixels = projected(seen, scale * points)
         if pixels.min() < 10 or pixels[:, 0].max() > WIDTH - 10 or pixels[:, 1].max() > HEIGHT - 10:
@@ -71,20 +72,25 @@ def board_rig(
         told: Pose[Base, Tool] = Pose(
             turn @ held.rotation, held.translation_mm + generator.normal(0.0, arm_mm, 3)
         )
-        view = TargetView(
-            source=f"{len(looks)}.png",
-            width_px=WIDTH,
-            height_px=HEIGHT,
-            point_index=np.arange(len(points)),
-            points_px=pixels + generator.normal(0.0, NOISE_PX, pixels.shape),
-            covariance_px2=np.tile(NOISE_PX**2 * np.eye(2), (len(points), 1, 1)),
-            points_board_mm=points,
-        )
-        if turned and len(looks) % 2:
-            view = renumbered(view, plate, numberings(plate)[1])
-        poses = board_poses(view, plate, camera.camera)
-        if not isinstance(poses, FitFailure):
-            looks.append(BoardLook(view.source, told, poses))
+        taken: list[BoardLook] = []
+        for _ in range(images):
+            source = f"{len(looks) + len(taken)}.png"
+            view = TargetView(
+                source=source,
+                width_px=WIDTH,
+                height_px=HEIGHT,
+                point_index=np.arange(len(points)),
+                points_px=pixels + generator.normal(0.0, NOISE_PX, pixels.shape),
+                covariance_px2=np.tile(NOISE_PX**2 * np.eye(2), (len(points), 1, 1)),
+                points_board_mm=points,
+            )
+            if turned and len(looks) % 2:
+                view = renumbered(view, plate, numberings(plate)[1])
+            poses = board_poses(view, plate, camera.camera)
+            if not isinstance(poses, FitFailure):
+                posture = source if images == 1 else f"p{len(looks) // images}"
+                taken.append(BoardLook(posture, told, poses))
+        looks += taken if len(taken) == images else []
     return BoardRig(tuple(looks), camera, hand_eye, board)
 
 

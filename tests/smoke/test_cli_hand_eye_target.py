@@ -57,6 +57,7 @@ def test_a_recording_makes_a_scanner(
     assert told["method"] == "board"
     assert told["n_postures"] == len(POSTURES) == len(told["postures"])
     assert told["rms_px"] < 0.2
+    assert told["target_scale_sigma"] < 0.02
     assert told["target_scale"] == pytest.approx(1.0, abs=5.0 * told["target_scale_sigma"])
     page = output.with_suffix(".html").read_text()
     assert "from 8 views of a target at rest" in page

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -95,15 +95,18 @@ def find_stripes(
     dark = _partners(paths, background)
     load_stripe_method(stripes.method)
     if stripes.laser_colour == "auto":
-        colour = _common_colour(paths, image_options)
+        colours = _laser_colours(paths, image_options)
+        colour: LaserColour = colours[0] if colours else "auto"
         if colour in COLOURS and not background:
-            colour = _clearest(colour, paths, stripes, image_options)
+            colour = _clearest(colours, paths, stripes, image_options)
         stripes = replace(stripes, laser_colour=colour)
     shown = set(evenly_chosen(names, MAX_PICTURES))
     exposures: dict[str, Exposure] = {}
     profiles: list[Profile] = []
+    has_colours = False
     for k, (path, name) in enumerate(zip(paths, names, strict=True)):
         exposure = read_exposure(path, image_options, source=name)
+        has_colours |= not exposure.is_colourless
         partner = dark[k]
         without = None
         if partner is not None:
@@ -113,7 +116,7 @@ def find_stripes(
         if name in shown:
             exposures[name] = exposure
         job.progress(ProgressEvent("stripes", k + 1, len(paths), name))
-    warnings = _without_line(profiles)
+    warnings = _without_line(profiles, has_colours=has_colours)
     used = (*paths, *dict.fromkeys(path for path in dark if path is not None))
     provenance = job.provenance(used, (stripes, image_options), warnings=warnings)
     is_simulated = are_simulated(paths)
@@ -123,9 +126,7 @@ def find_stripes(
         title="Laser stripes in simulated images." if is_simulated else "Laser stripes.",
         quantities=(
             *stripe_quantities(profiles),
-            Quantity(
-                "laser_colour", "Laser colour", stripes.laser_colour, meaning="of colour images"
-            ),
+            *_colour_taken(stripes.laser_colour, has_colours=has_colours),
         ),
         tables=(stripe_table(profiles),) if len(profiles) <= LISTED else (),
         warnings=warnings,
@@ -133,6 +134,12 @@ def find_stripes(
         next_step=f"open {places[1]}; `armscan calibrate laser -h` makes points of such stripes",
         extra={"kind": "stripes", "simulated": is_simulated},
     )
+
+
+def _colour_taken(colour: LaserColour, *, has_colours: bool) -> tuple[Quantity, ...]:
+    if not has_colours:
+        return ()
+    return (Quantity("laser_colour", "Laser colour", colour, meaning="of colour images"),)
 
 
 def _partners(paths: Sequence[Path], background: Sequence[str] | None) -> Sequence[Path | None]:
@@ -161,53 +168,113 @@ MUCH_MORE, TOO_MUCH = 1.2, 3.0
 across each image, it is coloured print that the difference shows."""
 KEPT, NEAR_PX = 0.8, 2.0
 """Share of the colour's own points that have one of the difference's beside them."""
+RIVAL = 1.0 / 3.0
+"""Least height of another colour's lines, of that of the strongest, to be the laser's."""
 
 
-def _common_colour(paths: Sequence[Path], options: ImageOptions) -> LaserColour:
-    """The colour of the strongest lines of a sample of images; ``auto`` if none has that colour.
+def _laser_colours(paths: Sequence[Path], options: ImageOptions) -> Sequence[LaserColour]:
+    """The colour of the strongest lines of a sample of images, then others that may be the laser's.
 
-    Squared heights are summed: images without the laser, of weak lines, hardly count.
+    Squared heights are summed: images without the laser, of weak lines, hardly count. None if no
+    image has colours, ``auto`` if none has that colour.
     """
     found: set[LaserColour] = set()
     total = np.zeros(len(COLOURS))
     for path in evenly_chosen(paths, VOTERS):
         exposure = read_exposure(path, options)
-        if exposure.colour != "mono":
+        if not exposure.is_colourless:
             channels = split_channels(exposure, None)
             found.add(find_laser_colour(channels))
             total += np.square(line_strengths(channels))
-    strongest = COLOURS[int(np.argmax(total))]
-    return strongest if strongest in found else "auto"
+    ranked = [k for k in np.argsort(-total, kind="stable") if total[k] >= RIVAL**2 * total.max()]
+    if COLOURS[ranked[0]] in found:
+        return tuple(COLOURS[k] for k in ranked)
+    return ("auto",) if found else ()
 
 
 def _clearest(
-    colour: LaserColour, paths: Sequence[Path], stripes: StripeOptions, options: ImageOptions
+    colours: Sequence[LaserColour],
+    paths: Sequence[Path],
+    stripes: StripeOptions,
+    options: ImageOptions,
 ) -> LaserColour:
-    """The colour itself, or that of its differences which shows much more of the same long lines.
+    """The first colour, or that of its differences which shows much more of the same long lines.
 
-    Light of the room is alike in all colours: on what is white or grey a difference hides it.
+    Light of the room is alike in all colours: on what is white or grey a difference hides it. Where
+    the first colour shows hardly a line, of blots and edges that have it, another one may.
     """
-    channels = [one for one in get_args(LaserColour) if one.partition("-")[0] == colour]
-    n_shown, n_kept, n_across = dict.fromkeys(channels, 0), dict.fromkeys(channels, 0), 0
-    for path in evenly_chosen(paths, JUDGES):
-        exposure = read_exposure(path, options)
-        own: FloatArray | None = None
-        n_across += max(exposure.width_px, exposure.height_px)
-        for channel in channels if exposure.colour != "mono" else ():
-            points = _long_lines(extract_stripes(exposure, replace(stripes, laser_colour=channel)))
-            own = points if own is None else own
-            n_shown[channel] += len(points)
-            if len(points) and len(own):
-                away_px = np.asarray(cKDTree(points).query(own)[0])
-                n_kept[channel] += int(np.count_nonzero(away_px < NEAR_PX))
-    n_own = n_shown[colour]
-    most = max(TOO_MUCH * n_own, n_across)
+    judges = [read_exposure(path, options) for path in evenly_chosen(paths, JUDGES)]
+    judges = [exposure for exposure in judges if not exposure.is_colourless]
+    first, *rivals = colours
+    shown = _shown_by(first, judges, stripes)
+    clearest = _of_family(first, shown, judges)
+    if shown[first].n_long >= LONG * len(judges):
+        return clearest
+    for rival in rivals:
+        own = _shown_in(rival, judges, stripes)
+        if own.n_long > TOO_MUCH * shown[clearest].n_long and own.n_good > own.n_flagged:
+            shown, clearest = {**shown, rival: own}, rival
+    if clearest not in rivals:
+        return clearest
+    return _of_family(clearest, _shown_by(clearest, judges, stripes), judges)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shown:
+    """What a channel shows of some images: accepted points of long lines (N, 2) of each, and how
+    many points are accepted and flagged in all.
+    """
+
+    long_px: Sequence[FloatArray]
+    n_good: int
+    n_flagged: int
+
+    @property
+    def n_long(self) -> int:
+        return sum(map(len, self.long_px))
+
+
+def _shown_in(channel: LaserColour, judges: Sequence[Exposure], stripes: StripeOptions) -> _Shown:
+    chosen = replace(stripes, laser_colour=channel)
+    profiles = [extract_stripes(exposure, chosen) for exposure in judges]
+    n_good = sum(int(profile.is_accepted.sum()) for profile in profiles)
+    n_all = sum(len(profile) for profile in profiles)
+    return _Shown([_long_lines(profile) for profile in profiles], n_good, n_all - n_good)
+
+
+def _shown_by(
+    colour: LaserColour, judges: Sequence[Exposure], stripes: StripeOptions
+) -> dict[LaserColour, _Shown]:
+    """What a colour shows, and each of its differences."""
+    family = [one for one in get_args(LaserColour) if one.partition("-")[0] == colour]
+    return {channel: _shown_in(channel, judges, stripes) for channel in family}
+
+
+def _of_family(
+    colour: LaserColour, shown: Mapping[LaserColour, _Shown], judges: Sequence[Exposure]
+) -> LaserColour:
+    """The colour itself, or its difference of most points where that shows much more of its lines,
+    and what the colour shows, too.
+    """
+    own = shown[colour]
+    across = sum(max(exposure.width_px, exposure.height_px) for exposure in judges)
+    most = max(TOO_MUCH * own.n_long, across)
     better = [
         channel
-        for channel in channels
-        if MUCH_MORE * n_own < n_shown[channel] <= most and n_kept[channel] >= KEPT * n_own
+        for channel, other in shown.items()
+        if MUCH_MORE * own.n_long < other.n_long <= most
+        and _n_near(own, other) >= KEPT * own.n_long
     ]
-    return max(better, key=lambda channel: n_shown[channel], default=colour)
+    return max(better, key=lambda channel: shown[channel].n_long, default=colour)
+
+
+def _n_near(own: _Shown, other: _Shown) -> int:
+    """How many of a channel's points of long lines have one of another's beside them."""
+    return sum(
+        int(np.count_nonzero(np.asarray(cKDTree(theirs).query(ours)[0]) < NEAR_PX))
+        for ours, theirs in zip(own.long_px, other.long_px, strict=True)
+        if len(ours) and len(theirs)
+    )
 
 
 def _long_lines(profile: Profile) -> FloatArray:
@@ -222,14 +289,16 @@ NAMED, LISTED = 5, 40
 """Images that a warning names, and those that the terminal lists: the page has them all."""
 
 
-def _without_line(profiles: Sequence[Profile]) -> tuple[str, ...]:
+def _without_line(profiles: Sequence[Profile], *, has_colours: bool) -> tuple[str, ...]:
     empty = [profile.source for profile in profiles if not profile.is_accepted.any()]
     if not empty:
         return ()
     more = f" and {len(empty) - NAMED} more" if len(empty) > NAMED else ""
+    said = f"no line was found in {', '.join(empty[:NAMED])}{more}"
+    if not has_colours:
+        return (said,)
     return (
-        f"no line was found in {', '.join(empty[:NAMED])}{more}: if there is one, "
-        "`armscan stripes --laser-colour` says in which colours it shows",
+        f"{said}: if there is one, `armscan stripes --laser-colour` says in which colours it shows",
     )
 
 

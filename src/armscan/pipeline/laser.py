@@ -131,7 +131,7 @@ def calibrate_sheets_from_pairs(
     lit = _LitBoards(pairs, places, target, camera, options, cache, progress)
     colour = options.stripes.laser_colour
     channels: tuple[tuple[LaserColour, str], ...] = ((colour, ""),)
-    if colour == "auto" and any(pair[0].colour != "mono" for pair in lit.shown):
+    if colour == "auto" and not all(pair[0].is_colourless for pair in lit.shown):
         shown = lit.shown
         channels = (
             rank_channels(

@@ -51,6 +51,8 @@ class SensorWindow:
 
 
 ColourLayout = Literal["mono", "rgb"]
+COARSE_STEP_PX = 16
+"""Of the pixels that are compared first: a colour photograph differs there already."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,6 +114,22 @@ class Exposure:
     def colour(self) -> ColourLayout:
         """Layout of the channels."""
         return "mono" if self.image.ndim == 2 else "rgb"
+
+    @property
+    def is_colourless(self) -> bool:
+        """True where red, green and blue are alike in each pixel: grey, however it is stored."""
+        if self.image.ndim == 2:
+            return True
+        red, *others = np.moveaxis(self.image, 2, 0)
+        return all(
+            np.array_equal(red[::step, ::step], other[::step, ::step])
+            for step in (COARSE_STEP_PX, 1)
+            for other in others
+        )
+
+    def as_mono(self) -> Exposure:
+        """The same of its red channel alone; of a colourless image nothing is lost."""
+        return self if self.image.ndim == 2 else replace(self, image=self.image[:, :, 0])
 
     @property
     def height_px(self) -> int:

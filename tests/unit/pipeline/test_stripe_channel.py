@@ -186,7 +186,9 @@ def test_the_next_channel_is_tried_where_the_first_gives_no_sheet(
     monkeypatch.setattr(laser, "rank_channels", lambda *_: ranked)
     monkeypatch.setattr(laser._LitBoards, "calibrated", calibrated)
     size = (rig.camera.height_px, rig.camera.width_px, 3)
-    picture = Exposure(np.zeros(size, np.uint8), "a.png")
+    levels = np.zeros(size, np.uint8)
+    levels[0, 0, 0] = 1
+    picture = Exposure(levels, "a.png")
     found = laser.calibrate_sheets_from_pairs(
         [(picture, None)], Chessboard(7, 5, 10.0), rig.calibration(rig.camera)
     )
@@ -196,6 +198,24 @@ def test_the_next_channel_is_tried_where_the_first_gives_no_sheet(
     assert isinstance(found, LaserFit)
     assert found.laser_colour == "green-excess"
     assert found.channel_reason == "green-excess: next; grey shows more, but no numbering holds"
+
+
+def test_no_channel_is_weighed_of_grey_photographs_in_three_channels(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, asked = rig_of_vga(), []
+    placement = laser.BoardPlacement("a.png", {0: cast(SeenBoard, (0, None, None))}, None)
+    monkeypatch.setattr(laser, "find_placements", lambda *_: iter([placement]))
+    monkeypatch.setattr(laser, "wrong_count", lambda *_: None)
+    monkeypatch.setattr(laser, "rank_channels", lambda *_: asked.append("channels"))
+    refusal = FitFailure("no board", "look")
+    monkeypatch.setattr(laser._LitBoards, "calibrated", lambda _, colour: refusal)
+    grey = np.full((rig.camera.height_px, rig.camera.width_px, 3), 7, np.uint8)
+    camera, target = rig.calibration(rig.camera), Chessboard(7, 5, 10.0)
+    for levels, n_asked in ((grey, 0), (grey + np.uint8([0, 1, 0]), 1)):
+        pairs = [(Exposure(levels, "a.png"), None)]
+        assert laser.calibrate_sheets_from_pairs(pairs, target, camera) is refusal
+        assert len(asked) == n_asked
 
 
 @pytest.mark.parametrize(

@@ -79,20 +79,74 @@ def test_wrong_options_are_named(
 
 
 def test_one_colour_is_taken_for_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Three photographs show a red line; in the third a blue pattern stands out a little more."""
+    """Three photographs show a red line; in the third a blue line stands out a little more."""
     folder = tmp_path / "colours"
     folder.mkdir()
     for k in range(3):
         image = SCENE.expose_red(k, 1.0).image.copy()
         if k == 2:
-            image[:, 20:300:40, 2] = 160
-            image[:, 21:300:40, 2] = 160
-        cv2.imwrite(str(folder / f"{k}.png"), image[:, :, ::-1])
+            image[40:43, :, 2] = 220
+        write_colour(folder / f"{k}.png", image)
     assert main(["stripes", str(folder), "-o", str(tmp_path / "lines.csv"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["laser_colour"] == "red"
     alone = ["stripes", str(folder / "2.png"), "-o", str(tmp_path / "alone.csv"), "--json"]
     assert main(alone) == 0
     assert json.loads(capsys.readouterr().out)["laser_colour"] == "blue"
+
+
+def test_a_colour_without_a_line_gives_way_to_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Narrow blue things stand out most, none of them a line; the laser is red and weaker."""
+    folder = tmp_path / "things"
+    folder.mkdir()
+    for k in range(2):
+        image = SCENE.expose_red(k, 1.0).image.copy()
+        image[:, 20:300:40, 2] = image[:, 21:300:40, 2] = 160
+        write_colour(folder / f"{k}.png", image)
+    out = tmp_path / "lines.csv"
+    assert main(["stripes", str(folder), "-o", str(out), "--json"]) == 0
+    report, away = written(out, capsys)
+    assert report["laser_colour"] == "red"
+    assert len(away) > 0.95 * 2 * 320
+    assert np.mean(away < 0.5) > 0.99
+
+
+def test_a_grey_photograph_may_be_stored_with_three_channels(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beside colour ones, or where a colour is asked for, its line is found as in one channel."""
+    folder = tmp_path / "grey"
+    folder.mkdir()
+    grey = SCENE.expose(0).image
+    cv2.imwrite(str(folder / "one.png"), grey)
+    cv2.imwrite(str(folder / "three.png"), np.repeat(grey[:, :, None], 3, axis=2))
+    write_colour(folder / "red.png", SCENE.expose_red(1, 1.0).image.astype(np.float64))
+    out = tmp_path / "lines.csv"
+    for words, count in (([], 3), (["--laser-colour", "green-red"], 2)):
+        named = [str(folder / name) for name in ("one.png", "three.png", "red.png")[:count]]
+        assert main(["stripes", *named, *words, "-o", str(out), "--json", "--force"]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert ("laser_colour" in report) == (count == 3), "nothing is told of colours without any"
+        with out.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        found = [
+            [{**row, "image": ""} for row in rows if row["image"] == name]
+            for name in ("one.png", "three.png", "red.png")[:count]
+        ]
+        assert found[0] == found[1]
+        assert all(sum(row["accepted"] == "1" for row in one) > 300 for one in found)
+
+
+def test_nothing_is_said_of_colours_where_grey_images_show_no_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dark = np.random.default_rng(0).normal(20.0, 1.0, (240, 320, 1)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "dark.png"), np.repeat(dark, 3, axis=2))
+    out = tmp_path / "lines.csv"
+    assert main(["stripes", str(tmp_path / "dark.png"), "-o", str(out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["warnings"] == ["no line was found in dark.png"]
 
 
 def bars(rng: np.random.Generator) -> np.ndarray:

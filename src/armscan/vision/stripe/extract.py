@@ -79,7 +79,8 @@ def extract_stripes(
     Candidates are runs above the local background; the Hessian at each candidate gives point and
     direction (eq. 2.41); a Gaussian profile (eq. 2.40), with the skew and the tails that all
     profiles of the image have in common, is fitted with weights from the image's own noise; the
-    centres are smoothed along the line where its course allows.
+    centres are smoothed along the line where its course allows. A photograph whose three channels
+    are alike everywhere is grey, whatever colour is asked for.
 
     Parameters
     ----------
@@ -103,6 +104,9 @@ def extract_stripes(
     options = options or StripeOptions()
     if background is not None:
         check_background(exposure, background)
+    if exposure.is_colourless and (background is None or background.is_colourless):
+        exposure, background = exposure.as_mono(), background and background.as_mono()
+    if background is not None:
         background = laid_under(background, exposure)
     full_scale = exposure.full_scale / NORMAL_SCALE
     threshold = None if options.threshold is None else options.threshold / full_scale

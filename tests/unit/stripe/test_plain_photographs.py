@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import lit_plane, mono_plane
+from armscan.vision.stripe.image import is_thresholded, lit_plane, mono_plane
 from armscan.vision.stripe.ridge import find_candidates, find_line_sigma, measure_level
 from rigs.stripe_image import StripeScene
 from rigs.stripe_scenes import line
@@ -113,3 +113,31 @@ def test_the_corners_of_a_chessboard_beside_a_thick_line_are_no_narrow_lines() -
         off = good[:, 0] - 80.0 - 0.05 * good[:, 1]
         assert (np.abs(off) < 3.0).sum() > 150
         assert (np.abs(off) > 40.0).sum() == 0
+
+
+@pytest.mark.parametrize("sigma_px", [1.0, 1.5, 2.5, 4.0])
+@pytest.mark.parametrize("angle_deg", [0.5, 12.0, 30.0, 80.0])
+def test_a_line_that_somebody_thresholded_is_as_uncertain_as_its_rounded_edges(
+    angle_deg: float, sigma_px: float
+) -> None:
+    """White on black without a flank, as programs keep it beside the photograph, and as JPEG."""
+    scene = StripeScene((line(angle_deg, sigma_px=sigma_px, peak=150.0),), 320, 240)
+    rng = np.random.default_rng(5)
+    white = np.where(scene.expose(1).image > 90, 252, 3)
+    image = (white + rng.integers(-3, 4, white.shape)).astype(np.uint8)
+    for picture in (image, np.repeat(image[:, :, None], 3, axis=2)):
+        profile = extract_stripes(Exposure(picture, "thresholded"))
+        away, _, along = scene.errors(profile.points_px[profile.is_accepted])
+        assert len(np.unique(np.floor(along / 2.0))) > 0.95 * 240 / 2
+        assert np.abs(away).max() < 0.8
+        sigmas = away / profile.sigma_px[profile.is_accepted]
+        assert 0.2 < np.sqrt((sigmas**2).mean()) < 1.2
+
+
+def test_what_a_camera_saw_in_black_and_white_is_no_threshold() -> None:
+    """Over-exposed eight times; in the dark; and without a line."""
+    for peak, sigma_px in ((1600.0, 1.2), (1600.0, 5.0), (60.0, 1.5)):
+        scene = StripeScene((line(0.5, sigma_px=sigma_px, peak=peak),), 320, 240)
+        assert not is_thresholded(scene.expose(1))
+    assert not is_thresholded(StripeScene((), 320, 240).expose(1))
+    assert not is_thresholded(Exposure(np.zeros((240, 320), np.uint8), "dark"))

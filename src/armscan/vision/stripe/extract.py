@@ -31,16 +31,19 @@ from armscan.vision.stripe.flags import (
 from armscan.vision.stripe.image import (
     EVEN,
     NORMAL_SCALE,
+    ROUNDED_PX,
     StripeOptions,
     StripePlane,
     check_background,
     colour_planes,
     has_laser_colour,
     is_on_known_ground,
+    is_thresholded,
     laid_under,
     lit_plane,
     mono_plane,
     relative_reflectance,
+    softened,
 )
 from armscan.vision.stripe.ridge import (
     BLUR_PX,
@@ -80,7 +83,8 @@ def extract_stripes(
     direction (eq. 2.41); a Gaussian profile (eq. 2.40), with the skew and the tails that all
     profiles of the image have in common, is fitted with weights from the image's own noise; the
     centres are smoothed along the line where its course allows. A photograph whose three channels
-    are alike everywhere is grey, whatever colour is asked for.
+    are alike everywhere is grey, whatever colour is asked for. One that somebody made black and
+    white is blurred by a pixel first, and its centres are as uncertain as its rounded edges.
 
     Parameters
     ----------
@@ -108,6 +112,16 @@ def extract_stripes(
         exposure, background = exposure.as_mono(), background and background.as_mono()
     if background is not None:
         background = laid_under(background, exposure)
+    elif is_thresholded(exposure):
+        profile = _extract(softened(exposure), options)
+        rounded = ROUNDED_PX * exposure.window.binning
+        return replace(profile, sigma_px=np.hypot(profile.sigma_px, rounded))
+    return _extract(exposure, options, background)
+
+
+def _extract(
+    exposure: Exposure, options: StripeOptions, background: Exposure | None = None
+) -> Profile:
     full_scale = exposure.full_scale / NORMAL_SCALE
     threshold = None if options.threshold is None else options.threshold / full_scale
     if exposure.colour == "mono" and background is None:

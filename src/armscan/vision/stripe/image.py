@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
@@ -263,6 +264,42 @@ def subtract(lit: FloatImage, dark: FloatImage, full_scale: float) -> FloatImage
         rest = np.abs(y - gain * x - offset)
         use = rest <= TRIM_SIGMAS * max(robust_sigma(rest), 0.5)
     return np.asarray(lit - np.float32(gain) * dark - np.float32(offset), dtype=np.float32)
+
+
+DIM, BRIGHT, LEAST_BETWEEN = 0.1, 0.9, 0.02
+"""Of full scale. A lens and a sensor leave 40 to 100 % of the pixels that are not dark between the
+two (photographs of ten strangers, over-exposed ones among them), a threshold none."""
+FEW_PX = 32
+SOFT_PX = 1.0
+ROUNDED_PX = math.sqrt(1.0 / 24.0)
+"""Scatter of the mean of two edges, each rounded to a whole pixel."""
+
+
+def is_thresholded(exposure: Exposure) -> bool:
+    """True of a grey image that somebody made black and white: hardly a pixel lies between.
+
+    Of others a few rows and columns tell.
+    """
+    image = exposure.image
+    if image.ndim > 2:
+        return False
+    few = (image[::FEW_PX], image[:, ::FEW_PX])
+    return _is_black_and_white(few, exposure.full_scale) and _is_black_and_white(
+        (image,), exposure.full_scale, least=1
+    )
+
+
+def _is_black_and_white(parts: Sequence[ImageArray], full_scale: int, least: int = 0) -> bool:
+    n_lit = sum(np.count_nonzero(part > int(DIM * full_scale)) for part in parts)
+    n_white = sum(np.count_nonzero(part >= int(BRIGHT * full_scale)) for part in parts)
+    return bool(n_white >= least and n_lit - n_white <= LEAST_BETWEEN * n_lit)
+
+
+def softened(exposure: Exposure) -> Exposure:
+    """A grey exposure with flanks on its lines, of which a fit lives: blurred by a pixel."""
+    image = np.empty_like(exposure.image)
+    cv2.GaussianBlur(exposure.image, (0, 0), SOFT_PX, dst=image)
+    return replace(exposure, image=image)
 
 
 EVEN = np.ones((1, 1), np.float32)

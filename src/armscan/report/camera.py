@@ -422,8 +422,8 @@ def _residual_histogram(fit: CameraFit) -> Picture:
     tail = f" Beyond the picture: {beyond}." if beyond else ""
     return histogram_chart(
         [
-            Bars(residuals[:, 0], ACCENT, "x", alpha=0.75),
-            Bars(residuals[:, 1], ACCENT_LIGHT, "y", alpha=0.75),
+            Bars(residuals[:, 0], ACCENT_LIGHT, "x"),
+            Bars(residuals[:, 1], ACCENT, "y", is_outline=True),
         ],
         edges,
         "residual, px",

@@ -34,7 +34,6 @@ class Bars:
     colour: str
     label: str | None = None
     is_outline: bool = False
-    alpha: float = 1.0
     counts: IntArray | None = None
 
 
@@ -77,7 +76,7 @@ def histogram_chart(
                 )  # fmt: skip
             else:
                 axes.hist(
-                    item.values, bins, histtype="stepfilled", color=item.colour, alpha=item.alpha,
+                    item.values, bins, histtype="stepfilled", color=item.colour,
                     label=item.label, weights=item.counts,
                 )  # fmt: skip
         if curve is not None:

@@ -214,8 +214,9 @@ def _quantile(values: FloatArray, counts: IntArray, share: float) -> float:
 def _stretched(
     levels: FloatArray, bright: float, middle: float
 ) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    scale = max(bright, 0.02) if bright < 0.7 else 1.0
-    gamma = 0.7 if middle / scale < 0.2 else 1.0
+    # both change steadily: photographs of one light look alike, and white paper is not burnt out
+    scale = min(1.0, max(bright, 0.02) / 0.9)
+    gamma = float(np.interp(middle / scale, [0.1, 0.3], [0.7, 1.0]))
     return np.asarray(255.0 * np.clip(levels / scale, 0.0, 1.0) ** gamma, dtype=np.uint8)
 
 

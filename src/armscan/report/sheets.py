@@ -416,6 +416,8 @@ def _residuals_along(fit: LaserFit, index: int) -> Picture:
             axes.set_ylim(-reach, reach)
         for axes in list(grid.flat)[n:]:
             axes.set_axis_off()
+        for axes in list(grid.flat)[n - columns : n]:
+            axes.tick_params(labelbottom=True)
         figure.supxlabel("along the stripe, mm", fontsize=9, color=MUTED)
         figure.supylabel("off the sheet, mm", fontsize=9, color=MUTED)
     more = f" Beyond the pictures: {plural(beyond, 'point')}." if beyond else ""

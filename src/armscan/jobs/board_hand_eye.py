@@ -35,7 +35,7 @@ from armscan.records.exposure import Exposure
 from armscan.report.board_hand_eye import board_hand_eye_page, board_quantities, look_table
 from armscan.report.hand_eye import TITLE, hand_eye_quantities
 from armscan.report.photographs import refused_page, tried_targets
-from armscan.report.quantity import Quantity, Summary, sentences, without_source
+from armscan.report.quantity import Quantity, Summary, plural, sentences, without_source
 from armscan.storage.arm import read_arm_model
 from armscan.storage.documents import (
     read_camera_calibration,
@@ -267,7 +267,7 @@ def _scan_views(source: LookSource) -> _Views:
     n_used = min(len(posed), MOST_ROWS)
     chosen = [posed[k] for k in np.linspace(0, len(posed) - 1, n_used).round().astype(int)]
     n_other = sum(row.camera != 0 for row in recording.rows)
-    note = f"{n_other} exposures of other cameras than camera 0, which gives the hand-eye, not used"
+    note = f"{plural(n_other, 'exposure')} of other cameras not used: camera 0 gives the hand-eye"
     without = [(names[k], "the arm gave no pose for it") for k in dark or left if k not in posed]
     return _Views(
         exposures=tuple(recording.exposure(k) for k in chosen),
@@ -327,7 +327,8 @@ def _not_used_warnings(not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:
         return ()
     named = ", ".join(f"{source} ({without_source(source, why)})" for source, why in not_used[:4])
     more = f" and {len(not_used) - 4} more" if len(not_used) > 4 else ""
-    return (f"{len(not_used)} views were not used: {named}{more}",)
+    verb = "was" if len(not_used) == 1 else "were"
+    return (f"{plural(len(not_used), 'view')} {verb} not used: {named}{more}",)
 
 
 def _explained(failure: FitFailure, found: FoundTargets) -> FitFailure:

@@ -139,7 +139,7 @@ def stack_observations(
                 stripe=np.full(len(rows), number),
                 points_mm=points.points_mm[rows],
                 across_mm_px=np.einsum(
-                    "nij,nj->ni", points.dpoint_dq[rows], profile.normals_px[rows]
+                    "nij,nj->ni", points.dpoint_dq[rows], _to_one_side(profile.normals_px[rows])
                 ),
                 sigma_px=profile.sigma_px[rows],
                 dpoint_dpose=points.dpoint_dpose[rows],
@@ -147,6 +147,16 @@ def stack_observations(
             )
         )
     return SheetObservations.concat(parts)
+
+
+def _to_one_side(normals: FloatArray) -> FloatArray:
+    """Normals (N, 2) of the segments of a stripe, each known but for its sign, on the first's side.
+
+    A residual means the same all along the stripe then.
+    """
+    middle = np.linalg.eigh(normals.T @ normals)[1][:, 1]
+    is_there = normals @ middle >= 0.0
+    return np.where((is_there == is_there[0])[:, None], normals, -normals)
 
 
 @dataclass(frozen=True, eq=False)

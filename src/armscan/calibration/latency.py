@@ -162,14 +162,8 @@ class LatencyFit:
         separate clocks, of those that then have a pose.
     normal_base
         (3,) of the plate, in Base.
-    motion
-        What the motion told.
-    noise
-        Of heights and of the leans along the stripes.
     n_left_out
         Exposures that do not fit the plate, or had no pose.
-    warnings
-        In words.
     """
 
     estimate: Estimate[int]
@@ -264,22 +258,8 @@ def calibrate_latency(
     process), as restricted maximum likelihood says; exposures off by more than `FARTHEST` sigmas
     are left out.
 
-    Parameters
-    ----------
-    looks
-        What the exposures see of the plate.
-    arm
-        The arm's track.
-    tool_from_sensor
-        The hand-eye.
-    is_shared
-        False if camera and arm have clocks of their own: any offset is searched for that lets
-        the exposures lie within the track, and the drift is estimated.
-
-    Returns
-    -------
-    LatencyFit | FitFailure
-        A failure if too little was seen, or the motion does not tell.
+    Unless ``is_shared``, camera and arm have clocks of their own: any offset is searched for that
+    lets the exposures lie within the track, and the drift is estimated.
     """
     if len(looks) < FEWEST_EXPOSURES:
         return FitFailure(

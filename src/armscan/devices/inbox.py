@@ -24,8 +24,6 @@ class Inbox(Generic[T]):
 
     Parameters
     ----------
-    name
-        What messages call the device.
     most
         Elements that it holds.
 
@@ -159,17 +157,11 @@ class FaultyLine(Generic[T]):
 
     Parameters
     ----------
-    name
-        What messages call the device.
     most
         Elements that its inbox holds.
-    clock
-        The device's.
     delay_ns, spread_ns
         Least time on the way, and the mean of what comes on top by chance, exponentially
         distributed as on a busy computer.
-    rng
-        Of that chance.
     """
 
     def __init__(

@@ -59,14 +59,7 @@ def open_device(kind: Literal["lasers"], address: str) -> LaserController: ...
 @overload
 def open_device(kind: DeviceKind, address: str) -> Camera | Arm | LaserController: ...
 def open_device(kind: DeviceKind, address: str) -> Camera | Arm | LaserController:
-    """Open the device at an address.
-
-    Parameters
-    ----------
-    kind
-        What it is.
-    address
-        Driver and place, for example ``tcp:127.0.0.1:4712``.
+    """Open the device at an address: driver and place, for example ``tcp:127.0.0.1:4712``.
 
     Raises
     ------

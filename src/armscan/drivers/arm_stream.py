@@ -391,13 +391,7 @@ class StreamedArm:
 
 @dataclass(frozen=True, slots=True)
 class ArmStreamDriver:
-    """Opens ``tcp:HOST:PORT`` or ``serial:PORT:BAUD``.
-
-    Parameters
-    ----------
-    link
-        Which of the two.
-    """
+    """Opens ``tcp:HOST:PORT`` or ``serial:PORT:BAUD``."""
 
     link: Any
     kinds: tuple[DeviceKind, ...] = ("arm",)
@@ -409,15 +403,7 @@ class ArmStreamDriver:
         return ()
 
     def open(self, kind: DeviceKind, place: str) -> Arm:
-        """Connect to the arm at a place.
-
-        Raises
-        ------
-        DeviceError
-            If there is no connection, or what comes is no arm's stream.
-        OptionError
-            If the address cannot be read.
-        """
+        """Connect to the arm at a place."""
         return StreamedArm(self.link, place)
 
 

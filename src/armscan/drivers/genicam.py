@@ -63,8 +63,6 @@ class RawFrame:
 
     Parameters
     ----------
-    image
-        A copy of the pixels.
     number
         The camera's own count.
     t_camera_ns

@@ -277,13 +277,7 @@ class LaserSerialDriver:
         return ()
 
     def open(self, kind: DeviceKind, place: str) -> LaserController:
-        """Open the controller at a port; its lasers are off then.
-
-        Raises
-        ------
-        DeviceError
-            If the port is not there or taken, or nothing there speaks the protocol.
-        """
+        """Open the controller at a port; its lasers are off then."""
         return SerialLasers(place)
 
 

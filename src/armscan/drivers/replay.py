@@ -80,8 +80,6 @@ class Playback:
 
     Parameters
     ----------
-    source
-        What is played.
     rate_hz
         Middle rate of the exposures of one camera; 0 for that of the recording.
     is_loop
@@ -491,15 +489,7 @@ class ReplayDriver:
         return ()
 
     def open(self, kind: DeviceKind, place: str) -> Camera | Arm | LaserController:
-        """Open one device of a recording.
-
-        Raises
-        ------
-        DeviceError
-            If there is no such recording, or it has no such device.
-        OptionError
-            If the address cannot be read.
-        """
+        """Open one device of a recording."""
         plan, camera = _plan(place)
         with _PLAYED_LOCK:
             rig = _PLAYED.get(plan) or _playback(plan)

@@ -42,8 +42,6 @@ class Webcam:
     ----------
     place
         Number of the camera as the system counts them, or path of a video file.
-    is_grey
-        Deliver grey images.
     rate_hz
         Of a file; 0 for its own.
     is_loop
@@ -204,15 +202,7 @@ class WebcamDriver:
         return tuple(found)
 
     def open(self, kind: DeviceKind, place: str) -> Camera:
-        """Open a webcam or a video file.
-
-        Raises
-        ------
-        DeviceError
-            If it is not there or taken, or gives no image.
-        OptionError
-            If the address cannot be read.
-        """
+        """Open a webcam or a video file."""
         path, options = split_place(place, ("colour", "rate", "loop"))
         colour, loop = options.get("colour", "mono"), options.get("loop", "0")
         if not path or colour not in ("mono", "rgb") or loop not in ("0", "1"):

@@ -90,8 +90,6 @@ class CellSums:
 
     Parameters
     ----------
-    n_values
-        K.
     folder
         Where runs go; None keeps all in memory however many cells there are.
     most_bytes

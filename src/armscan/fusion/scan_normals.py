@@ -146,8 +146,6 @@ class ScanNormals:
 
     Parameters
     ----------
-    spool
-        The points.
     radius_mm
         Points within this distance make a point's tangent plane.
     """

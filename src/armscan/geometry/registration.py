@@ -155,15 +155,7 @@ def register_points(pairs: PointPairs) -> Estimate[Pose[A, B]] | FitFailure:
 
 
 def misfits(pairs: PointPairs, fit: Estimate[Pose[A, B]]) -> PointMisfit[A]:
-    """Each point's offset from where the others put it (deleted residuals, Baarda's test).
-
-    Parameters
-    ----------
-    pairs
-        What was registered.
-    fit
-        Its registration, with every point in it.
-    """
+    """Each point's offset from where the others put it (deleted residuals, Baarda's test)."""
     residuals, jacobian, weights = _linearised(pairs, fit.value)
     covariance = np.linalg.inv(weights)
     own = covariance - jacobian @ fit.covariance @ np.swapaxes(jacobian, 1, 2)

@@ -66,15 +66,7 @@ class Plane(ArrayRecord, kw_only=False):
 
 
 def fit_line(points: FloatArray, weights: FloatArray | None = None) -> Line | FitFailure:
-    """Fit a line to (N, D) points: least sum of squared distances.
-
-    Parameters
-    ----------
-    points
-        (N, D) points.
-    weights
-        (N,) one over variance, or None for equal ones.
-    """
+    """Fit a line to (N, D) points: least squared distances, weighted by 1 / variance (N,)."""
     points = np.asarray(points, dtype=np.float64)
     w = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
     if int((w > 0.0).sum()) < 2:
@@ -125,15 +117,11 @@ def fit_plane(
 ) -> Estimate[Plane] | FitFailure:
     """Fit a plane to (N, 3) points: least sum of squared distances along the normal.
 
-    Parameters
-    ----------
-    points_mm
-        (N, 3) points.
-    prior_sigma_mm, prior_freedom
-        What is known of a point's noise beforehand, and how many degrees of freedom that is worth:
-        the noise's variance is (prior_freedom prior_sigma_mm^2 + squared residuals) /
-        (prior_freedom + N - 3). That is the expected variance if it was drawn from the scaled
-        inverse chi-square distribution of prior_freedom + 2 degrees and that mean.
+    ``prior_sigma_mm`` and ``prior_freedom`` are what is known of a point's noise beforehand, and
+    how many degrees of freedom that is worth: the noise's variance is (prior_freedom
+    prior_sigma_mm^2 + squared residuals) / (prior_freedom + N - 3). That is the expected variance
+    if it was drawn from the scaled inverse chi-square distribution of prior_freedom + 2 degrees and
+    that mean.
 
     Returns
     -------

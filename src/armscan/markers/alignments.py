@@ -84,8 +84,6 @@ class Matched:
 
     Parameters
     ----------
-    alignment
-        Pairs and motion.
     n_rival
         Markers that the best other alignment explains.
     """
@@ -113,8 +111,6 @@ class NoMatch:
 
     Parameters
     ----------
-    reason, remedy
-        What and what to do.
     n_best
         Markers that the best alignment explains.
     """
@@ -505,14 +501,8 @@ def find_alignments(
 ) -> list[Alignment]:
     """Different alignments, the best first; at least the two best are complete.
 
-    Parameters
-    ----------
-    placing, votes
-        The two sets, and how their labels agree.
-    are_seen
-        Both sets are in the frame of a sensor that saw them from its origin.
-    known
-        Alignments that are not to be looked for.
+    With ``are_seen`` both sets are in the frame of a sensor that saw them from its origin; those
+    ``known`` are not looked for.
     """
     a, b = placing.first, placing.second
     # among few markers three that agree are looked for too: they may be a rival of four

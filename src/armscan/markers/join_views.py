@@ -66,16 +66,9 @@ def link_views(
     options: MarkerMatchOptions | None = None,
     advance: Callable[[int, int], None] | None = None,
 ) -> ViewLinks:
-    """Match every view with every other.
+    """Match every view, in its own frame, with every other.
 
-    Parameters
-    ----------
-    views
-        Markers of each view in its own frame.
-    options
-        How to match.
-    advance
-        Called with how many pairs are done, and of how many.
+    ``advance`` is called with how many pairs are done, and of how many.
     """
     links: list[Link] = []
     not_unique: dict[int, str] = {}
@@ -103,8 +96,6 @@ class Tracks:
     ----------
     of_view
         For each view, (N,) number of the part's marker that each of its markers is.
-    n_markers
-        Count of different markers.
     n_contradictions
         Pairs that were dropped because they would make two markers of one view the same.
     """
@@ -175,8 +166,6 @@ class JoinedViews:
         For each placed view, (N,) number of the map's marker that each of its markers is.
     sightings
         What was adjusted; ``view`` counts in ``placed``.
-    left
-        Views that could not be joined.
     chain
         Poses of the placed views by the chain alone, before all was solved together.
     n_links
@@ -232,14 +221,7 @@ def join_views(
     are placed one after the other where they share most, then all poses and markers are solved
     together.
 
-    Parameters
-    ----------
-    views
-        Markers of each view, two views at least.
-    options
-        How to match.
-    advance
-        Called with how many pairs of views are matched, and of how many.
+    ``advance`` is called with how many pairs of views are matched, and of how many.
     """
     if len(views) < 2:
         return FitFailure("one view cannot be joined to anything", "give two or more views")

@@ -244,15 +244,6 @@ def on_planes(
     The homography with the most seeds is found, its seeds are set aside, and so on, since a part
     may have several flat faces.
 
-    Parameters
-    ----------
-    pairs
-        K candidates.
-    seeds
-        Pairs that are the only candidates of both their rings.
-    left, right
-        Rings in the two images.
-
     Returns
     -------
     is_on_plane
@@ -276,26 +267,14 @@ def on_planes(
 
 
 def depth_misfits(pairs: CandidatePairs, seeds: CandidatePairs, left: RingImages) -> FloatArray:
-    """How far pairs lie from the plane through their nearest seeds, where a part is curved.
+    """How far (K,) pairs lie from the plane through their nearest seeds, where a part is curved.
 
-    With calibrated cameras the homography of a plane has three unknowns instead of the eight of
-    eq. 4.28: the inverse depth is linear in the ideal image coordinates. So few can be had from the
-    nearest neighbours, and continued to the marker, where eight cannot. The plane is the one
-    through three neighbours with the least median distance in depth of the others.
-
-    Parameters
-    ----------
-    pairs
-        K candidates.
-    seeds
-        Pairs to take neighbours from; those that share a ring with the candidate are left out.
-    left
-        Rings in the left image.
-
-    Returns
-    -------
-    (K,) difference in depth over the median distance to the neighbours; infinite where there are
-    too few neighbours.
+    With calibrated cameras the homography of a plane has three unknowns instead of the eight of eq.
+    4.28: the inverse depth is linear in the ideal image coordinates. So few can be had from the
+    nearest neighbours, those that share a ring left out, and continued to the marker, where eight
+    cannot. The plane is the one through three neighbours with the least median distance in depth of
+    the others; the misfit is the difference in depth over that, infinite where neighbours are too
+    few.
     """
     found = np.full(len(pairs), np.inf)
     places = left.centres_px[seeds.left]
@@ -382,12 +361,7 @@ def only_supported(pairs: CandidatePairs, rank: IntArray, best: IntArray) -> Int
     A rival is another pair with one of the two rings whose rank is lower by one at most, or was
     with other seeds.
 
-    Parameters
-    ----------
-    pairs
-        K candidates.
-    rank, best
-        (K,) ranks, and the highest that each pair had with any seeds so far.
+    ``best`` (K,) is the highest rank that each pair had with any seeds so far.
     """
     rows = []
     for k in np.flatnonzero(rank >= 2):

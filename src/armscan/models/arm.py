@@ -49,8 +49,6 @@ class ArmModel(ArrayRecord):
         Fixed pose of Tool in the frame of the last axis.
     joint_min_rad, joint_max_rad
         (n,) limits of the joint angles as the encoders give them; infinite where there is none.
-    name
-        What reports call it.
 
     Raises
     ------
@@ -111,18 +109,9 @@ def thesis_arm(
 ) -> ArmModel:
     """The nominal seven-axis arm of Table 2 (eqs. 2.7 and 2.8).
 
-    Parameters
-    ----------
-    d_mm
-        (d_1, d_3, d_5, d_7).
-    l_mm
-        (l_2, l_4, l_6) as Table 2 names them: the chain holds their negatives.
-    theta_offset_rad
-        (7,) encoder offsets theta_i0.
-    flange
-        Pose of Tool after axis 7; that of the axis itself if None.
-    name
-        What reports call it.
+    ``d_mm`` are (d_1, d_3, d_5, d_7), ``l_mm`` (l_2, l_4, l_6) as Table 2 names them, of which the
+    chain holds the negatives; ``theta_offset_rad`` (7,) the encoder offsets theta_i0. Without
+    ``flange`` Tool is the frame of axis 7.
 
     Raises
     ------
@@ -204,12 +193,7 @@ def axis_frames(arm: ArmModel, joints_rad: FloatArray) -> AxisFrames:
 def forward(arm: ArmModel, joints_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pose of the tool for many joint vectors (eq. 2.9, then the flange).
 
-    Parameters
-    ----------
-    arm
-        Geometry.
-    joints_rad
-        (N, n) angles as the encoders give them; the arm's offsets are added here.
+    ``joints_rad`` (N, n) are as the encoders give them; the arm's offsets are added here.
 
     Returns
     -------

@@ -32,8 +32,6 @@ class TwoViews:
 
     Parameters
     ----------
-    left, right
-        The cameras.
     right_from_left
         Pose of the left camera, which is the Sensor frame, in the right camera's (eqs. 4.3 to 4.5;
         ``R_LR``, ``T_LR`` of eqs. 4.15 and 4.16).
@@ -109,12 +107,7 @@ def epipolar_distances_px(
     curve in the image as taken: the value of ``x_r' E x_l`` over the length of its gradient by the
     point's own pixel, correct to first order in the distance.
 
-    Parameters
-    ----------
-    views
-        The cameras.
-    left_px, right_px
-        (N, 2) pixels as taken, row by row of one point.
+    Pixels (N, 2) are as taken, row by row of one point.
 
     Returns
     -------
@@ -211,14 +204,8 @@ def triangulate_points(
 
     Gauss-Newton from the point midway between the two rays.
 
-    Parameters
-    ----------
-    views
-        The cameras.
-    left_px, right_px
-        (N, 2) pixels as taken, row by row of one point.
-    left_covariance_px2, right_covariance_px2
-        (N, 2, 2) covariances of the pixels, or (2, 2) for all: ``sigma_px**2 * np.eye(2)``.
+    Pixels (N, 2) are as taken, row by row of one point; their covariances are (N, 2, 2), or (2, 2)
+    for all: ``sigma_px**2 * np.eye(2)``.
     """
     n = len(left_px)
     observed = np.concatenate([left_px, right_px], axis=1)
@@ -358,10 +345,6 @@ class StereoCalibration(ArrayRecord):
         Root mean square over all points of both cameras of the residual vector's length.
     n_pairs, n_points
         What was used; a point that both cameras see counts once.
-    provenance
-        How it came to be.
-    diagnostics
-        Evidence for a reader; None where there is none.
     """
 
     left: CameraCalibration

@@ -127,19 +127,7 @@ Columns = Mapping[str, tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmTable:
-    """What ``arm.csv`` says.
-
-    Parameters
-    ----------
-    track
-        The samples.
-    form
-        How the poses are written.
-    extra
-        Columns that are not known.
-    warnings
-        What is odd in it.
-    """
+    """What ``arm.csv`` says."""
 
     track: ArmTrack
     form: PoseForm
@@ -155,16 +143,8 @@ def read_arm_table(
 ) -> ArmTable:
     """Samples of ``arm.csv``; a row is ``base_from_tool``.
 
-    Parameters
-    ----------
-    table
-        The file.
-    form
-        How the poses are written; None lets the columns decide.
-    rotation
-        Convention of Euler angles.
-    arm
-        Turns joint angles into poses; needed for the form ``joints`` only.
+    Without ``form`` the columns decide how poses are written; ``arm`` turns joint angles into poses
+    and is needed for these only.
 
     Raises
     ------

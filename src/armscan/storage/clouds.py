@@ -72,8 +72,6 @@ class CloudFormat:
 
     Parameters
     ----------
-    name, suffixes
-        As people and file names call it.
     read
         Columns of a file's content and path.
     write
@@ -141,10 +139,6 @@ class CloudFile:
 
     Parameters
     ----------
-    cloud
-        The points.
-    remarks
-        What a person should know of how it was read, in words.
     dropped
         Names of the file's columns that the cloud does not carry.
     n_points
@@ -158,13 +152,7 @@ class CloudFile:
 
 
 def read_cloud_file(path: Path) -> CloudFile:
-    """As `read_cloud`, with what a person should know of the reading.
-
-    Raises
-    ------
-    ArmscanError
-        As `read_cloud`.
-    """
+    """As `read_cloud`, with what a person should know of the reading."""
     data = read_bytes(path)
     # a PLY file says so itself, whatever its name
     known = BY_SUFFIX.get(".ply" if data.startswith(b"ply") else path.suffix.lower())
@@ -209,16 +197,9 @@ def cloud_parts(
     *,
     is_fused: bool = False,
 ) -> Iterator[bytes]:
-    """As `cloud_bytes`, of a cloud that comes in pieces.
+    """As `cloud_bytes`, of a cloud that comes in pieces, as `ply_parts` takes them.
 
     PLY and XYZ files are made piece by piece, others in memory.
-
-    Parameters
-    ----------
-    path
-        Where it goes.
-    marks, n_points, pieces, is_fused
-        As of `ply_parts`.
     """
     suffix = path.suffix.lower()
     if suffix == ".ply":
@@ -244,13 +225,7 @@ PIECE_POINTS = 200_000
 
 
 def read_cloud_pieces(path: Path) -> Iterator[PointCloud]:
-    """As `read_cloud`, a binary PLY file piece by piece.
-
-    Raises
-    ------
-    ArmscanError
-        As `read_cloud`.
-    """
+    """As `read_cloud`, a binary PLY file piece by piece."""
     pieces = ply_pieces(path, PIECE_POINTS) if is_file(path) else None
     if pieces is None:
         yield read_cloud(path)
@@ -304,16 +279,10 @@ class Conversion:
 def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) -> Conversion:
     """Write a calibration's camera as ROS ``camera_info``, or a cloud or mesh in another format.
 
-    Parameters
-    ----------
-    source
-        A cloud in any of `FORMATS`, a model of a part, or any calibration that armscan reads: its
-        own camera or sensor document, OpenCV's YAML, XML or JSON, ROS.
-    output
-        ``.yaml`` for a camera, ``.stl`` for the triangles of a model, one of `CLOUD_SUFFIXES` for a
-        cloud, or for the corners of a mesh.
-    is_overwriting
-        Replace a file that exists.
+    ``source`` is a cloud in any of `FORMATS`, a model of a part, or any calibration that armscan
+    reads: its own camera or sensor document, OpenCV's YAML, XML or JSON, ROS. ``output`` is
+    ``.yaml`` for a camera, ``.stl`` for the triangles of a model, one of `CLOUD_SUFFIXES` for a
+    cloud, or for the corners of a mesh.
 
     Raises
     ------

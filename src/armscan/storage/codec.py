@@ -287,8 +287,6 @@ class RecordCodec:
 
     Parameters
     ----------
-    layouts
-        Of the classes that need one.
     unknown
         Takes a sentence for each key that is not known; None refuses them.
     """
@@ -333,18 +331,8 @@ class RecordCodec:
         return None if may_lack and isinstance(value, float) and not math.isfinite(value) else value
 
     def read(self, kind: type[T], tree: Any, key: str = "", **given: Any) -> T:
-        """Record of a tree.
-
-        Parameters
-        ----------
-        kind
-            Class of the record.
-        tree
-            What the file holds under ``key``.
-        key
-            Where the record stands, for messages.
-        given
-            Fields that are not in the tree.
+        """Record of a tree that the file holds under ``key``; ``given`` are fields that are not in
+        it.
 
         Raises
         ------

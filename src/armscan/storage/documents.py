@@ -162,8 +162,6 @@ class Registration:
         Scans that were joined, their markers, markers that moved, and scans that could not be.
     chi2, degrees_of_freedom
         Squared residuals in units of their covariances.
-    provenance
-        How it came to be.
     """
 
     kind: Literal["views", "moved arm"]
@@ -627,21 +625,10 @@ def new_provenance(
 ) -> Provenance:
     """Describe a document that is about to be written.
 
-    Parameters
-    ----------
-    inputs
-        Files that went in; each is hashed.
-    command
-        The command line, one word an entry; empty in a program.
-    options
-        Options dataclasses in force; every field is recorded as ``Class.field``, one
-        that is a dataclass itself by its own class and fields.
-    parents
-        Of the documents on which this one rests; their reasons for a refusal go on.
-    warnings
-        What the program warned of.
-    forced
-        Why this document was refused, if it is written all the same.
+    Files that went in are hashed. Of options dataclasses in force every field is recorded as
+    ``Class.field``, one that is a dataclass itself by its own class and fields. Of ``parents``, the
+    documents on which this one rests, the reasons for a refusal go on; ``forced`` is why this one
+    was refused, if it is written all the same.
     """
     return Provenance(
         document_id=str(uuid4()),

@@ -201,12 +201,7 @@ def told_of(where: str, *, remedy: str = "") -> Iterator[None]:
 def check_outputs(paths: Iterable[Path], *, is_overwriting: bool = False) -> None:
     """Raise before long work if a result could not be written afterwards.
 
-    Parameters
-    ----------
-    paths
-        Files that will be written.
-    is_overwriting
-        Allow files that exist; folders are refused all the same.
+    ``is_overwriting`` allows files that exist; folders are refused all the same.
 
     Raises
     ------

@@ -254,14 +254,7 @@ def camera_info_yaml(
     Rectification is the identity and the projection matrix repeats the intrinsics: a single
     camera. Numbers are written so that reading them back gives the same floats.
 
-    Parameters
-    ----------
-    camera
-        The camera.
-    name
-        ``camera_name``: letters, digits, ``_``, ``/`` and ``-``.
-    comments
-        Why the calibration was refused, if it was and was written all the same.
+    ``comments`` are why the calibration was refused, if it was and was written all the same.
 
     Raises
     ------

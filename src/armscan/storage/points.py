@@ -197,8 +197,6 @@ class MarkerList:
     ----------
     markers
         The markers; without a column ``id`` they are numbered from 1 in the order of the rows.
-    path
-        The file.
     has_ids
         True if the list numbers its markers itself.
     is_sigma_assumed
@@ -260,14 +258,8 @@ def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_
     A comment ``# frame = Base`` names the frame, ``# simulated`` marks rendered images. Tables of
     probed points are such lists; points are taken as they stand, centres of a tip included.
 
-    Parameters
-    ----------
-    path
-        The file.
-    frame
-        Frame of the markers where the list names none.
-    sigma_mm
-        Standard deviation an axis where the list gives no covariance.
+    ``frame`` is that of the markers where the list names none, ``sigma_mm`` the standard deviation
+    an axis where it gives no covariance.
 
     Raises
     ------

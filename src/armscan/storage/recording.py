@@ -230,17 +230,7 @@ def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposur
 
 
 def setup_of_image(path: Path, setup: CameraSetup, lacking: Sequence[str]) -> CameraSetup:
-    """Complete what nobody said about a camera by one of its images.
-
-    Parameters
-    ----------
-    path
-        The image.
-    setup
-        What is known, defaults elsewhere.
-    lacking
-        Names of the fields that nobody said.
-    """
+    """Complete by one of its images what is lacking: what nobody said about a camera."""
     bits = None if "bits_used" in lacking else setup.bits_used
     image = read_exposure(path, ImageOptions(bits, setup.align))
     found: dict[str, Any] = {key: getattr(image, key) for key in lacking}
@@ -336,14 +326,8 @@ class FolderRecording:
 
     Parameters
     ----------
-    folder
-        Where it lies.
-    session, rows, arm
-        See `ScanSource`.
     is_simulated
         True if it, or a mark beside it, says that its images were rendered.
-    warnings
-        What is odd in it, in words.
     exposure_columns, arm_columns
         Columns of the tables that are not known, in the order of ``rows`` and of the samples.
     arm_model
@@ -586,29 +570,15 @@ def write_recording(
     arm: ArmModel | None = None,
     beside: Mapping[Path, bytes] | None = None,
 ) -> None:
-    """Write a scan as a folder recording.
+    """Write a scan as a folder recording, into a folder that does not exist or is empty.
 
     Everything is written into a folder of another name, which is renamed when it is complete; an
     interrupt or a full disk leaves nothing. Images of a folder recording are copied byte by byte,
-    those of any other source are written as PNG.
-
-    Parameters
-    ----------
-    folder
-        Must not exist, or be empty.
-    source
-        What to write.
-    progress
-        Called with images written, images in all, and the name of the latest.
-    names
-        (N,) paths of the images inside the recording; if None their own names where those are
-        paths of PNG files, else by index.
-    encoded
-        (N,) the images' PNG files, where they were made already; see `encoded_png`.
-    arm
-        Geometry that turns joint angles into poses.
-    beside
-        Files outside the folder that appear with it; see `new_folder`.
+    those of any other source are written as PNG, or as ``encoded`` (N,), where they were made
+    already; see `encoded_png`. ``names`` (N,) are their paths inside the recording; if None their
+    own names where those are paths of PNG files, else by index. ``progress`` is called with images
+    written, images in all, and the name of the latest; files ``beside`` appear with the folder
+    (`new_folder`).
 
     Raises
     ------

@@ -92,8 +92,6 @@ class SessionFile:
         Its facts, defaults where it says nothing; no cameras if it names none.
     stated
         Keys that it holds, as ``pose.form`` or ``camera.0.colour``.
-    warnings
-        What is odd in it.
     """
 
     session: Session

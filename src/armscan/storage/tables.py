@@ -53,8 +53,6 @@ class CsvTable:
 
     Parameters
     ----------
-    where
-        Name of the file, for messages.
     columns
         Cells of each column, stripped of blanks, in the order of the header.
     lines
@@ -149,14 +147,7 @@ class CsvTable:
         )
 
     def floats(self, names: Sequence[str], *, may_lack: bool = False) -> FloatArray:
-        """Return columns as numbers (N, len(names)).
-
-        Parameters
-        ----------
-        names
-            Columns.
-        may_lack
-            Take empty cells and ``nan`` as NaN instead of refusing them.
+        """Columns as numbers (N, len(names)); with ``may_lack`` empty cells and ``nan`` as NaN.
 
         Raises
         ------
@@ -195,14 +186,7 @@ class CsvTable:
         return values
 
     def ints(self, name: str, missing: int | None = None) -> IntArray:
-        """Return a column as whole numbers (N,).
-
-        Parameters
-        ----------
-        name
-            The column.
-        missing
-            Stands for an empty cell; None refuses empty cells.
+        """A column as whole numbers (N,); ``missing`` stands for an empty cell, None refuses these.
 
         Raises
         ------

@@ -47,10 +47,6 @@ class Observations:
         (N, 2) height of the board per unit of the two bow parameters.
     starts
         (V + 1,) first row of each view, and N.
-    width_px, height_px
-        Size of the image.
-    lens
-        Kind of lens that is supposed.
     """
 
     points_px: FloatArray
@@ -197,8 +193,6 @@ class NormalEquations:
 
     Parameters
     ----------
-    chi2
-        Weighted sum of squares.
     shared, cross, pose
         (F, F), (V, F, 6) and (V, 6, 6) blocks of ``J' J``.
     shared_gradient, pose_gradient
@@ -358,23 +352,9 @@ def adjust(
 ) -> Minimum[State, NormalEquations] | FitFailure:
     """Minimise eq. 2.39, weighted by each point's covariance.
 
-    Parameters
-    ----------
-    observations
-        The image points.
-    start
-        Starting values.
-    basis
-        (11, F) from `free_basis`; (11, 0) solves the poses alone.
-    weights
-        (N,) factors of each point's chi2, 0 to leave a point out; all 1 if None.
-    max_steps
-        Most iterations; what is reached by then is returned.
-
-    Returns
-    -------
-    adjustment
-        The minimum, or what was reached by the last step; or why there is none.
+    ``basis`` is (11, F) from `free_basis`; (11, 0) solves the poses alone. ``weights`` (N,) are
+    factors of each point's chi2, 0 to leave a point out; all 1 if None. After ``max_steps`` what is
+    reached by then is returned.
     """
     used = np.ones(len(observations.points_px)) if weights is None else weights
     return descend(
@@ -393,16 +373,8 @@ def descend(
 ) -> Minimum[S, NormalEquations] | FitFailure:
     """Levenberg-Marquardt with the poses eliminated per view, over any such unknowns.
 
-    Parameters
-    ----------
-    start
-        Starting values.
-    equations_at
-        Normal equations at a state, or None where it is impossible.
-    move
-        The state after a step of the (F,) shared unknowns and the (V, 6) poses.
-    max_steps
-        Most iterations; what is reached by then is returned.
+    ``equations_at`` gives None where a state is impossible; ``move`` takes a step of the (F,)
+    shared unknowns and the (V, 6) poses. After ``max_steps`` what is reached is returned.
     """
 
     def evaluate(state: S) -> tuple[float, NormalEquations] | None:
@@ -455,12 +427,7 @@ def joint_covariance(
 ) -> tuple[FloatArray, float] | FitFailure:
     """Invert the normal equations.
 
-    Parameters
-    ----------
-    equations
-        At the minimum.
-    basis
-        (S, F) from `free_basis`.
+    ``basis`` is (S, F) from `free_basis`.
 
     Returns
     -------
@@ -469,7 +436,6 @@ def joint_covariance(
         what the detector says; scale it by sigma0 squared.
     condition
         Of the reduced normal matrix, see `condition_number`.
-
     or why the unknowns are not determined.
     """
     reduced = reduced_normal_matrix(equations)

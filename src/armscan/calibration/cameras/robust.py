@@ -112,20 +112,14 @@ class Solution:
     ----------
     observations
         What was adjusted, with the weights that were in force.
-    state
-        The unknowns.
     basis
         Which of them were free, see `free_basis`.
-    equations
-        Normal equations at the minimum, points kept only.
     weights
         (N,) 1 for points kept and 0 for outliers.
     view_levels
         (V,) robust chi2 per coordinate of each view over that of the typical view.
     outlier_shares
         (V,) share of each view's points that lie too far out for the typical view's noise.
-    is_converged
-        False if the adjustment was stopped before the minimum.
     """
 
     observations: Observations
@@ -172,19 +166,7 @@ def solve_robustly(
     trusted: BoolArray,
     max_steps: int,
 ) -> Solution | FitFailure:
-    """Solve, look for outliers, and solve again without them where there are any.
-
-    Parameters
-    ----------
-    observations
-        The image points.
-    start, trusted
-        From `armscan.calibration.cameras.start.starting_state`.
-    basis
-        From `free_basis`.
-    max_steps
-        Most iterations of each adjustment.
-    """
+    """Solve, look for outliers, and solve again without them where there are any."""
     if trusted.all():
         result = adjust(observations, start, basis, max_steps=max_steps)
         if isinstance(result, FitFailure):
@@ -481,16 +463,8 @@ def covariance_with_target_error(
 ) -> FloatArray:
     """Covariance (S + 6 V, S + 6 V) of shared unknowns and poses with the target's own errors.
 
-    Parameters
-    ----------
-    unit_covariance
-        From `armscan.calibration.cameras.adjustment.joint_covariance`.
-    variance_factor
-        sigma0 squared of the solution.
-    error
-        Of the target.
-    found
-        The residuals that showed it.
+    ``unit_covariance`` is that of `armscan.calibration.cameras.adjustment.joint_covariance`,
+    ``variance_factor`` the solution's sigma0 squared.
     """
     covariance = error.independent_share * variance_factor * unit_covariance
     if error.sigma_mm == 0.0 or found is None:
@@ -579,14 +553,7 @@ def with_significant_bow(
 def board_warp(bowed: Solution, test: BowTest, covariance: FloatArray) -> BoardWarp:
     """The bow of a solution in which it was free.
 
-    Parameters
-    ----------
-    bowed
-        The solution with bow.
-    test
-        Of its bow.
-    covariance
-        (11 + 6 V, 11 + 6 V) scaled joint covariance of the bowed solution.
+    ``covariance`` (11 + 6 V, 11 + 6 V) is its scaled joint covariance.
     """
     return BoardWarp(
         bow_mm=bowed.state.shared[WARP_ROWS],

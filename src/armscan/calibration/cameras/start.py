@@ -145,11 +145,6 @@ _FIXED_CENTRE = (_B11, _B22, _B33)
 def constraint_rows(homography: FloatArray) -> FloatArray:
     """Two equations of one view (eq. 2.34) for ``b = (B11, B12, B22, B13, B23, B33)``.
 
-    Parameters
-    ----------
-    homography
-        (3, 3) from board to image.
-
     Returns
     -------
     rows
@@ -180,22 +175,11 @@ def constraint_rows(homography: FloatArray) -> FloatArray:
 def intrinsics_from_homographies(
     homographies: Sequence[FloatArray], width_px: int, height_px: int
 ) -> FloatArray | FitFailure:
-    """Solve eq. 2.34 for the intrinsic matrix without skew.
+    """Solve eq. 2.34 for the intrinsic matrix (3, 3) of eq. 2.18, without skew.
 
-    First with all five unknowns of B; if noise leaves no positive definite B (eq. 2.32), with the
-    principal point in the middle of the image; and then with one focal length.
-
-    Parameters
-    ----------
-    homographies
-        (3, 3) matrices from board to pixels.
-    width_px, height_px
-        Size of the image.
-
-    Returns
-    -------
-    matrix
-        (3, 3) intrinsic matrix of eq. 2.18, or why there is none.
+    From (3, 3) homographies from board to pixels: first with all five unknowns of B; if noise
+    leaves no positive definite B (eq. 2.32), with the principal point in the middle of the image;
+    and then with one focal length.
     """
     centre = np.array([0.5 * (width_px - 1), 0.5 * (height_px - 1)])
     scale = 0.5 * (width_px + height_px)
@@ -355,18 +339,7 @@ def starting_state(
     model: DistortionModel,
     options: CameraOptions,
 ) -> tuple[State, BoolArray] | FitFailure:
-    """Closed-form camera and poses.
-
-    Parameters
-    ----------
-    views
-        The views.
-    observations
-        The same views from `gather`.
-    homographies
-        One (3, 3) a view, from board mm to pixels.
-    model, options
-        Which parameters are free.
+    """Closed-form camera and poses, from one homography (3, 3) a view, from board mm to pixels.
 
     Returns
     -------
@@ -374,7 +347,6 @@ def starting_state(
         Starting values with those parameters at rest that are not free.
     trusted
         (V,) False for views that fit a plane so badly that they had no say.
-
     or why there are none.
     """
     if model == "fisheye":
@@ -481,8 +453,6 @@ class PoseCandidate:
 
     Parameters
     ----------
-    sensor_from_board
-        The pose.
     chi2
         Squared residuals over the detector's covariances.
     """
@@ -500,14 +470,7 @@ def board_pose_candidates(
     fits almost as well when its normal is mirrored at the line of sight: that pose starts the
     second.
 
-    Parameters
-    ----------
-    view
-        Target points.
-    camera
-        The camera, held fixed.
-    bow_mm
-        (2,) bow of the board as in `BoardWarp`; flat if None.
+    ``bow_mm`` (2,) is the bow of the board as in `BoardWarp`; flat if None.
 
     Raises
     ------

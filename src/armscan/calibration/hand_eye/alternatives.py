@@ -255,10 +255,6 @@ class Contradiction:
 
     Parameters
     ----------
-    failure
-        What is contradicted and what to do.
-    is_refused
-        True if the hand-eye must not be used.
     widening
         (6, 6) to be added to the hand-eye's covariance, so that it holds what it would change by.
     arm_mm

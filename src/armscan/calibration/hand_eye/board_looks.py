@@ -52,8 +52,6 @@ class BoardPose(ArrayRecord):
 
     Parameters
     ----------
-    sensor_from_board
-        The pose.
     covariance
         (6, 6) of the points' noise, the camera held; a rotation vector in Sensor from the left,
         then the translation.
@@ -77,8 +75,6 @@ class BoardLook:
     ----------
     posture
         Looks of equal names share the arm's error.
-    base_from_tool
-        As the arm reported it.
     poses
         Of the target; the better first, and those of every numbering that no view tells apart.
     """
@@ -131,8 +127,6 @@ class BoardStart:
 
     Parameters
     ----------
-    tool_from_sensor, base_from_board
-        The two poses.
     chosen
         (N,) pose of each look that is nearest.
     off_rad, off_mm
@@ -445,15 +439,8 @@ def better_reading(
 ) -> FitFailure | None:
     """Refuse in favour of another way to read the arm's poses, if it makes the looks agree.
 
-    Parameters
-    ----------
-    looks
-        As they were read.
-    fact
-        What is wrong so.
-    readings
-        Of the table that they are from, the likelier first; after them convention, direction,
-        unit and order are tried.
+    ``fact`` is what is wrong as they are read. ``readings`` are of the table that they are from,
+    the likelier first; after them convention, direction, unit and order are tried.
     """
     given, found = find_board_start(looks), None
     least_mm = np.inf if isinstance(given, FitFailure) else MUCH_BETTER * given.typical_at_lever_mm

@@ -148,12 +148,6 @@ class HandEyeSolution:
 
     Parameters
     ----------
-    problem
-        What was solved.
-    state, placed
-        All unknowns, and the observations placed with them.
-    components, noise
-        Causes of scatter and their standard deviations.
     known
         (M, M) covariance of the residuals by what errs alike in all postures: a probed plane and
         the sensor.

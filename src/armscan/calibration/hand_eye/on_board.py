@@ -101,26 +101,11 @@ def calibrate_on_board(
 ) -> BoardHandEyeFit | FitFailure:
     """Find where the camera sits on the arm's last link from looks at a target that stays put.
 
-    Parameters
-    ----------
-    looks
-        Each with the arm's pose.
-    camera
-        With which the target's poses were found. The looks move it within its covariance.
-    options
-        The arm's scatter, where it is known; else it is estimated.
-    bow
-        Of the target, with which its poses were found; None if it is flat.
-    target
-        For the words about its size.
-    readings
-        Other ways to read the arm's poses, of all looks, that are tried where they do not fit.
-
-    Returns
-    -------
-    BoardHandEyeFit
-        With method "board". The calibration belongs to the moved camera: ``covariance`` holds that
-        fixed, ``dhand_eye_dsensor`` (6, 9) says how the hand-eye follows it.
+    The looks move the camera, with which the target's poses were found, within its covariance, and
+    the calibration belongs to the moved one: ``covariance`` holds that fixed, ``dhand_eye_dsensor``
+    (6, 9) says how the hand-eye follows it. ``bow`` is that of the target with which its poses were
+    found; None if it is flat. ``target`` is for words about its size. ``readings`` are other ways
+    to read the arm's poses, of all looks, that are tried where they do not fit.
     """
     options = options or HandEyeOptions()
     refused = _refuse_few(looks)

@@ -194,8 +194,6 @@ class ProbedPlate(ArrayRecord):
         (N,) whether each touch took part.
     side_from
         How the side of the probe was found, in words.
-    warnings
-        What is weak, in words.
     rows
         Row of each touch in the table it came from, counted from 1 below the header.
     """
@@ -234,21 +232,9 @@ def fit_probed_plate(
 
     Eq. 2.44's algebraic fit favours points near the origin; distances along the normal do not.
 
-    Parameters
-    ----------
-    probed
-        Points on the surface, or centres of the tip.
-    towards_mm
-        (3,) or (M, 3) places of the arm's tool in Base while it probed or scanned: their side is
-        the plate's face. None where not known.
-    options
-        Defaults if None.
-
-    Returns
-    -------
-    ProbedPlate or FitFailure
-        A failure for fewer than three points, points near one line, points on no plane, or an
-        unclear side.
+    ``towards_mm`` (3,) or (M, 3) are places of the arm's tool in Base while it probed or scanned:
+    their side is the plate's face. None where not known. There is no plate of fewer than three
+    points, points near one line or on no plane, or with an unclear side.
 
     Raises
     ------

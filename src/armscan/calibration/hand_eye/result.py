@@ -82,8 +82,6 @@ class StripeResidual(RowRecord):
 
     Parameters
     ----------
-    source, posture
-        Names of the exposure and of its posture.
     points_base_mm
         (N, 3) points placed with the result.
     residual_mm
@@ -102,10 +100,6 @@ class PostureResult:
 
     Parameters
     ----------
-    posture
-        Its name.
-    n_exposures, n_points
-        What was used.
     mean_mm, rms_mm
         Mean and root mean square distance of its points from the reference.
     normalised_mean
@@ -141,18 +135,12 @@ class HandEyeFit(ArrayRecord):
 
     Parameters
     ----------
-    calibration
-        The result.
     start
         Where the refinement started: on a plate the linear solution.
-    stripes, postures
-        What each exposure and each posture left over.
     singular_values
         (6,) of the scaled and whitened system, largest first.
     reference
         What the reference was and how far the data agree with it, as (label, value) for a reader.
-    warnings
-        What is weak, in words.
     sensor_step, sensor_covariance
         (P,) by what the stripes move the sensor's parameters, and (P, P) their covariance after it;
         None where the sensor was taken as exact. The calibration belongs to the moved sensor.

@@ -168,23 +168,10 @@ def descend_all(
     n_steps: int,
     scale: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Damped Gauss-Newton from many starts at once.
+    """Damped Gauss-Newton from many starts at once: rotations (K, 3, 3) and others (K, U).
 
-    Parameters
-    ----------
-    place
-        Residuals and derivatives of many states.
-    rotations, others
-        (K, 3, 3) and (K, U) to start from.
-    n_steps
-        Steps of each.
-    scale
-        (3 + U,) of `unit_steps`, or (K, 3 + U).
-
-    Returns
-    -------
-    rotations, others, cost
-        (K, 3, 3), (K, U), and the sums of squared residuals (K,).
+    ``scale`` (3 + U,) is of `unit_steps`, or (K, 3 + U). Returns both after the steps, and the sums
+    of squared residuals (K,).
     """
     residual, jacobian = place(rotations, others)
     cost = (residual**2).sum(axis=1)

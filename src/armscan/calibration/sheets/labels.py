@@ -45,14 +45,8 @@ class SheetAssignment:
 
     Parameters
     ----------
-    names
-        Of the sheets.
     sheets
         ``sheets[i][k]`` is the sheet of stripe k of image i, -1 for none.
-    how
-        In words.
-    warnings
-        What is doubtful.
     is_fan
         True where lines of a fan were found among others: one that cannot be calibrated may then be
         left out.

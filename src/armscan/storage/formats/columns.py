@@ -85,8 +85,6 @@ class CloudColumns:
         Lines beside them: ``frame Sensor``, ``sheet 0 "A"``, ``exposure 0 "laser.png"``.
     sources
         Names of the exposures of a file that is not armscan's; empty for the file's own.
-    remarks
-        What a person should know of the reading, in words.
     passed_over
         Names of columns that the file has and that were not read.
     """
@@ -109,8 +107,6 @@ class CloudPiece:
 
     Parameters
     ----------
-    cloud
-        The points.
     sigma_mm
         (N,) as `PointCloud.sigma_mm`, where it is known already.
     n_points

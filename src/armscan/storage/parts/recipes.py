@@ -208,14 +208,10 @@ class RecipeFile:
 
     Parameters
     ----------
-    recipe
-        What to do.
     part
         The model; None without one.
     inputs
         The recipe's file, the model's, and that of reference points.
-    title_block
-        At the head of every page.
     has_pdf
         Whether every part's page is written as PDF too.
     measured_beside
@@ -583,8 +579,6 @@ class PartResult:
         A part that is done by the same is not done again; the model's is empty without one.
     row
         Its row of the table.
-    features
-        Those that were found.
     """
 
     armscan_version: str

@@ -61,13 +61,6 @@ class ChordError:
 def read_step(path: Path, chord: ChordError) -> PartModel:
     """Read a STEP file; lengths are in mm whatever the file's unit, and faces stay as they are.
 
-    Parameters
-    ----------
-    path
-        The file.
-    chord
-        How finely faces are made into triangles.
-
     Raises
     ------
     OptionError

@@ -28,14 +28,9 @@ MM_COLUMNS = tuple(key for key in DEFINITIONS if key.endswith("_mm"))
 def read_tolerances(text: str, part: PartModel) -> tuple[float, dict[str, float]]:
     """The tolerance of all faces in mm, NaN for none, and those of single faces.
 
-    Parameters
-    ----------
-    text
-        Empty; a number in mm; or the name of a file: TOML with ``default_mm`` and a table
-        ``[faces]`` of names and mm, or CSV with the columns ``face`` and ``tolerance_mm``, ``*``
-        standing for every face that is not named.
-    part
-        Whose faces are named.
+    The text is empty; a number in mm; or the name of a file: TOML with ``default_mm`` and a table
+    ``[faces]`` of names and mm, or CSV with the columns ``face`` and ``tolerance_mm``, ``*``
+    standing for every face that is not named.
 
     Raises
     ------

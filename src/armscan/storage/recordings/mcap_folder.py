@@ -263,13 +263,6 @@ def pieces_of(
 
     After a damage it goes on with the next chunk that is whole. A file without its end ends in a
     damage.
-
-    Parameters
-    ----------
-    file
-        Opened for reading.
-    size
-        Its bytes.
     """
     topics: dict[int, str] = {}
     place = len(MAGIC)
@@ -488,11 +481,6 @@ class McapFolder:
 
     Its tables are those that `extract_recording` writes. Images that were recorded raw are given as
     PGM or PPM files under the names that they have there.
-
-    Parameters
-    ----------
-    path
-        The file.
 
     Raises
     ------

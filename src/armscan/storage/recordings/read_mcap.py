@@ -314,17 +314,9 @@ def record_folder(
 
     An ``output`` that exists is replaced when the new one is whole.
 
-    Parameters
-    ----------
-    folder, output
-        From where to where.
-    most
-        So many exposures, the first ones, and what the arm reported a second before and after
-        them; None for all.
-    edit
-        What becomes of each document; None leaves them.
-    is_stripe_band
-        See `WriterOptions`; grey pixels are then written raw, not as their files.
+    Of ``most`` exposures, the first ones, with what the arm reported a second before and after
+    them; of all if None. ``edit`` says what becomes of each document. With ``is_stripe_band``
+    (`WriterOptions`) grey pixels are written raw, not as their files.
 
     Raises
     ------
@@ -392,20 +384,7 @@ def record_source(
     encoded: Iterable[bytes] | None = None,
     beside: Mapping[Path, bytes] | None = None,
 ) -> WriterStatus:
-    """Write a scan as an MCAP file: what `write_recording` writes into a folder.
-
-    Parameters
-    ----------
-    output
-        Must not exist.
-    source
-        What to write.
-    progress
-        Called with images written, images in all, and the name of the latest.
-    encoded
-        (N,) the images' PNG files, where they were made already.
-    beside
-        Files that appear with it; they must not exist.
+    """Write a scan as a new MCAP file: what `write_recording`, whose arguments these are, writes.
 
     Raises
     ------

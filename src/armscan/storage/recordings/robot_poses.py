@@ -50,14 +50,7 @@ def rotations_of_form(
     A quaternion is w, x, y, z (Hamilton, active), of either sign and norm 1 within 1e-6; a matrix
     is row by row and orthonormal within 1e-5, and the nearest rotation is taken.
 
-    Parameters
-    ----------
-    numbers
-        Finite.
-    form, convention
-        How they are written.
-    places
-        (N,) file and line of each, for messages.
+    Numbers are finite; ``places`` (N,) name file and line of each, for messages.
 
     Raises
     ------

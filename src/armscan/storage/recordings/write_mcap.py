@@ -149,13 +149,6 @@ class RecordingWriter:
     Exposures, samples of the arm and events may be added from several threads. Times may be in any
     order: what is recorded is what was delivered. A file whose `close` never came has no summary;
     its chunks are whole, checksummed, and declare what they hold; facts follow their images.
-
-    Parameters
-    ----------
-    path
-        File to write; must not exist.
-    options
-        How it is written.
     """
 
     def __init__(self, path: Path, options: WriterOptions | None = None) -> None:

@@ -92,13 +92,6 @@ class ClockModel:
 
     `add` takes a microsecond; once a block it fits anew. The state has a fixed size.
     A clock that jumped, or a transport that became slower for good, starts it anew.
-
-    Attributes
-    ----------
-    fit
-        `ClockFit`, or why there is none yet.
-    n_jumps
-        How often it began anew.
     """
 
     def __init__(self) -> None:
@@ -230,10 +223,7 @@ def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
     leaves out pairs that are late as a whole; then fits by least squares and lowers the line by
     the scatter, by which the mean of delays with a hard lower limit lies above that limit.
 
-    Parameters
-    ----------
-    fastest
-        (device, other) times in ns, in time order, each the fastest of a block.
+    Pairs of times (device, other) in ns are in time order, each the fastest of a block.
     """
     if len(fastest) < FEWEST_BLOCKS:
         return FitFailure(f"{len(fastest)} of {FEWEST_BLOCKS} blocks of elements are complete")
@@ -363,13 +353,6 @@ class StreamMonitor:
     """Watches count and times of one device's stream and keeps the model of its clock.
 
     Call `check` for every element in the order of arrival; then ask `clock` for its time.
-
-    Attributes
-    ----------
-    clock
-        From the device's clock to this computer's.
-    counts
-        What was seen so far.
     """
 
     def __init__(self) -> None:
@@ -390,15 +373,7 @@ class StreamMonitor:
         return not self.clock.missing(self._t_device_ns)
 
     def check(self, number: int, t_device_ns: int, t_host_ns: int) -> ElementStatus:
-        """Take one element.
-
-        Parameters
-        ----------
-        number
-            The device's count.
-        t_device_ns, t_host_ns
-            When it was taken by the device's clock, and when it arrived by this computer's.
-        """
+        """Take one element by its count and its times by the device's and this computer's clock."""
         self.counts.n_elements += 1
         last = self._number
         if last is not None and number <= last:

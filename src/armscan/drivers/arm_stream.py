@@ -284,16 +284,6 @@ class StreamedArm:
     """See `armscan.devices.protocols.Arm`.
 
     A connection that ends is told of by `read`, and opened again when the arm is there again.
-
-    Parameters
-    ----------
-    scheme, place
-        Kind of the link and its address.
-
-    Raises
-    ------
-    DeviceError
-        If there is no connection, or nothing that comes is a frame of an arm.
     """
 
     def __init__(self, scheme: type[TcpLink] | type[SerialLink], place: str) -> None:

@@ -51,16 +51,6 @@ def sources_word(lasers: Sequence[str]) -> str:
 class SerialLasers:
     """See `armscan.devices.protocols.LaserController`.
 
-    Parameters
-    ----------
-    place
-        ``PORT:BAUD``.
-
-    Raises
-    ------
-    DeviceError
-        If the port cannot be opened, or nothing there speaks the protocol.
-
     Attributes
     ----------
     n_damaged

@@ -86,11 +86,6 @@ class Playback:
         Begin anew at the end; triggers and times go on.
     is_ahead
         Read all images into memory first.
-
-    Raises
-    ------
-    DeviceError
-        If the recording has no exposures, or one of them cannot be read.
     """
 
     def __init__(
@@ -337,13 +332,7 @@ def _usual_step_ns(source: ScanSource) -> int:
 
 
 class _Played:
-    """What the devices of a recording have in common.
-
-    Attributes
-    ----------
-    rig
-        The recording that is played; faults are made there.
-    """
+    """What the devices of a recording have in common."""
 
     def __init__(self, rig: Playback, device: str) -> None:
         rig.open(device)

@@ -46,11 +46,6 @@ class Webcam:
         Of a file; 0 for its own.
     is_loop
         Begin a file anew at its end.
-
-    Raises
-    ------
-    DeviceError
-        If there is no such camera or file, or it gives no image.
     """
 
     def __init__(self, place: str, *, is_grey: bool, rate_hz: float, is_loop: bool) -> None:

@@ -303,11 +303,8 @@ def fit_shape(
 
     A circle is fitted within the least-squares plane of its points, as is usual in metrology.
 
-    Returns
-    -------
-    Estimate
-        Covariance of `parameter_names`, the noise taken from the residuals (zero without
-        redundancy); residuals (R,) in mm, two a point of a line; chi2 in units of that noise.
+    Covariance of `parameter_names`, the noise taken from the residuals (zero without redundancy);
+    residuals (R,) in mm, two a point of a line; chi2 in units of that noise.
 
     Raises
     ------

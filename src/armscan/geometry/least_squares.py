@@ -136,15 +136,7 @@ class Whitening:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DenseSystem:
-    """Whitened residuals and their Jacobian at a state.
-
-    Parameters
-    ----------
-    residuals
-        (N,) whitened.
-    jacobian
-        (N, K) derivative by the step.
-    """
+    """Whitened residuals (N,) and their Jacobian (N, K) by the step at a state."""
 
     residuals: FloatArray
     jacobian: FloatArray
@@ -183,15 +175,7 @@ class DenseSystem:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Minimum(Generic[S, L]):
-    """Where a search ended.
-
-    Parameters
-    ----------
-    system
-        The problem linearised there.
-    is_settled
-        False if the steps ran out.
-    """
+    """Where a search ended; ``is_settled`` is False if the steps ran out."""
 
     state: S
     system: L

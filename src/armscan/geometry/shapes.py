@@ -123,12 +123,8 @@ def fit_plane(
     if it was drawn from the scaled inverse chi-square distribution of prior_freedom + 2 degrees and
     that mean.
 
-    Returns
-    -------
-    Estimate
-        Covariance of `PLANE_PARAMETERS` (tilts about the centroid along axis 1 and 2, offset);
-        without a prior the noise is taken from the residuals alone, and is zero for three points;
-        residuals in mm; chi2 in units of that noise.
+    Covariance of `PLANE_PARAMETERS` (tilts about the centroid along axis 1 and 2, offset), zero for
+    three points without a prior; residuals in mm; chi2 in units of the noise.
     """
     points = np.asarray(points_mm, dtype=np.float64)
     n = len(points)
@@ -207,20 +203,10 @@ def fit_sphere(
 ) -> Estimate[Sphere] | FitFailure:
     """Fit a sphere to (N, 3) points: least sum of squared distances (the Gaussian sphere).
 
-    Parameters
-    ----------
-    points_mm
-        (N, 3) points; four at least, and not all on one plane.
-    outlier_sigmas
-        Reject points further from the surface than this many robust standard deviations, after a
-        start by least median of squares; None to use all.
-
-    Returns
-    -------
-    Estimate
-        Covariance of `SPHERE_PARAMETERS`, the size of the noise taken from the residuals (zero
-        without redundancy). Residuals: (N,) distance of every point in mm, positive outside, of
-        rejected points too. ``chi2`` in units of that noise.
+    Points further from the surface than ``outlier_sigmas`` robust standard deviations are rejected,
+    after a start by least median of squares; None uses all. Covariance of `SPHERE_PARAMETERS`, the
+    noise taken from the residuals (zero without redundancy); residuals (N,) of every point in mm,
+    positive outside, of rejected points too; chi2 in units of that noise.
 
     Raises
     ------

@@ -27,15 +27,7 @@ Node = tuple[int, int]
 
 
 class Link(RowRecord):
-    """Markers that two views share.
-
-    Parameters
-    ----------
-    first, second
-        Indices of the views.
-    pairs
-        (K, 2) indices of markers in either.
-    """
+    """Markers that two views share: ``pairs`` (K, 2) of their indices."""
 
     first: int
     second: int
@@ -90,14 +82,9 @@ def link_views(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Markers of the part, each with its sightings.
+    """Markers of the part: (N,) number of each of a view's markers.
 
-    Parameters
-    ----------
-    of_view
-        For each view, (N,) number of the part's marker that each of its markers is.
-    n_contradictions
-        Pairs that were dropped because they would make two markers of one view the same.
+    Pairs that would make two markers of one view the same are dropped and counted.
     """
 
     of_view: tuple[IntArray, ...]

@@ -54,19 +54,10 @@ class HomographyConsensus(ArrayRecord):
 
 
 def fit_homography(left_px: FloatArray, right_px: FloatArray) -> FloatArray | FitFailure:
-    """Least-squares homography (eqs. 4.29 and 4.30, the denominators multiplied out).
+    """Least-squares homography (3, 3) of norm 1 (eqs. 4.29 and 4.30, denominators multiplied out).
 
-    Both images are shifted to their mean and scaled to unit spread first, without which the
-    equations are badly conditioned.
-
-    Parameters
-    ----------
-    left_px, right_px
-        (N, 2) points, row by row of one marker; N >= 4.
-
-    Returns
-    -------
-    (3, 3) H, norm 1; or why there is none.
+    From four (N, 2) points or more, row by row of one marker. Both images are shifted to their mean
+    and scaled to unit spread first, without which the equations are badly conditioned.
     """
     if len(left_px) < SAMPLE:
         return FitFailure(
@@ -239,17 +230,10 @@ def on_planes(
     left: RingImages,
     right: RingImages,
 ) -> tuple[BoolArray, int]:
-    """Which pairs agree with a homography on which many seeds agree (eqs. 4.28 to 4.30).
+    """Which pairs (K,) agree with a homography on which many seeds agree, and how many there are.
 
-    The homography with the most seeds is found, its seeds are set aside, and so on, since a part
-    may have several flat faces.
-
-    Returns
-    -------
-    is_on_plane
-        (K,).
-    n_planes
-        Count of homographies found.
+    The homography with the most seeds is found (eqs. 4.28 to 4.30), its seeds are set aside, and so
+    on, since a part may have several flat faces.
     """
     from_px, to_px = left.centres_px[pairs.left], right.centres_px[pairs.right]
     seed_from, seed_to = left.centres_px[seeds.left], right.centres_px[seeds.right]
@@ -321,13 +305,8 @@ def ranks(
 ) -> tuple[IntArray, int]:
     """How well each pair is supported, and the count of planes.
 
-    Returns
-    -------
-    rank
-        (K,) 3 on a plane of many seeds; 2 near its neighbours' plane, or as large as most markers;
-        1 not far from its neighbours' plane; 0 else.
-    n_planes
-        Count of homographies found.
+    Rank 3 on a plane of many seeds; 2 near its neighbours' plane, or as large as most markers; 1
+    not far from its neighbours' plane; 0 else.
     """
     is_on_plane, n_planes = on_planes(pairs, seeds, left, right)
     misfit = depth_misfits(pairs, seeds, left)

@@ -39,12 +39,9 @@ class FTest:
 
 @dataclass(frozen=True, slots=True)
 class WarpedBoard:
-    """The bow of the target that was solved with the camera.
+    """The bow of the target that was solved with the camera, along x and along y, of its middle.
 
-    Parameters
-    ----------
-    bow_mm
-        Along x and along y: the height of the middle over the edges, positive away from the camera.
+    It is the height over the edges, positive away from the camera.
     """
 
     bow_mm: tuple[float, float]
@@ -111,12 +108,8 @@ class SheetDiagnostics:
 class SensorDiagnostics:
     """Evidence of all light sheets together.
 
-    Parameters
-    ----------
-    noise_factor
-        Scatter of the stripe points over what their sigmas claim.
-    correlation_points
-        Points along a stripe that count as one independent point.
+    ``noise_factor`` is the scatter of the stripe points over what their sigmas claim,
+    ``correlation_points`` the points along a stripe that count as one independent point.
     """
 
     noise_factor: float
@@ -261,13 +254,7 @@ class SheetCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SecondCamera:
-    """The right camera of a stereo head (eqs. 4.15 and 4.16).
-
-    Parameters
-    ----------
-    right_from_sensor
-        Where the Sensor frame, that of the left camera, lies in the right camera's.
-    """
+    """The right camera of a stereo head (eqs. 4.15 and 4.16)."""
 
     camera: CameraCalibration
     right_from_sensor: Pose[CameraRight, Sensor]

@@ -141,21 +141,10 @@ def fold_radius(coefficients: FloatArray, lens: Lens = "pinhole") -> float:
 def undistort(
     distorted: FloatArray, coefficients: FloatArray, lens: Lens = "pinhole"
 ) -> tuple[FloatArray, BoolArray]:
-    """Invert eq. 2.17 by Newton's method.
+    """Invert eq. 2.17 by Newton's method for (N, 2) distorted normalised coordinates.
 
-    Parameters
-    ----------
-    distorted
-        (N, 2) distorted normalised coordinates.
-    coefficients, lens
-        As for `distort`.
-
-    Returns
-    -------
-    xy
-        (N, 2) ideal coordinates; where not valid, of no meaning but finite.
-    is_valid
-        (N,) False where the model folds over, so that no inverse exists on the inner branch.
+    The second value (N,) is False where the model folds over, so that no inverse exists on the
+    inner branch; the first is finite there, and of no meaning.
     """
     u, v = distorted[:, 0], distorted[:, 1]
     x, y = u.copy(), v.copy()
@@ -308,19 +297,9 @@ class CameraModel(ArrayRecord):
         return q, dq_dpoint, dq_dparameters
 
     def undistort(self, q_px: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Map pixels to ideal normalised coordinates ``X/Z, Y/Z``.
+        """Map pixels (N, 2) to ideal normalised coordinates ``X/Z, Y/Z`` (eq. 2.14).
 
-        Parameters
-        ----------
-        q_px
-            (N, 2) full-sensor pixels.
-
-        Returns
-        -------
-        xy
-            (N, 2) normalised coordinates (eq. 2.14).
-        is_valid
-            (N,) False where the distortion model has no inverse.
+        The second value (N,) is False where the distortion model has no inverse.
         """
         q = np.asarray(q_px, dtype=np.float64)
         distorted = (q - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]

@@ -28,14 +28,7 @@ N_SECOND = len(SECOND_PARAMETER_NAMES)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoViews:
-    """A left and a right camera.
-
-    Parameters
-    ----------
-    right_from_left
-        Pose of the left camera, which is the Sensor frame, in the right camera's (eqs. 4.3 to 4.5;
-        ``R_LR``, ``T_LR`` of eqs. 4.15 and 4.16).
-    """
+    """A left and a right camera, and the left one's frame, Sensor, in the right (eqs. 4.3-4.5)."""
 
     left: CameraModel
     right: CameraModel
@@ -103,19 +96,11 @@ def epipolar_distances_px(
 ) -> tuple[FloatArray, FloatArray]:
     """Signed distances of matched points from each other's epipolar lines, in each image's pixels.
 
-    A lens bends the epipolar line of eq. 4.26 to a curve. The distance given is that from the
-    curve in the image as taken: the value of ``x_r' E x_l`` over the length of its gradient by the
-    point's own pixel, correct to first order in the distance.
-
-    Pixels (N, 2) are as taken, row by row of one point.
-
-    Returns
-    -------
-    in_left_px, in_right_px
-        (N,) distance of the left point from the right point's curve in the left image, and of the
-        right point from the left point's curve in the right image. Both have the sign of
-        ``x_r' E x_l``, which swapping the cameras leaves as it is. NaN where a pixel lies beyond
-        the part of the image that the distortion model can invert, and in an epipole.
+    A lens bends the epipolar line of eq. 4.26 to a curve. The distance given is that from the curve
+    in the image as taken: the value of ``x_r' E x_l``, whose sign it has, over the length of its
+    gradient by the point's own pixel, correct to first order in the distance. Pixels (N, 2) are as
+    taken, row by row of one point. NaN where a pixel lies beyond what the distortion model can
+    invert, and in an epipole.
     """
     left, left_ok, left_dxy_dq, _ = views.left.undistort_with_jacobian(left_px)
     right, right_ok, right_dxy_dq, _ = views.right.undistort_with_jacobian(right_px)
@@ -136,11 +121,6 @@ def sampson_distances_px(in_left_px: FloatArray, in_right_px: FloatArray) -> Flo
     It is the least length by which the two points together, in the four-dimensional space of both
     pixels, have to move until their rays meet (Sampson's distance); with noise of sigma an axis in
     both images its standard deviation is sigma.
-
-    Parameters
-    ----------
-    in_left_px, in_right_px
-        From `epipolar_distances_px`.
     """
     sign = np.where(in_left_px < 0.0, -1.0, 1.0)
     product = np.abs(in_left_px * in_right_px)

@@ -68,13 +68,7 @@ class _Arm:
 
 
 def read_arm_model(path: Path) -> ArmModel:
-    """Read ``arm.toml``.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is missing, no TOML, or does not describe an arm.
-    """
+    """Read ``arm.toml``."""
     where = path_text(path)
     content = parse_toml(read_bytes(path), where, AXES_REMEDY)
     with told_of(where, remedy=AXES_REMEDY):
@@ -418,15 +412,7 @@ TIP_DIAMETERS_MM = (1e-3, 1000.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProbeTip:
-    """A ball at the end of a probe.
-
-    Parameters
-    ----------
-    centre_tool_mm
-        (3,) its centre in Tool.
-    diameter_mm
-        Its diameter.
-    """
+    """A ball at the end of a probe; ``centre_tool_mm`` (3,) is in Tool."""
 
     centre_tool_mm: FloatArray
     diameter_mm: float
@@ -437,13 +423,7 @@ class ProbeTip:
 
 
 def read_probe_tip(path: Path) -> ProbeTip:
-    """Read ``probe.toml``.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is missing, no TOML, or a key is missing, unknown or wrong.
-    """
+    """Read ``probe.toml``."""
     where = path_text(path)
     content = parse_toml(read_bytes(path), where, PROBE_REMEDY)
     with told_of(where, remedy=PROBE_REMEDY):
@@ -479,11 +459,6 @@ def write_probing(
     """Write touches as a folder: ``arm.csv`` with a sample a touch, ``probe.toml``, a session.
 
     Files ``beside`` it appear with it; see `new_folder`.
-
-    Raises
-    ------
-    OutputError
-        If the folder holds something, or cannot be written.
     """
     session = Session(cameras=(), is_simulated=is_simulated)
     columns = arm_columns(track, session.pose_form, session.rotation, {})

@@ -125,8 +125,6 @@ def read_cloud(path: Path) -> PointCloud:
 
     Raises
     ------
-    FileFormatError
-        If the file is cut short, or holds no points in x, y, z.
     OptionError
         If its format needs a package that is not installed.
     """
@@ -135,14 +133,9 @@ def read_cloud(path: Path) -> PointCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudFile:
-    """A cloud as a file held it.
+    """A cloud as a file held it, and columns that it does not carry.
 
-    Parameters
-    ----------
-    dropped
-        Names of the file's columns that the cloud does not carry.
-    n_points
-        (N,) measured points that each of a fused cloud stands for; None where the file has none.
+    ``n_points`` (N,) are the measured points that each of a fused cloud stands for, or None.
     """
 
     cloud: PointCloud
@@ -255,8 +248,6 @@ def write_cloud(path: Path, cloud: PointCloud, *, is_overwriting: bool = False) 
     ------
     OptionError
         As `cloud_bytes`.
-    OutputError
-        If the file exists or cannot be written.
     """
     write_files({path: cloud_bytes(cloud, path)}, is_overwriting=is_overwriting)
 
@@ -288,12 +279,8 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
     ------
     OptionError
         If there is no way from the one kind of file to the other.
-    FileFormatError
-        If the source cannot be read.
     InputError
         If a mesh is wanted and the source holds no triangles.
-    OutputError
-        If the output exists or cannot be written.
     """
     suffix = output.suffix.lower()
     if output.exists() and source.exists() and output.samefile(source):

@@ -56,13 +56,7 @@ KEPT: Mapping[str, type[Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class DetectionCache:
-    """Entries in one folder, made when the first entry is kept.
-
-    Parameters
-    ----------
-    reused, made
-        Names of the entries that this object gave, and that it kept.
-    """
+    """Entries in one folder, made when the first is kept; names of those given and kept."""
 
     folder: Path
     reused: set[str] = field(default_factory=set, compare=False, repr=False)

@@ -48,13 +48,8 @@ N_COEFFICIENTS = 5
 def parse_foreign_camera(data: bytes, where: str) -> tuple[CameraModel, float]:
     """Camera of a file that OpenCV (YAML, XML, JSON) or ROS (``camera_info`` YAML) wrote.
 
-    Returns
-    -------
-    camera
-        Coefficients beyond ``k1 k2 p1 p2 k3``, of a fisheye beyond ``k1 k2 k3``, are accepted when
-        they are zero.
-    rms_px
-        Reprojection error that the file states; NaN for none.
+    Coefficients beyond ``k1 k2 p1 p2 k3``, of a fisheye beyond ``k1 k2 k3``, are accepted when they
+    are zero. With the reprojection error (px) that the file states; NaN for none.
 
     Raises
     ------

@@ -41,16 +41,6 @@ def expand_paths(patterns: Iterable[str | Path]) -> tuple[Path, ...]:
 
     A folder stands for the images in it, a pattern for the files that match; each is sorted in
     natural order, and the order of the arguments is kept. A file that is named twice is taken once.
-
-    Parameters
-    ----------
-    patterns
-        Paths, folders, or patterns with ``*``, ``?``, ``[...]`` and ``**``.
-
-    Raises
-    ------
-    FileFormatError
-        If an argument matches nothing, or a folder holds no image.
     """
     found: dict[Path, None] = {}
     for pattern in patterns:

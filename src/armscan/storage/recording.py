@@ -76,14 +76,7 @@ CROWD = 3
 def check_clock(
     rows: Sequence[ExposureRow], arm: ArmTrack, said: SessionFile, folder: Path
 ) -> tuple[list[str], list[str]]:
-    """Refuse a recording whose poses cannot be found.
-
-    Returns
-    -------
-    assumed
-        What is assumed of its clock, in words.
-    warnings
-        What is odd in its times, in words.
+    """Refuse a recording whose poses cannot be found; tell what is assumed, and odd, in words.
 
     Raises
     ------
@@ -202,8 +195,6 @@ def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposur
 
     Raises
     ------
-    FileFormatError
-        If the image is missing or damaged, or its size or layout is not the camera's.
     OptionError
         If pixels exceed the stated bits.
     """
@@ -350,13 +341,7 @@ class FolderRecording:
         return recording_name(self.folder)
 
     def exposure(self, row: int) -> Exposure:
-        """Read the exposure of ``rows[row]`` with its pixels.
-
-        Raises
-        ------
-        FileFormatError
-            If the image is missing or damaged, or its size or layout is not the camera's.
-        """
+        """Read the exposure of ``rows[row]`` with its pixels."""
         chosen = self.rows[row]
         return read_recorded(self.folder, chosen, self.session.cameras[chosen.camera])
 
@@ -382,17 +367,7 @@ def recording_tables(folder: Path) -> tuple[Path, ...]:
 def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording:
     """Read a folder recording, or the one in an MCAP file; images are read later, one by one.
 
-    Parameters
-    ----------
-    folder
-        Holds ``exposures.csv``, images, and as a rule ``session.toml`` and ``arm.csv``.
-    arm
-        Turns joint angles into poses; ``arm.toml`` of the recording if None.
-
-    Raises
-    ------
-    FileFormatError
-        If a table is missing, damaged or against a rule of the format.
+    ``arm`` turns joint angles into poses, ``arm.toml`` of the recording if None.
     """
     _check_folder(folder)
     table = read_csv(folder / EXPOSURES_FILE)
@@ -429,27 +404,7 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
 
 
 def read_arm_track(folder: Path, arm: ArmModel | None = None) -> tuple[ArmTrack, tuple[str, ...]]:
-    """Read what the arm reported, from a folder with or without images.
-
-    Parameters
-    ----------
-    folder
-        Holds ``arm.csv``, and as a rule ``session.toml``.
-    arm
-        Turns joint angles into poses; ``arm.toml`` of the folder if None.
-
-    Returns
-    -------
-    track
-        The samples.
-    notes
-        What is odd in the files or was assumed, in words.
-
-    Raises
-    ------
-    FileFormatError
-        If a file is missing, damaged or against a rule of the format.
-    """
+    """Read what the arm reported, from a folder with or without images; and what is odd."""
     said, notes = _said(folder)
     table = read_csv(folder / ARM_FILE)
     found = _arm_table(table, said, arm if arm is not None else _own_arm_model(folder))
@@ -582,8 +537,6 @@ def write_recording(
 
     Raises
     ------
-    OutputError
-        If the folder holds something, or cannot be written.
     InputError
         If an exposure is not what its session says.
     """

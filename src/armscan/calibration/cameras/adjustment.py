@@ -191,12 +191,8 @@ S = TypeVar("S")
 class NormalEquations:
     """Gauss-Newton normal equations in blocks: F shared unknowns and V poses.
 
-    Parameters
-    ----------
-    shared, cross, pose
-        (F, F), (V, F, 6) and (V, 6, 6) blocks of ``J' J``.
-    shared_gradient, pose_gradient
-        (F,) and (V, 6) of ``J' r`` with r observed minus predicted.
+    Blocks (F, F), (V, F, 6) and (V, 6, 6) of ``J' J``, (F,) and (V, 6) of ``J' r`` with r observed
+    minus predicted.
     """
 
     chi2: float
@@ -295,13 +291,7 @@ def normal_equations(
 
 
 def damped_step(equations: NormalEquations, damping: float) -> tuple[FloatArray, FloatArray] | None:
-    """Solve the damped normal equations by Schur's complement of the poses.
-
-    Returns
-    -------
-    shared_step, pose_steps
-        (F,) and (V, 6), or None if the matrix is singular.
-    """
+    """Solve the damped normal equations by Schur's complement of the poses: (F,) and (V, 6)."""
     pose = equations.pose + damping * _diagonals(equations.pose)
     shared = equations.shared + damping * np.diag(np.diag(equations.shared))
     try:

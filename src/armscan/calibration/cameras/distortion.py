@@ -351,12 +351,7 @@ SIGNIFICANT_SIGMAS = 4.0
 class DesignEffect:
     """By how much the views' pulls on the camera scatter more than points that err on their own.
 
-    Parameters
-    ----------
-    value
-        1 where every point errs on its own.
-    sigma
-        Its standard deviation there.
+    ``value`` is 1, with the standard deviation ``sigma``, where every point errs on its own.
     """
 
     value: float
@@ -451,13 +446,9 @@ def typical_coefficients(solution: Solution, names: tuple[str, ...]) -> FloatArr
 class LeftAtZero:
     """What coefficients that were left at zero, and may not be, do to everything else.
 
-    Parameters
-    ----------
-    unit_covariance
-        (S + 6 V, S + 6 V) as from `joint_covariance`, with these coefficients unknown as well, but
-        of a usual lens.
-    shift
-        (S + 6 V,) by which all unknowns would move if they were solved so.
+    ``unit_covariance`` (S + 6 V, S + 6 V) is as from `joint_covariance`, with these coefficients
+    unknown as well, but of a usual lens; ``shift`` (S + 6 V,) by what all would move if they were
+    solved so.
     """
 
     unit_covariance: FloatArray

@@ -83,15 +83,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoState:
-    """Values of all unknowns.
-
-    Parameters
-    ----------
-    intrinsics
-        (18,) of the left, then of the right camera.
-    rotations, translations_mm
-        (U, 3, 3) and (U, 3) of ``sensor_from_board``.
-    """
+    """Values of all unknowns: intrinsics (18,) left, then right; relative pose; U boards' poses."""
 
     intrinsics: FloatArray
     right_from_left: Pose[CameraRight, Sensor]
@@ -532,11 +524,6 @@ def hold_out_pairs(solution: JointSolution, n_folds: int, max_steps: int) -> Cro
     Each fold's pairs are left out, cameras and relative pose are solved from the rest, and each
     held-out pair gets one board pose, fitted in both images. Views of one camera alone are never
     held out, and outliers count nowhere.
-
-    Returns
-    -------
-    result
-        None if too few pairs would be left to solve from, or if a fold has no solution.
     """
     boards = solution.boards
     both = np.array([k for k, board in enumerate(boards) if board.is_seen_by_both], dtype=np.int64)

@@ -36,15 +36,10 @@ from armscan.vision.targets.target import Target, TargetView
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSeen:
-    """A pose of a board that one view allows.
+    """A pose of a board that one view allows; Sensor stands for that camera's frame.
 
-    Parameters
-    ----------
-    camera_from_board
-        The pose; the Sensor frame stands for that of the camera, left or right.
-    covariance
-        (6, 6) of rotation-vector increment (rad, in the camera's frame, on the left) and
-        translation (mm), due to the points' noise alone.
+    ``covariance`` (6, 6) is of rotation-vector increment (rad, in that frame, on the left) and
+    translation (mm), due to the points' noise alone.
     """
 
     camera_from_board: Pose[Sensor, Board]

@@ -271,12 +271,8 @@ SAME_POINT_MM = 1e-6
 class TargetError:
     """How far the target's points miss their places.
 
-    Parameters
-    ----------
-    sigma_mm
-        Standard deviation along each axis of the board; 0 where views show none.
-    independent_share
-        Part of the residuals' variance that is new in every view.
+    ``sigma_mm`` is along each axis of the board, 0 where views show none; ``independent_share`` the
+    part of the residuals' variance that is new in every view.
     """
 
     sigma_mm: float
@@ -394,19 +390,10 @@ def agreeing_numberings(
     Errors of its print turn with it: where views are numbered alike, points miss their places
     alike. It is told by all views together, and must be clearer than chance can make it.
 
-    Parameters
-    ----------
-    places_mm, missed_mm
-        (M, 3) places on the board of the points of each of V views as found numbered, and (M, 2)
-        what each misses its place by.
-    known
-        Numberings that no single view can tell apart, the one as found first.
-
-    Returns
-    -------
-    chosen
-        (V,) places among ``known``; the first view keeps its own. None where the views tell
-        nothing, or all are numbered alike.
+    ``places_mm`` (M, 3) are the points of each of V views as found numbered, ``missed_mm`` (M, 2)
+    what each misses its place by; ``known`` are numberings that no single view can tell apart, the
+    one as found first. The numbers (V,) among these leave the first view its own. None where the
+    views tell nothing, or all are numbered alike.
     """
     if len(known) < 2 or len(places_mm) < FEWEST_VIEWS:
         return None
@@ -537,11 +524,7 @@ def with_significant_bow(
 ) -> tuple[Solution, BowTest | None] | FitFailure:
     """Free the bow of the board and keep it so where it is wanted, or significant.
 
-    Returns
-    -------
-    solution, test
-        With the bow's test, or the flat one and None; a failure if a bow that is wanted has no
-        solution.
+    With the bow's test, or the flat solution and None; a failure if a bow that is wanted has none.
     """
     bowed = with_board_warp(flat, max_steps)
     if isinstance(bowed, FitFailure):

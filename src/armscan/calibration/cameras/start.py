@@ -44,18 +44,8 @@ REFINEMENT_STEPS = 6
 def estimate_homography(board_xy: FloatArray, image_xy: FloatArray) -> FloatArray | FitFailure:
     """Fit ``s m' = H M'`` (eq. 2.29): normalised linear solution, then least squares in the image.
 
-    Parameters
-    ----------
-    board_xy
-        (M, 2) points on the board, in any unit.
-    image_xy
-        (M, 2) image points, in pixels or normalised coordinates.
-
-    Returns
-    -------
-    homography
-        (3, 3), scaled to unit Frobenius norm, that maps the points to positive third coordinates;
-        or why there is none.
+    (3, 3), of unit Frobenius norm and positive third coordinates, from (M, 2) points on the board,
+    in any unit, to (M, 2) in the image, in pixels or normalised.
     """
     if len(board_xy) < MIN_POINTS:
         return FitFailure(f"{len(board_xy)} points, a homography needs {MIN_POINTS}")
@@ -265,15 +255,7 @@ def _matrix_from_b(b: FloatArray) -> FloatArray | None:
 
 
 def pose_from_homography(homography: FloatArray, matrix: FloatArray) -> Pose[Sensor, Board]:
-    """Pose of a flat board from its homography (eq. 2.35), made a proper rotation.
-
-    Parameters
-    ----------
-    homography
-        (3, 3) from board mm to pixels.
-    matrix
-        (3, 3) intrinsic matrix.
-    """
+    """Pose of a flat board from its homography (3, 3), mm to pixels (eq. 2.35), made a rotation."""
     columns = np.linalg.solve(matrix, homography)
     scale = 0.5 * (np.linalg.norm(columns[:, 0]) + np.linalg.norm(columns[:, 1]))
     columns = columns / scale * (1.0 if columns[2, 2] > 0.0 else -1.0)
@@ -449,13 +431,7 @@ _CAMERA = np.eye(11, 9)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseCandidate:
-    """A local minimum of the reprojection error of a flat board.
-
-    Parameters
-    ----------
-    chi2
-        Squared residuals over the detector's covariances.
-    """
+    """A local minimum of a flat board's reprojection error; ``chi2`` by the detector's sigmas."""
 
     sensor_from_board: Pose[Sensor, Board]
     chi2: float

@@ -69,14 +69,9 @@ class BoardPose(ArrayRecord):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardLook:
-    """The target seen from one posture.
+    """The target seen from one posture; looks of equal postures share the arm's error.
 
-    Parameters
-    ----------
-    posture
-        Looks of equal names share the arm's error.
-    poses
-        Of the target; the better first, and those of every numbering that no view tells apart.
+    Of ``poses`` the better comes first, with those of every numbering that no view tells apart.
     """
 
     posture: str
@@ -125,12 +120,8 @@ def board_poses(
 class BoardStart:
     """A hand-eye that most looks agree on.
 
-    Parameters
-    ----------
-    chosen
-        (N,) pose of each look that is nearest.
-    off_rad, off_mm
-        (N,) what is left of each look, in orientation and place of the target's middle.
+    ``chosen`` (N,) is the nearest pose of each look, ``off_rad`` and ``off_mm`` (N,) what is left
+    of it, in orientation and place of the target's middle.
     """
 
     tool_from_sensor: Pose[Tool, Sensor]

@@ -151,12 +151,8 @@ def arm_components(
 ) -> tuple[NoiseComponent, ...]:
     """The scatter of an arm's poses by itself: its shift and both `TURNS`.
 
-    Parameters
-    ----------
-    covariances
-        (M, M) of each, for a standard deviation of 1.
-    position_mm, rotation_rad
-        Given, or None to have them estimated.
+    ``covariances`` (M, M) are for a standard deviation of 1; sizes are given, or None to be
+    estimated.
     """
     shift = _component("arm", covariances[0], position_mm, TYPICAL_ARM_MM, ARM_WIDTH)
     return _pose_components(covariances, shift, rotation_rad)
@@ -592,13 +588,8 @@ def estimate_noise(
 class SolutionCovariance:
     """Second moments of a solution's errors, and how much longer their tails are than normal ones.
 
-    Parameters
-    ----------
-    matrix
-        (K, K) covariance.
-    region_factor
-        What the usual 95 % limit of the hand-eye's ``e' C^-1 e`` is to be multiplied with so that
-        95 % of the errors lie within it; at least 1.
+    ``region_factor``, at least 1, is what the usual 95 % limit of the hand-eye's ``e' C^-1 e`` is
+    to be multiplied with so that 95 % of the errors lie within it.
     """
 
     matrix: FloatArray

@@ -344,15 +344,7 @@ class CircleSection(ArrayRecord):
 def find_sections(
     stripes: Sequence[PosedStripe], radius_mm: float
 ) -> tuple[tuple[CircleSection, ...], tuple[str, ...]]:
-    """Fit a section circle to the stripe of every exposure and sheet.
-
-    Returns
-    -------
-    sections
-        One for each usable stripe.
-    left_out
-        Stripes that were not used, each with the reason, in words.
-    """
+    """Fit a circle to the stripe of every exposure and sheet; those not used with the reason."""
     planes = _sheet_planes(stripes)
     sections, left_out = [], []
     for stripe in stripes:

@@ -140,14 +140,9 @@ _USE_LABELS = {
 class PlacedBoard:
     """A board's pose in the Sensor frame.
 
-    Parameters
-    ----------
-    covariance
-        (6, 6) by the noise of the target's points: rotation-vector increment (rad, Sensor frame,
-        from the left), then translation (mm).
-    by_cameras
-        (6, P) derivative by the P parameters of `HeadCameras`; then by the two of the target's
-        bow, if it has one.
+    ``covariance`` (6, 6) is by the noise of the target's points: rotation-vector increment (rad,
+    Sensor frame, from the left), then translation (mm). ``by_cameras`` (6, P) is its derivative by
+    the P parameters of `HeadCameras`; then by the two of the target's bow, if it has one.
     """
 
     sensor_from_board: Pose[Sensor, Board]

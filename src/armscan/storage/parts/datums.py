@@ -167,8 +167,6 @@ def read_reference_points(path: Path, measured: Path | None = None) -> Reference
 
     Raises
     ------
-    FileFormatError
-        If a table is not such a one, or the tables share no names.
     OptionError
         If measured places are given twice, or not at all.
     """
@@ -256,8 +254,6 @@ def read_reference_markers(
 
     Raises
     ------
-    FileFormatError
-        If a list is none, or has numbers where the other has not.
     InputError
         If the measured markers are in another frame than the cloud.
     """

@@ -258,8 +258,6 @@ def read_recipe(path: Path) -> RecipeFile:
 
     Raises
     ------
-    FileFormatError
-        If it is no TOML, a key is not known or has a wrong value, or the model has no such face.
     OptionError
         If the model's format needs a package that is not installed.
     """
@@ -573,12 +571,8 @@ class FoundFeature:
 class PartResult:
     """``features.json``: what a recipe found on a part, and from which files.
 
-    Parameters
-    ----------
-    armscan_version, recipe_sha256, part_sha256, cloud_sha256
-        A part that is done by the same is not done again; the model's is empty without one.
-    row
-        Its row of the table.
+    A part that is done by the same version and files is not done again; ``row`` is its row of the
+    table.
     """
 
     armscan_version: str
@@ -613,13 +607,7 @@ def part_result_bytes(result: PartResult) -> bytes:
 
 
 def read_part_result(path: Path) -> PartResult:
-    """Read a part's result.
-
-    Raises
-    ------
-    FileFormatError
-        If it is not one.
-    """
+    """Read a part's result."""
     where = path_text(path)
     try:
         return RESULT.read(PartResult, parse_json(read_bytes(path), where))

@@ -36,8 +36,6 @@ def read_tolerances(text: str, part: PartModel) -> tuple[float, dict[str, float]
     ------
     OptionError
         If the text is neither a number nor the name of such a file.
-    FileFormatError
-        If the file is not understood, or names a face that the part lacks.
     """
     if not text:
         return math.nan, {}
@@ -86,13 +84,7 @@ def _toml_tolerances(content: dict[str, Any], where: str) -> tuple[float, dict[s
 
 
 def require_face(name: str, part: PartModel, where: str) -> None:
-    """Refuse the name of a face that the part lacks.
-
-    Raises
-    ------
-    FileFormatError
-        If it has none of that name; the nearest one is proposed.
-    """
+    """Refuse the name of a face that the part lacks."""
     if name in part.face_names:
         return
     near = get_close_matches(name, part.face_names, 1)

@@ -238,8 +238,6 @@ def extract_recording(path: Path, folder: Path, *, is_recovering: bool = False) 
     FileFormatError
         If the file is none of armscan, holds no exposure that is whole, or, unless recovering, is
         unfinished or damaged.
-    OutputError
-        If the folder holds something, or cannot be written.
     """
     where = path_text(path)
     stated = _stated(path, is_recovering=is_recovering)
@@ -317,13 +315,6 @@ def record_folder(
     Of ``most`` exposures, the first ones, with what the arm reported a second before and after
     them; of all if None. ``edit`` says what becomes of each document. With ``is_stripe_band``
     (`WriterOptions`) grey pixels are written raw, not as their files.
-
-    Raises
-    ------
-    FileFormatError
-        If the recording cannot be read.
-    OutputError
-        If the file cannot be written.
     """
     recording = read_recording(folder)
     session = written_session(recording)
@@ -384,13 +375,7 @@ def record_source(
     encoded: Iterable[bytes] | None = None,
     beside: Mapping[Path, bytes] | None = None,
 ) -> WriterStatus:
-    """Write a scan as a new MCAP file: what `write_recording`, whose arguments these are, writes.
-
-    Raises
-    ------
-    OutputError
-        If the file exists or cannot be written; nothing is left then.
-    """
+    """Write a scan as a new MCAP file: what `write_recording`, whose arguments these are, does."""
     check_new_file(output)
     session, rows = written_session(source), named_rows(source)
     columns, arm = exposure_columns(rows, {}), source.arm
@@ -401,13 +386,7 @@ def record_source(
 
 
 def check_new_file(output: Path) -> None:
-    """Raise before long work if a new file could not be written afterwards.
-
-    Raises
-    ------
-    OutputError
-        If it exists, or its folder does not or may not be written.
-    """
+    """Raise before long work if a new file could not be written afterwards."""
     if output.exists():
         raise OutputError("the file exists", where=path_text(output), remedy="name another file")
     check_outputs((output,))

@@ -19,7 +19,7 @@ from math import hypot, inf, sqrt
 import numpy as np
 
 from armscan.errors import EstimationError
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 
 FIRST_BLOCK = 4
@@ -53,8 +53,6 @@ class ClockFit:
         Part by which the other clock runs faster.
     sigma_offset_ns, sigma_drift
         Standard deviations of ``other_ns`` and of the drift, which do not correlate.
-    last_device_ns
-        Latest time that the fit rests on.
     scatter_ns
         Of the fastest elements of the blocks about the line.
     """
@@ -64,23 +62,12 @@ class ClockFit:
     drift: float
     sigma_offset_ns: float
     sigma_drift: float
-    last_device_ns: int
     scatter_ns: float
 
     def to_other_ns(self, t_device_ns: int) -> int:
         """Time of the other clock, in whole ns."""
         since = t_device_ns - self.device_ns
         return self.other_ns + since + round(self.drift * since)
-
-    def to_device_ns(self, t_other_ns: int) -> int:
-        """Time of the device's clock, in whole ns."""
-        since = t_other_ns - self.other_ns
-        return self.device_ns + since - round(since * (self.drift / (1.0 + self.drift)))
-
-    def all_to_other_ns(self, t_device_ns: IntArray) -> IntArray:
-        """Times (N,) of the other clock."""
-        since = np.asarray(t_device_ns, dtype=np.int64) - self.device_ns
-        return np.asarray(self.other_ns + since + np.rint(self.drift * since).astype(np.int64))
 
     def sigma_ns(self, t_device_ns: int) -> float:
         """Standard deviation of `to_other_ns`, the constant least delay apart."""
@@ -254,7 +241,6 @@ def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
         drift=drift,
         sigma_offset_ns=hypot(known / sqrt(n), RESOLUTION_NS),
         sigma_drift=known / sqrt(spread),
-        last_device_ns=fastest[-1][0],
         scatter_ns=scatter,
     )
 

@@ -86,27 +86,19 @@ def find_homography(
     threshold_px: float,
     *,
     min_inliers: int = SAMPLE + 1,
-    seed: int = 0,
 ) -> HomographyConsensus | FitFailure:
     """Find the homography with which most pairs agree: the six steps of section 4.3.1.
 
-    Parameters
-    ----------
-    left_px, right_px
-        (N, 2) points, row by row of what may be one marker.
-    threshold_px
-        T: largest distance of a right point from where H maps its left one.
-    min_inliers
-        Fewest pairs that must agree; four always do.
-    seed
-        Of the random samples; all samples are tried where they are few.
+    Points (N, 2) are row by row of what may be one marker. ``threshold_px`` is T: the largest
+    distance of a right point from where H maps its left one; four pairs always agree. All samples
+    are tried where they are few.
     """
     n = len(left_px)
     if n < max(min_inliers, SAMPLE):
         return FitFailure(
             f"{n} pairs, {max(min_inliers, SAMPLE)} are needed", "show more markers to both cameras"
         )
-    samples = _samples(n, seed)
+    samples = _samples(n)
     samples = samples[_is_spread(left_px, samples) & _is_spread(right_px, samples)]
     if not len(samples):
         return FitFailure("the pairs lie on one line", "place markers off that line too")
@@ -143,11 +135,11 @@ def _refined(
     return HomographyConsensus(matrix=matrix, is_inlier=inlier, rms_px=rms)
 
 
-def _samples(n: int, seed: int) -> IntArray:
+def _samples(n: int) -> IntArray:
     """Rows (S, 4) of pairs: all combinations where they are few, random ones otherwise."""
     if comb(n, SAMPLE) <= MAX_SAMPLES:
         return np.array(list(combinations(range(n), SAMPLE)), dtype=np.int64)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     return np.asarray(rng.random((MAX_SAMPLES, n)).argsort(axis=1)[:, :SAMPLE])
 
 

@@ -31,6 +31,8 @@ Lens = Literal["pinhole", "fisheye"]
 ``r (1 + k1 r^2 + k2 r^4 + k3 r^6)`` by a pinhole with distortion, and at
 ``theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6)`` by a fisheye, which has no p1, p2: the first
 three terms of Kannala and Brandt (2006), as OpenCV's fisheye model with k4 = 0."""
+BORDER_PIXELS = 24
+"""Tested along each side of the image for a distortion that folds over."""
 WIDEST_RAD = np.deg2rad(88.0)
 """Angle from the axis beyond which a ray has no use as X/Z, Y/Z."""
 TANGENTIAL = ("p1", "p2")
@@ -305,28 +307,18 @@ class CameraModel(ArrayRecord):
         distorted = (q - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
         return undistort(distorted, self.distortion, self.lens)
 
-    def folded_border(self, n_steps: int = 24) -> FloatArray:
+    def folded_border(self) -> FloatArray:
         """(K, 2) pixels on the image's border for which the distortion has no inverse.
 
         None of a fisheye whose terms grow up to `WIDEST_RAD`: it sees nothing beyond.
-
-        Parameters
-        ----------
-        n_steps
-            Pixels tested along each side.
         """
         if fold_radius(self.distortion, self.lens) == np.tan(WIDEST_RAD):
             return np.zeros((0, 2))
         right, bottom = self.width_px - 1.0, self.height_px - 1.0
-        u, v = np.linspace(0.0, right, n_steps), np.linspace(0.0, bottom, n_steps)
-        border = np.concatenate(
-            [
-                np.column_stack([u, np.zeros(n_steps)]),
-                np.column_stack([u, np.full(n_steps, bottom)]),
-                np.column_stack([np.zeros(n_steps), v]),
-                np.column_stack([np.full(n_steps, right), v]),
-            ]
-        )
+        u, v = (np.linspace(0.0, end, BORDER_PIXELS) for end in (right, bottom))
+        none = np.zeros(BORDER_PIXELS)
+        sides = ((u, none), (u, none + bottom), (none, v), (none + right, v))
+        border = np.concatenate([np.column_stack(side) for side in sides])
         return np.asarray(border[~self.undistort(border)[1]])
 
     def undistort_with_jacobian(

@@ -453,7 +453,6 @@ def write_probing(
     tip: ProbeTip,
     *,
     is_simulated: bool = False,
-    arm: ArmModel | None = None,
     beside: Mapping[Path, bytes] | None = None,
 ) -> None:
     """Write touches as a folder: ``arm.csv`` with a sample a touch, ``probe.toml``, a session.
@@ -466,5 +465,3 @@ def write_probing(
         (partial / ARM_FILE).write_bytes(csv_bytes(columns))
         (partial / PROBE_FILE).write_bytes(probe_tip_toml(tip))
         (partial / SESSION_FILE).write_bytes(session_toml(session))
-        if arm is not None:
-            (partial / ARM_MODEL_FILE).write_bytes(arm_model_toml(arm))

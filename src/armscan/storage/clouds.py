@@ -312,7 +312,7 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         conversion = Conversion(what, losses, (*found.remarks, *without), cloud.forced)
     else:
         camera, forced = _camera(source)
-        content = camera_info_yaml(camera, comments=forced).encode()
+        content = camera_info_yaml(camera, forced).encode()
         conversion = Conversion("camera to ROS camera_info", YAML_LOSES, (), forced)
     write_files({output: content}, is_overwriting=is_overwriting)
     return conversion

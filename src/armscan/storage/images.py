@@ -394,7 +394,6 @@ def read_exposure(
     options: ImageOptions = DEFAULT_OPTIONS,
     *,
     source: str | None = None,
-    lasers: tuple[str, ...] = (),
 ) -> Exposure:
     """Read an image file of 8 to 16 bits, grey or colour.
 
@@ -409,8 +408,6 @@ def read_exposure(
         What the file does not say about its pixels.
     source
         Name for messages and reports; the file's name if None.
-    lasers
-        Names of the laser sources that were on.
 
     Raises
     ------
@@ -445,7 +442,7 @@ def read_exposure(
             remedy="state the bits that the camera uses (--bits-used), and --bits-align high where "
             "they are the upper ones of 16",
         )
-    return Exposure(image, name, bits_used=bits, lasers=lasers)
+    return Exposure(image, name, bits_used=bits)
 
 
 def read_exposures(

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.calibration.cameras.adjustment import (
-    NormalEquations,
     Observations,
     State,
     adjust,
@@ -492,7 +491,6 @@ def mirrored_pose(pose: Pose[Sensor, Board], centre_board_mm: FloatArray) -> Pos
 def estimate_board_pose(
     view: TargetView,
     camera: CameraModel,
-    camera_covariance: FloatArray | None = None,
     bow_mm: FloatArray | None = None,
     *,
     allow_ambiguous: bool = False,
@@ -505,8 +503,6 @@ def estimate_board_pose(
         Target points with covariances.
     camera
         The camera.
-    camera_covariance
-        (9, 9); if given, the camera's uncertainty is carried into the pose.
     bow_mm
         (2,) bow of the board as in `BoardWarp`; flat if None.
     allow_ambiguous
@@ -522,7 +518,7 @@ def estimate_board_pose(
         over the degrees of freedom (with fewer than ten of them never below 1). Or why there is
         no pose: too few points, points on a line, or two poses that fit alike.
     """
-    found = estimate_board_poses(view, camera, camera_covariance, bow_mm)
+    found = estimate_board_poses(view, camera, bow_mm)
     if isinstance(found, FitFailure):
         return found
     if len(found) > 1 and not allow_ambiguous:
@@ -536,7 +532,6 @@ def estimate_board_pose(
 def estimate_board_poses(
     view: TargetView,
     camera: CameraModel,
-    camera_covariance: FloatArray | None = None,
     bow_mm: FloatArray | None = None,
 ) -> tuple[Estimate[Pose[Sensor, Board]], ...] | FitFailure:
     """All poses of a board that one view does not refute, the best first.
@@ -564,11 +559,12 @@ def estimate_board_poses(
         equations = linearise(observations, state, _CAMERA, np.ones(len(view)))
         if equations is None or not condition_number(equations.pose[0]) < 1e13:
             return FitFailure("the points do not determine a pose", "show more of the board")
+        covariance = factor * np.linalg.inv(equations.pose[0])
         found.append(
             Estimate(
                 value=candidate.sensor_from_board,
                 parameter_names=POSE_PARAMETER_NAMES,
-                covariance=_pose_covariance(equations, factor, camera_covariance),
+                covariance=0.5 * (covariance + covariance.T),
                 residuals=residuals_px(observations, state),
                 degrees_of_freedom=degrees,
                 chi2=candidate.chi2,
@@ -591,18 +587,6 @@ def _with_excess(
     if excess <= 0.0:
         return view
     return replace(view, covariance_px2=view.covariance_px2 + excess * np.eye(2))
-
-
-def _pose_covariance(
-    equations: NormalEquations, factor: float, camera_covariance: FloatArray | None
-) -> FloatArray:
-    inverse = np.linalg.inv(equations.pose[0])
-    covariance = factor * inverse
-    if camera_covariance is not None:
-        # The pose follows the camera by -V^-1 W' (implicit function).
-        by_camera = -inverse @ equations.cross[0].T
-        covariance = covariance + by_camera @ camera_covariance @ by_camera.T
-    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def _refined(

@@ -390,13 +390,12 @@ class NoiseEstimate:
     """Standard deviations (C,) of the causes of scatter, and covariance (C, C) of their logarithms.
 
     Given ones are included, with a covariance of zero. ``is_settled`` is False if the steps ran
-    out; ``log_posterior`` is the highest, without constants.
+    out.
     """
 
     sigmas: FloatArray
     log_covariance: FloatArray
     is_settled: bool = True
-    log_posterior: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -581,7 +580,7 @@ def estimate_noise(
         if is_settled:
             break
     log_covariance[np.ix_(free, free)] = np.linalg.inv(information)
-    return NoiseEstimate(posterior.sigmas(logs), log_covariance, is_settled, value)
+    return NoiseEstimate(posterior.sigmas(logs), log_covariance, is_settled)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

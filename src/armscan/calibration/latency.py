@@ -589,7 +589,7 @@ def _result(problem: _Problem, fine: _Solution, before_ns: int) -> LatencyFit | 
         drift, sigma_drift = _drift_left(system, fine.noise)
     kept = np.zeros(len(problem.t_ns), dtype=np.bool_)
     kept[system.rows] = True
-    earlier = _linearise(problem, _shifted(fine.state, before_ns), kept)[0]
+    earlier = _linearise(problem, replace(fine.state, shift_ns=before_ns, drift=0.0), kept)[0]
     return LatencyFit(
         estimate=Estimate(
             value=fine.state.shift_ns,
@@ -630,10 +630,6 @@ def _widened(fine: _Solution, motion: StandOffMotion) -> FloatArray:
             scores += inverse.solve(jacobian @ fine.covariance[k]) * part
         factors[k] = max(1.0, score_sigma(scores, lag) / float(np.sqrt(fine.covariance[k, k])))
     return np.asarray(fine.covariance * np.outer(factors, factors))
-
-
-def _shifted(state: _State, shift_ns: int) -> _State:
-    return replace(state, shift_ns=shift_ns, drift=0.0)
 
 
 def _drift_left(system: _System, noise: tuple[ResidualNoise, ...]) -> tuple[float, float]:

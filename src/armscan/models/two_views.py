@@ -60,11 +60,6 @@ class TwoViews:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Project points into the right image, with derivatives (eqs. 4.17 and 4.18).
 
-        Parameters
-        ----------
-        points_sensor_mm
-            (N, 3) points in the Sensor frame.
-
         Returns
         -------
         q_px

@@ -163,7 +163,13 @@ def read_arm_table(
     else:
         used += (*POSITION, *FORM_COLUMNS[chosen])
         is_known, rotations, positions = _from_poses(table, chosen, rotation)
-    _refuse_metres(rotations[is_known], positions[is_known], table.where)
+    if are_surely_metres(rotations[is_known], positions[is_known]):
+        raise FileFormatError(
+            "the tool turns and moves but stays within 10 mm of Base's origin: positions look "
+            "like metres",
+            where=table.where,
+            remedy=METRES_REMEDY,
+        )
     track = ArmTrack(
         t_ns=times,
         rotations=rotations,
@@ -377,16 +383,6 @@ def _from_joints(
     positions = np.zeros((len(table), 3))
     rotations[is_known], positions[is_known] = forward(arm, joints[is_known])
     return is_known, rotations, positions
-
-
-def _refuse_metres(rotations: FloatArray, positions_mm: FloatArray, where: str) -> None:
-    if are_surely_metres(rotations, positions_mm):
-        raise FileFormatError(
-            "the tool turns and moves but stays within 10 mm of Base's origin: positions look "
-            "like metres",
-            where=where,
-            remedy=METRES_REMEDY,
-        )
 
 
 def _warnings(track: ArmTrack, where: str) -> list[str]:

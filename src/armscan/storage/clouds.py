@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from armscan.errors import FileFormatError, OptionError, OutputError
@@ -91,19 +92,12 @@ def _lost(*words: str) -> Callable[[PointCloud], tuple[str, ...]]:
     return lambda _: words
 
 
-def _las(piece: CloudPiece) -> bytes:
-    return las.las_bytes(piece, is_packed=False)
-
-
-def _laz(piece: CloudPiece) -> bytes:
-    return las.las_bytes(piece, is_packed=True)
-
-
+LAZ, LAS = (partial(las.las_bytes, is_packed=is_packed) for is_packed in (True, False))
 FORMATS = (
     CloudFormat("PLY", (".ply",), ply_columns, ply_bytes, _lost()),
     CloudFormat("E57", (".e57",), e57.e57_columns, e57.e57_bytes, _lost()),
-    CloudFormat("LAZ", (".laz",), las.las_columns, _laz, las.las_losses),
-    CloudFormat("LAS", (".las",), las.las_columns, _las, las.las_losses),
+    CloudFormat("LAZ", (".laz",), las.las_columns, LAZ, las.las_losses),
+    CloudFormat("LAS", (".las",), las.las_columns, LAS, las.las_losses),
     CloudFormat("PCD", (".pcd",), pcd.pcd_columns, pcd.pcd_bytes, _lost()),
     CloudFormat("CSV", (".csv",), text.text_columns, text.csv_bytes, _lost(*text.CSV_LOSES)),
     CloudFormat(

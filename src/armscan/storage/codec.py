@@ -363,7 +363,8 @@ class RecordCodec:
             return {name: tuple(map(float, rows)) if is_tuple else np.array(rows)}
         own = layout.keys.get(name, name)
         used.add(own)
-        if own not in tree and not _has_no_default(item) and name not in layout.required:
+        has_default = item.default is not MISSING or item.default_factory is not MISSING
+        if own not in tree and has_default and name not in layout.required:
             return {}
         content, place = _taken(tree, own, key), _join(key, own)
         if name in layout.codecs:
@@ -531,10 +532,6 @@ def _translation_key(hint: Any) -> str:
 
 
 _hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
-
-
-def _has_no_default(item: Field[Any]) -> bool:
-    return item.default is MISSING and item.default_factory is MISSING
 
 
 def _is_default(item: Field[Any], value: Any) -> bool:

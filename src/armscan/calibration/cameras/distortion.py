@@ -57,10 +57,7 @@ def cross_validate(
     ``solution``, of all used views, also is the folds' starting value; there is at most one fold a
     view.
 
-    Returns
-    -------
-    result
-        None if fewer than three views would be left to solve from, or if a fold has no solution.
+    None if fewer than three views would be left to solve from, or if a fold has no solution.
     """
     observations = solution.observations
     n_views = observations.n_views

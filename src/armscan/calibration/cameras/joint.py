@@ -419,14 +419,11 @@ def _judged(observations: JointObservations, state: StereoState) -> PointWeights
         (observations.right, state.in_right()),
     ):
         chi2 = chi2_of_points(seen, camera_state)
-        outlier: BoolArray = judge(_of_views_with_points(seen), chi2)[1]
+        # of views that have points
+        starts = tuple(int(start) for start in np.unique(seen.starts))
+        outlier: BoolArray = judge(replace(seen, starts=starts), chi2)[1]
         weights.append(np.where(outlier, 0.0, 1.0))
     return weights[0], weights[1]
-
-
-def _of_views_with_points(observations: Observations) -> Observations:
-    starts = tuple(int(start) for start in np.unique(observations.starts))
-    return replace(observations, starts=starts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -320,11 +320,7 @@ def true_order(
 ) -> tuple[int, ...] | None:
     """Which right view goes with each left view, if the lists are in different orders.
 
-    Returns
-    -------
-    partner
-        Index of the right view that fits each left view best, if another order than the given one
-        makes more than half of the pairs agree; else None.
+    None unless another order than the given one makes more than half of the pairs agree.
     """
     n = len(left)
     every = [relative_pose_candidates(a, b, numberings) for a in left for b in right]

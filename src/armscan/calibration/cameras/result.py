@@ -611,14 +611,11 @@ def reasons_to_refuse(fit: CameraFit) -> tuple[str, ...]:
             f"beside its columns: measure the print both ways and "
             f"{as_two_lengths(_board_points(fit), fit.stretch)}; print without fitting to the page",
         )
+    n_misfits = sum(view.is_misfit for view in fit.used_views)
     return (
-        *focal_reasons(fit.camera, float(fit.sigma[0]), float(fit.sigma[1]), _n_misfits(fit)),
+        *focal_reasons(fit.camera, float(fit.sigma[0]), float(fit.sigma[1]), n_misfits),
         *rms_reasons(fit.camera, rms_px),
     )
-
-
-def _n_misfits(fit: CameraFit) -> int:
-    return sum(view.is_misfit for view in fit.used_views)
 
 
 def focal_reasons(

@@ -34,23 +34,10 @@ SIGNIFICANT_SIGMAS = 4.0
 def excess_variance_px2(
     residuals: FloatArray, covariances: FloatArray, chi2: float, degrees_of_freedom: int
 ) -> float:
-    """Variance per axis to be added to the detector's covariances.
+    """Variance per axis, in px^2, to be added to covariances (N, 2, 2) that the detector claims.
 
-    Parameters
-    ----------
-    residuals
-        (N, 2) of the points used, in px.
-    covariances
-        (N, 2, 2) that the detector claims for them.
-    chi2
-        Squared residuals over these covariances.
-    degrees_of_freedom
-        Coordinates minus unknowns.
-
-    Returns
-    -------
-    variance
-        In px^2; 0 unless chi2 is larger than its expectation by four of its standard deviations.
+    It is 0 unless chi2, of residuals (N, 2) in px over these covariances, is larger than its
+    expectation by four of its standard deviations.
     """
     if degrees_of_freedom < 1:
         return 0.0

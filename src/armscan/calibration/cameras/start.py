@@ -51,8 +51,8 @@ def estimate_homography(board_xy: FloatArray, image_xy: FloatArray) -> FloatArra
     if flatness(board_xy) < COLLINEAR_RATIO or flatness(image_xy) < COLLINEAR_RATIO:
         return FitFailure("the points lie on one line", "turn the board towards the camera")
     board_norm, image_norm = _normaliser(board_xy), _normaliser(image_xy)
-    board = _apply(board_norm, board_xy)
-    image = _apply(image_norm, image_xy)
+    board = map_points(board_norm, board_xy)
+    image = map_points(image_norm, image_xy)
     inner = _refine(_linear(board, image), board, image)
     homography = np.linalg.inv(image_norm) @ inner @ board_norm
     depth = homography[2, :2] @ board_xy.mean(axis=0) + homography[2, 2]
@@ -64,7 +64,8 @@ def estimate_homography(board_xy: FloatArray, image_xy: FloatArray) -> FloatArra
 
 def map_points(homography: FloatArray, xy: FloatArray) -> FloatArray:
     """Map (M, 2) points by a (3, 3) homography."""
-    return _apply(homography, xy)
+    mapped = xy @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
 def flatness(xy: FloatArray) -> float:
@@ -79,11 +80,6 @@ def _normaliser(xy: FloatArray) -> FloatArray:
     matrix = np.diag([scale, scale, 1.0])
     matrix[:2, 2] = -scale * centre
     return matrix
-
-
-def _apply(homography: FloatArray, xy: FloatArray) -> FloatArray:
-    mapped = xy @ homography[:, :2].T + homography[:, 2]
-    return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
 def _linear(board: FloatArray, image: FloatArray) -> FloatArray:
@@ -104,7 +100,7 @@ def _refine(homography: FloatArray, board: FloatArray, image: FloatArray) -> Flo
     h = homography / homography[2, 2]
     rows = homogeneous(board)
     best: FloatArray = h
-    best_cost = float(np.sum((_apply(h, board) - image) ** 2))
+    best_cost = float(np.sum((map_points(h, board) - image) ** 2))
     for _ in range(REFINEMENT_STEPS):
         mapped = rows @ h.T
         w = mapped[:, 2:]
@@ -116,7 +112,7 @@ def _refine(homography: FloatArray, board: FloatArray, image: FloatArray) -> Flo
         error = (image - predicted).reshape(-1)
         step = np.linalg.lstsq(jacobian, error, rcond=None)[0]
         h = h + np.append(step, 0.0).reshape(3, 3)
-        cost = float(np.sum((_apply(h, board) - image) ** 2))
+        cost = float(np.sum((map_points(h, board) - image) ** 2))
         if not cost < best_cost:
             break
         converged = best_cost - cost < 1e-12 * best_cost
@@ -132,17 +128,11 @@ _FIXED_CENTRE = (_B11, _B22, _B33)
 
 
 def constraint_rows(homography: FloatArray) -> FloatArray:
-    """Two equations of one view (eq. 2.34) for ``b = (B11, B12, B22, B13, B23, B33)``.
+    """Two equations (2, 6) of one view (eq. 2.34) for ``b = (B11, B12, B22, B13, B23, B33)``.
 
-    Returns
-    -------
-    rows
-        (2, 6) rows ``v12`` and ``v11 - v22``.
-
-    Notes
-    -----
-    The thesis prints ``v12 - v22`` in the second row, which is wrong, and lists b as ``B11 B12 B13
-    B22 B23 B33``, which does not go with its own ``v_ij`` of eq. 2.33; both are corrected here.
+    These are ``v12`` and ``v11 - v22``. The thesis prints ``v12 - v22`` in the second row, which is
+    wrong, and lists b as ``B11 B12 B13 B22 B23 B33``, which does not go with its own ``v_ij`` of
+    eq. 2.33; both are corrected here.
     """
 
     def v(i: int, j: int) -> FloatArray:
@@ -266,21 +256,10 @@ def pose_from_homography(homography: FloatArray, matrix: FloatArray) -> Pose[Sen
 def linear_distortion(
     ideal_xy: FloatArray, observed_xy: FloatArray, free: Sequence[int]
 ) -> FloatArray:
-    """Distortion by linear least squares, ``K = (L'L)^-1 L'F`` (eqs. 2.36 to 2.38).
+    """Distortion (5,) by linear least squares, ``K = (L'L)^-1 L'F`` (eqs. 2.36 to 2.38).
 
-    Parameters
-    ----------
-    ideal_xy
-        (N, 2) normalised coordinates predicted without distortion.
-    observed_xy
-        (N, 2) normalised coordinates observed.
-    free
-        Indices into ``k1 k2 p1 p2 k3`` of the coefficients to solve; the thesis has the first four.
-
-    Returns
-    -------
-    coefficients
-        (5,) with zeros where not free.
+    From normalised coordinates (N, 2) without distortion and as observed. ``free`` are indices into
+    ``k1 k2 p1 p2 k3``, of which the thesis has the first four; the others are zero.
     """
     coefficients = np.zeros(5)
     if not len(free):
@@ -495,28 +474,14 @@ def estimate_board_pose(
     *,
     allow_ambiguous: bool = False,
 ) -> Estimate[Pose[Sensor, Board]] | FitFailure:
-    """Pose of a board in one view.
+    """``sensor_from_board`` in one view.
 
-    Parameters
-    ----------
-    view
-        Target points with covariances.
-    camera
-        The camera.
-    bow_mm
-        (2,) bow of the board as in `BoardWarp`; flat if None.
-    allow_ambiguous
-        Return the better of two poses even if they fit alike, instead of refusing.
-
-    Returns
-    -------
-    estimate
-        ``sensor_from_board``; covariance (6, 6) of (rotation-vector increment in rad in the Sensor
-        frame, applied on the left; translation in mm); residuals (M, 2) in px. The points'
-        covariances give the weights (see `armscan.calibration.cameras.robust`), the residuals the
-        level: the covariance is scaled by chi2
-        over the degrees of freedom (with fewer than ten of them never below 1). Or why there is
-        no pose: too few points, points on a line, or two poses that fit alike.
+    Covariance (6, 6) of (rotation-vector increment in rad in the Sensor frame, applied on the left;
+    translation in mm), residuals (M, 2) in px. The points' covariances give the weights (see
+    `armscan.calibration.cameras.robust`), the residuals the level: the covariance is scaled by chi2
+    over the degrees of freedom (with fewer than ten of them never below 1). ``bow_mm`` (2,) is the
+    board's, as in `BoardWarp`; flat if None. There is no pose of too few points, points on a line,
+    or of two poses that fit alike, of which ``allow_ambiguous`` takes the better.
     """
     found = estimate_board_poses(view, camera, bow_mm)
     if isinstance(found, FitFailure):

@@ -278,9 +278,8 @@ def find_contradiction(
         and best.size_mm > ARM_ACCURACY_MM
         and float(np.abs(change / np.sqrt(variance)).max()) > MOST_SIGMAS
     )
-    failure = _contradicted(best, fit, plate)
     return Contradiction(
-        failure=failure,
+        failure=_contradicted(best, fit, plate),
         is_refused=is_refused,
         widening=np.outer(change, change),
         arm_mm=best.arm_mm,

@@ -227,7 +227,10 @@ def find_board_start(
     shift, place = _translations(rows, chosen, rotation, base)
     hand_eye: Pose[Tool, Sensor] = Pose(rotation, shift)
     board: Pose[Base, Board] = Pose(base, place)
-    off = _placed_middles(rows, chosen, hand_eye) - board.apply(rows.middle_mm[chosen])
+    seen = np.einsum("nij,nj->ni", rows.board[chosen], rows.middle_mm[chosen])
+    in_tool = hand_eye.apply(seen + rows.board_mm[chosen])
+    placed = np.einsum("nij,nj->ni", rows.arm[chosen], in_tool) + rows.arm_mm[chosen]
+    off = placed - board.apply(rows.middle_mm[chosen])
     return BoardStart(
         hand_eye,
         board,
@@ -248,7 +251,10 @@ def _hypotheses(rows: _Candidates, n: int, max_triples: int) -> list[tuple[Float
                     sine = np.linalg.norm(np.cross(one, other))
                     if sine < APART_SINE * np.linalg.norm(one) * np.linalg.norm(other):
                         continue
-                    rotation = _align(np.array([one, other]), np.array([seen, also]))
+                    turns = np.array([one, other, np.cross(one, other)])
+                    rotation = nearest_rotation(
+                        turns.T @ np.array([seen, also, np.cross(seen, also)])
+                    )
                     found.append((rotation, rows.arm[row] @ rotation @ rows.board[row]))
     return found
 
@@ -263,13 +269,6 @@ def _turns_from(rows: _Candidates, row: int, look: int) -> list[tuple[FloatArray
         if size > TURNED_RAD and abs(size - float(np.linalg.norm(seen))) < LIKELY_TURN_RAD:
             found.append((turn, seen))
     return found
-
-
-def _align(turns: FloatArray, seen: FloatArray) -> FloatArray:
-    """Rotation (3, 3) that takes (K, 3) turns of the sensor to those of the tool."""
-    crossed = np.cross(turns[0], turns[1])[None], np.cross(seen[0], seen[1])[None]
-    turns, seen = np.concatenate([turns, crossed[0]]), np.concatenate([seen, crossed[1]])
-    return nearest_rotation(turns.T @ seen)
 
 
 def _rotation_of_turns(rows: _Candidates, chosen: IntArray) -> FloatArray:
@@ -321,15 +320,6 @@ def _subsets(n: int, most: int) -> list[tuple[int, ...]]:
         return triples
     some = np.random.default_rng(0).permutation(len(triples))[:most]
     return [triples[k] for k in some]
-
-
-def _placed_middles(
-    rows: _Candidates, chosen: IntArray, hand_eye: Pose[Tool, Sensor]
-) -> FloatArray:
-    """(N, 3) middles of the target in Base, by arm, hand-eye and view."""
-    seen = np.einsum("nij,nj->ni", rows.board[chosen], rows.middle_mm[chosen])
-    in_tool = hand_eye.apply(seen + rows.board_mm[chosen])
-    return np.asarray(np.einsum("nij,nj->ni", rows.arm[chosen], in_tool) + rows.arm_mm[chosen])
 
 
 def _refuse_turns(rows: _Candidates) -> FitFailure:

@@ -300,7 +300,8 @@ class _Problem:
         by_arm[0][:, 3:] = sensor_from_base
         by_arm[1][:, :3] = by_arm[2][:, :3] = sensor_from_base
         by_arm[1][:, 3:] = -sensor_from_base @ skew(from_arm)
-        scan_point = arm @ hand_eye.apply(self._scan_point_mm()) + arm_mm
+        middles = [pose.sensor_from_board.apply(middle_of(pose.view)) for pose in self.chosen]
+        scan_point = arm @ hand_eye.apply(np.mean(middles, axis=0)) + arm_mm
         by_arm[2][:, 3:] = -sensor_from_base @ skew(board.translation_mm - scan_point)
         return _System(
             self,
@@ -308,11 +309,6 @@ class _Problem:
             np.concatenate([jacobian.reshape(-1, N_UNKNOWN + q + 1), prior]),
             np.concatenate([by_arm.reshape(3, -1, 3), np.zeros((3, q, 3))], axis=1),
         )
-
-    def _scan_point_mm(self) -> FloatArray:
-        """(3,) in Sensor: the mean of the target's middles."""
-        middles = [pose.sensor_from_board.apply(middle_of(pose.view)) for pose in self.chosen]
-        return np.asarray(np.mean(middles, axis=0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -496,7 +492,8 @@ def _evidence(
         stated = covariance_over_noise(
             system.residual, solution.jacobian, solution.components, system.known, solution.noise
         )
-        conditioning = _conditioning(solution)
+        whitened = Whitening(solution.total)(solution.jacobian)
+        conditioning = conditioning_of(whitened[:, :N_POSE], whitened[:, N_POSE:])
         asked = _asked_scale(solution)
     except (EstimationError, np.linalg.LinAlgError) as error:
         return FitFailure(f"{_NOTHING.reason} ({error})", TURN_MORE)
@@ -568,11 +565,6 @@ def _positive(covariance: FloatArray) -> FloatArray:
     """The nearest covariance without negative variances, which averages may leave by rounding."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-def _conditioning(solution: _Solution) -> Conditioning:
-    whitened = Whitening(solution.total)(solution.jacobian)
-    return conditioning_of(whitened[:, :N_POSE], whitened[:, N_POSE:])
 
 
 def _left_out(solution: _Solution) -> dict[str, LeftOut]:

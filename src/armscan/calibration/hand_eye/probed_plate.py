@@ -36,24 +36,12 @@ def face_towards(
     *,
     is_sign_only: bool = False,
 ) -> tuple[Plane, str] | FitFailure:
-    """Turn a plane's normal to the side of the probe.
+    """Turn a plane's normal in Base to the side of the probe, and say how that was found.
 
-    Parameters
-    ----------
-    plane
-        The plane in Base.
-    towards_mm
-        (3,) or (M, 3) places of the tool; None where not known.
-    side
-        The user's word, which wins; None to follow the tool, or `DEFAULT_SIDE` without it.
-    is_sign_only
-        Nothing but the normal's sign depends on the side: where nobody says it, the tool lies in
-        the plane or `DEFAULT_SIDE` is not clear, the axis that the plate faces most will do.
-
-    Returns
-    -------
-    plane, side_from
-        The plane, and how its side was found, in words; a failure if it is not clear.
+    ``side`` is the user's word, which wins; None to follow the places (3,) or (M, 3) of the tool,
+    or `DEFAULT_SIDE` where these are not known. With ``is_sign_only`` nothing but the normal's sign
+    depends on the side: where nobody says it, the tool lies in the plane or `DEFAULT_SIDE` is not
+    clear, the axis that the plate faces most will do.
     """
     if side is None and towards_mm is not None:
         heights = plane.distance_mm(np.atleast_2d(np.asarray(towards_mm, dtype=np.float64)))

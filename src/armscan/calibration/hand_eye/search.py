@@ -94,16 +94,10 @@ def many_placed(
     translations_mm: FloatArray,
     surface: ReferenceSurface,
 ) -> ManyPlaced:
-    """Distances of points (N, 3) from the surface for many states at once.
+    """Distances of points (N, 3) in Sensor from the surface for many states at once.
 
-    Parameters
-    ----------
-    points_mm
-        (N, 3) in the Sensor frame.
-    rotations, translations_mm
-        (N, 3, 3) and (N, 3) ``base_from_tool`` of each.
-    surface
-        Its first parameters are unknown, as many as there are further unknowns.
+    ``base_from_tool`` of each is (N, 3, 3) and (N, 3). Of the surface's parameters the first are
+    unknown, as many as there are further unknowns.
     """
 
     def place(turns: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -24,18 +24,10 @@ from armscan.storage.formats.columns import (
     CloudPiece,
 )
 from armscan.storage.formats.ply import vertices_remark
-from armscan.storage.formats.text import SIGMA_LOSS
+from armscan.storage.formats.text import XYZ_LOSES
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-OBJ_LOSES = (
-    SIGMA_LOSS,
-    "sheet, exposure and segment",
-    "intensity",
-    "where the sensor stood",
-    "which calibration",
-    "n_points of a fused cloud",
-    "digits beyond 0.1 nm",
-)
+OBJ_LOSES = tuple(words for words in XYZ_LOSES if words != "normals")
 """What an OBJ file of points does not hold."""
 
 

@@ -339,14 +339,11 @@ def record_folder(
     return _record(
         output,
         _Content(session, documents, rows, columns, arm, arm_cells),
-        _stored(recording, rows) if is_stripe_band else image_bytes(folder, rows),
+        _stored(recording, rows)
+        if is_stripe_band
+        else (read_bytes(folder / row.source) for row in rows),
         options=WriterOptions(is_stripe_band=is_stripe_band),
     )
-
-
-def image_bytes(folder: Path, rows: Sequence[ExposureRow]) -> Iterator[bytes]:
-    """The image files of rows as they are."""
-    return (read_bytes(folder / row.source) for row in rows)
 
 
 def _stored(

@@ -15,6 +15,7 @@ from armscan.geometry.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
+    apply_homography,
     bools,
     floats,
     homogeneous,
@@ -65,7 +66,7 @@ def fit_homography(left_px: FloatArray, right_px: FloatArray) -> FloatArray | Fi
             "show more markers to both cameras",
         )
     to_left, to_right = _normaliser(left_px), _normaliser(right_px)
-    equations = _equations(_mapped(to_left, left_px), _mapped(to_right, right_px))
+    equations = _equations(apply_homography(to_left, left_px), apply_homography(to_right, right_px))
     _, singular, rows = np.linalg.svd(equations)
     if singular[7] < 1e-9 * singular[0]:
         return FitFailure(
@@ -73,11 +74,6 @@ def fit_homography(left_px: FloatArray, right_px: FloatArray) -> FloatArray | Fi
         )
     matrix = np.linalg.inv(to_right) @ rows[-1].reshape(3, 3) @ to_left
     return np.asarray(matrix / np.linalg.norm(matrix))
-
-
-def transfer_px(matrix: FloatArray, left_px: FloatArray) -> FloatArray:
-    """Where H maps (N, 2) left points in the right image (eqs. 4.29 and 4.30)."""
-    return _mapped(matrix, left_px)
 
 
 def find_homography(
@@ -121,7 +117,7 @@ def _refined(
         if isinstance(fitted, FitFailure):
             return fitted
         matrix = fitted
-        distance = np.linalg.norm(transfer_px(matrix, left_px) - right_px, axis=1)
+        distance = np.linalg.norm(apply_homography(matrix, left_px) - right_px, axis=1)
         before, inlier = inlier, np.asarray(distance <= threshold_px)
         count = int(inlier.sum())
         if count < max(min_inliers, SAMPLE):
@@ -159,7 +155,7 @@ def _count_inliers(
     left_px: FloatArray, right_px: FloatArray, samples: IntArray, threshold_px: float
 ) -> IntArray:
     to_left, to_right = _normaliser(left_px), _normaliser(right_px)
-    left, right = _mapped(to_left, left_px), _mapped(to_right, right_px)
+    left, right = apply_homography(to_left, left_px), apply_homography(to_right, right_px)
     threshold = threshold_px * to_right[0, 0]
     equations = _equations(left[samples], right[samples])
     # The last row of V' spans the null space of the eight equations.
@@ -187,11 +183,6 @@ def _normaliser(points_px: FloatArray) -> FloatArray:
     mean = points_px.mean(axis=0)
     scale = 1.0 / max(float(np.sqrt(points_px.var(axis=0).sum())), 1e-12)
     return np.array([[scale, 0.0, -scale * mean[0]], [0.0, scale, -scale * mean[1]], [0, 0, 1.0]])
-
-
-def _mapped(matrix: FloatArray, points: FloatArray) -> FloatArray:
-    mapped = homogeneous(points) @ matrix.T
-    return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
 PLANE_PX = 2.0
@@ -237,7 +228,7 @@ def on_planes(
         if isinstance(fit, FitFailure):
             return found, n_planes
         n_planes += 1
-        distance = np.linalg.norm(transfer_px(fit.matrix, from_px) - to_px, axis=1)
+        distance = np.linalg.norm(apply_homography(fit.matrix, from_px) - to_px, axis=1)
         found |= distance <= PLANE_PX
         free[np.flatnonzero(free)[fit.is_inlier]] = False
 

@@ -11,11 +11,10 @@ import numpy as np
 
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.result import BoardStripes
-from armscan.geometry.arrays import BoolArray, FloatArray, homogeneous
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.camera import CameraModel
-from armscan.models.light_sheet import LightSheet
 from armscan.records.profile import Profile
 from armscan.vision.targets.target import TargetView
 from rigs.plain_scanner import plain_camera
@@ -233,23 +232,3 @@ def exact(rig: SheetRig) -> SheetRig:
     return replace(
         rig, sigma_stripe_px=1e-6, sigma_corner_px=1e-6, camera_covariance=1e-18 * np.eye(9)
     )
-
-
-def intersect_with_jacobian(
-    sheet: LightSheet, xy: FloatArray
-) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-    """`LightSheet.intersect` (N, 3), with derivatives from the implicit function theorem.
-
-    By the normalised image coordinates (N, 3, 2) and by the sheet's parameters (N, 3, 8).
-    """
-    points, is_valid = sheet.intersect(xy)
-    rays = homogeneous(xy)
-    _, gradient, dh_dparameters = sheet.height_with_jacobian(points)
-    along = np.where(is_valid, np.einsum("ni,ni->n", gradient, rays), 1.0)
-    depth = points[:, 2]
-    ddepth_dxy = -gradient[:, :2] * depth[:, None] / along[:, None]
-    dpoint_dxy = rays[:, :, None] * ddepth_dxy[:, None, :]
-    dpoint_dxy[:, 0, 0] += depth
-    dpoint_dxy[:, 1, 1] += depth
-    ddepth_dparameters = -dh_dparameters / along[:, None]
-    return points, is_valid, dpoint_dxy, rays[:, :, None] * ddepth_dparameters[:, None, :]

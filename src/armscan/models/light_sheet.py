@@ -162,6 +162,27 @@ class LightSheet(ArrayRecord):
         depth = np.where(is_valid, depth, 0.0)
         return rays * depth[:, None], is_valid
 
+    def intersect_with_jacobian(
+        self, xy: FloatArray
+    ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
+        """As `intersect`, with derivatives from the implicit function theorem.
+
+        These are (N, 3, 2) by the normalised image coordinates and (N, 3, 8) by the sheet's
+        parameters (tilts, offset, bow).
+        """
+        points, is_valid = self.intersect(xy)
+        rays = homogeneous(xy)
+        _, gradient, dh_dparameters = self.height_with_jacobian(points)
+        along = np.einsum("ni,ni->n", gradient, rays)
+        along = np.where(is_valid, along, 1.0)
+        depth = points[:, 2]
+        ddepth_dxy = -gradient[:, :2] * depth[:, None] / along[:, None]
+        dpoint_dxy = rays[:, :, None] * ddepth_dxy[:, None, :]
+        dpoint_dxy[:, 0, 0] += depth
+        dpoint_dxy[:, 1, 1] += depth
+        ddepth_dparameters = -dh_dparameters / along[:, None]
+        return points, is_valid, dpoint_dxy, rays[:, :, None] * ddepth_dparameters[:, None, :]
+
     def in_frame(self, rotation: FloatArray, translation_mm: FloatArray) -> LightSheet:
         """The same sheet in another frame: ``p_there = R p_here + t``."""
         return LightSheet(

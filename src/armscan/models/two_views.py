@@ -150,6 +150,9 @@ class TriangulatedPoints:
         (N, 3) in the Sensor frame; NaN where not valid.
     noise_mm2
         (N, 3, 3) covariance due to the pixels' noise alone.
+    dpoint_dparameters
+        (N, 3, 24) derivative by the cameras' parameters at fixed pixels, in the order of
+        `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
     chi2
         (N,) squared residuals over the pixels' covariances: one degree of freedom, the distance
         from the epipolar constraint.
@@ -160,6 +163,7 @@ class TriangulatedPoints:
 
     points_sensor_mm: FloatArray
     noise_mm2: FloatArray
+    dpoint_dparameters: FloatArray
     chi2: FloatArray
     is_valid: BoolArray
 
@@ -186,24 +190,27 @@ def triangulate_points(
     start, is_valid = _midway(views, left_px, right_px)
     points = np.where(is_valid[:, None], start, [0.0, 0.0, 1.0])
     for _ in range(GAUSS_NEWTON_STEPS):
-        residual, dq_dpoint = _residuals(views, points, observed)
+        residual, dq_dpoint, _ = _residuals(views, points, observed)
         is_valid &= np.isfinite(residual).all(axis=1)
         normal, right_side = _normal(residual, dq_dpoint, weight, is_valid)
         step = np.linalg.solve(normal, right_side)[:, :, 0]
         points = points + np.where(is_valid[:, None], step, 0.0)
         if np.all(np.abs(step) <= CONVERGED_MM_PER_MM * np.abs(points).max(axis=1)[:, None]):
             break
-    residual, dq_dpoint = _residuals(views, points, observed)
+    residual, dq_dpoint, dq_dparameters = _residuals(views, points, observed)
     is_valid &= np.isfinite(residual).all(axis=1)
     normal, _ = _normal(residual, dq_dpoint, weight, is_valid)
     noise = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    # The point follows the parameters so that the weighted residual stays at its minimum.
+    carried = -noise @ dq_dpoint.transpose(0, 2, 1) @ weight @ dq_dparameters
     chi2 = (residual[:, None, :] @ weight @ residual[:, :, None])[:, 0, 0]
     gap = ~is_valid
     points, chi2 = np.where(gap[:, None], np.nan, points), np.where(gap, np.nan, chi2)
-    noise[gap] = np.nan
+    noise[gap], carried[gap] = np.nan, np.nan
     return TriangulatedPoints(
         points_sensor_mm=points,
         noise_mm2=noise,
+        dpoint_dparameters=carried,
         chi2=np.asarray(chi2),
         is_valid=is_valid,
     )
@@ -233,12 +240,15 @@ def _midway(
 
 def _residuals(
     views: TwoViews, points: FloatArray, observed: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Observed minus predicted (N, 4); prediction by point (N, 4, 3)."""
-    left, dleft_dpoint, _ = views.left.project_with_jacobian(points)
-    right, dright_dpoint, _ = views.project_right_with_jacobian(points)
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Observed minus predicted (N, 4); prediction by point (N, 4, 3), by parameters (N, 4, 24)."""
+    left, dleft_dpoint, dleft_dcamera = views.left.project_with_jacobian(points)
+    right, dright_dpoint, dright_dsecond = views.project_right_with_jacobian(points)
+    dq_dparameters = np.zeros((len(points), 4, N_CAMERA + N_SECOND))
+    dq_dparameters[:, :2, :N_CAMERA] = dleft_dcamera
+    dq_dparameters[:, 2:, N_CAMERA:] = dright_dsecond
     residual = observed - np.concatenate([left, right], axis=1)
-    return residual, np.concatenate([dleft_dpoint, dright_dpoint], axis=1)
+    return residual, np.concatenate([dleft_dpoint, dright_dpoint], axis=1), dq_dparameters
 
 
 def _normal(

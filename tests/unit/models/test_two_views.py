@@ -220,6 +220,21 @@ def test_covariance_of_points_holds_the_scatter() -> None:
     assert abs(found.chi2.mean() - 1.0) < 4.0 * np.sqrt(2.0 / n)
 
 
+@pytest.mark.parametrize("number", range(24))
+def test_points_follow_the_parameters(number: int) -> None:
+    left, right = LEFT.project(points(6)), project_right(VIEWS, points(6))
+
+    def found(views: TwoViews) -> FloatArray:
+        return triangulate_points(views, left, right, COVARIANCE, COVARIANCE).points_sensor_mm
+
+    step = step_of(number)
+    expected = (found(nudged(VIEWS, number, step)) - found(nudged(VIEWS, number, -step))) / (
+        2.0 * step
+    )
+    derivative = triangulate_points(VIEWS, left, right, COVARIANCE, COVARIANCE).dpoint_dparameters
+    assert np.abs(derivative[:, :, number] - expected).max() < 1e-4 * np.abs(expected).max()
+
+
 def test_rays_that_do_not_meet_ahead_give_no_point() -> None:
     camera = plain_camera(1000.0, (320.0, 240.0), (640, 480))
     beside: Pose[CameraRight, Sensor] = Pose(np.eye(3), np.array([-50.0, 0.0, 0.0]))

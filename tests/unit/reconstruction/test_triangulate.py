@@ -21,14 +21,7 @@ from armscan.reconstruction.triangulate import (
 )
 from armscan.records.profile import Profile
 from rigs.fisheye import TANGENTIAL, as_fisheye, fisheye_sensor
-from rigs.sheet_rig import (
-    CAMERA_SIGMA,
-    PROVENANCE,
-    THESIS_PLANE,
-    intersect_with_jacobian,
-    make_profile,
-    thesis_rig,
-)
+from rigs.sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
 from rigs.stereo_head import StereoHead
 
 SHEET_SIGMA_MM = np.array([0.02, 0.03, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -294,7 +287,7 @@ def test_rays_meet_sheets_as_in_the_models_of_camera_and_sheet(lens: Lens) -> No
     assert not is_met[~has_ray].any()
     for k, one in enumerate(head.sheets):
         rows = np.flatnonzero(has_ray & (sheet == k))
-        expected, met, by_xy, by_sheet = intersect_with_jacobian(one.sheet, xy[rows])
+        expected, met, by_xy, by_sheet = one.sheet.intersect_with_jacobian(xy[rows])
         np.testing.assert_array_equal(is_met[rows], met)
         rows, by_xy = rows[met], by_xy[met]
         np.testing.assert_allclose(points[rows], expected[met], rtol=1e-10)

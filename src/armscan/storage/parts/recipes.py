@@ -51,16 +51,16 @@ from armscan.storage.documents import (
     read_sensor_calibration,
 )
 from armscan.storage.files import is_file, path_text, read_bytes
-from armscan.storage.parts.datums import (
+from armscan.storage.parts.meshes import read_part
+from armscan.storage.parts.tables import (
     MEASURED,
     PICKED,
     datum_faces,
     datum_features,
     read_reference_markers,
     read_reference_points,
+    require_face,
 )
-from armscan.storage.parts.meshes import read_part
-from armscan.storage.parts.tables import require_face
 from armscan.storage.tables import csv_bytes, number_text, read_csv
 
 REMEDY = "write it as in the reference of recipes (docs/reference/files.md)"

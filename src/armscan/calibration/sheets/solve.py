@@ -265,33 +265,17 @@ def solve_sheets(
 ) -> SheetSolution | FitFailure:
     """Fit the sheets by Gauss-Newton steps.
 
-    Parameters
-    ----------
-    observations
-        Points with the sheet of each.
-    start
-        Starting sheets; their axes define u and v.
-    errors
-        Covariance of the boards' poses and of the camera.
-    is_bowed
-        For each sheet, whether its bow is free; a bow that is not free is zero.
-    sigma_factor
-        Multiplies the stripes' sigmas in the weights; one number, or one a point.
-    is_robust
-        Weigh points down by Huber's function on what remains; for finding outliers.
-    are_cameras_held
-        Solve for the sheets that belong to the cameras as calibrated.
-    may_bow
-        A bow that is not free is not zero but known beforehand to be so to `LIKELY_BOW`: a plane is
-        kept as long as no test asks for more, which is no proof that the sheet is one. Where the
-        stripes say nothing of a bow it stays zero, and uncertain by as much; where they show that
-        there is none, next to nothing is added to what is stated.
+    The axes of the starting sheets define u and v. A bow that is not free (``is_bowed``) is zero.
+    ``sigma_factor`` multiplies the stripes' sigmas, one number or one a point; ``is_robust`` weighs
+    points down by Huber's function on what remains, for finding outliers; ``are_cameras_held``
+    solves for the sheets that belong to the cameras as calibrated. With ``may_bow`` a bow that is
+    not free is not zero but known beforehand to be so to `LIKELY_BOW`: a plane is kept as long as
+    no test asks for more, which is no proof that the sheet is one. Where the stripes say nothing of
+    a bow it stays zero, and uncertain by as much; where they show that there is none, next to
+    nothing is added.
 
-    Returns
-    -------
-    SheetSolution or FitFailure
-        A failure where the points do not determine a sheet, or a step turns one by more than 45
-        degrees.
+    A failure where the points do not determine a sheet, or a step turns one by more than 45
+    degrees.
     """
     sheets = [replace(sheet, bow_mm=np.zeros(5)) for sheet in start]
     is_free = np.concatenate(

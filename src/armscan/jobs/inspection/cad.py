@@ -31,15 +31,17 @@ from armscan.report.inspection.cad import (
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import read_cloud
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.parts.datums import (
-    datum_faces,
-    datum_features,
-    read_reference_markers,
-    read_reference_points,
-)
 from armscan.storage.parts.meshes import UNITS_MM, read_part
 from armscan.storage.parts.step import ChordError
-from armscan.storage.parts.tables import deviation_ply_bytes, face_table_bytes, read_tolerances
+from armscan.storage.parts.tables import (
+    datum_faces,
+    datum_features,
+    deviation_ply_bytes,
+    face_table_bytes,
+    read_reference_markers,
+    read_reference_points,
+    read_tolerances,
+)
 
 STAGES = ("model", "cloud", "alignment", "deviations")
 
@@ -55,7 +57,7 @@ class PartOptions:
         three faces; ``features``: by fitted features one after the other; ``points``,
         ``markers``: by points whose places on the part are known.
     datums
-        Of ``321`` and ``features``, as of `armscan.storage.parts.datums`.
+        Of ``321`` and ``features``, as of `armscan.storage.parts.tables`.
     unit
         Unit of a mesh: mm, cm, m or inch.
     points

@@ -198,16 +198,8 @@ def given(options: type[T], **values: Any) -> T:
 
 
 def refuse_vain(options: Mapping[str, Any], what: str, remedy: str = "leave out") -> None:
-    """Refuse options that would be without effect.
-
-    Parameters
-    ----------
-    options
-        Value of each option by its name; None, False, or empty where it was not given.
-    what
-        Why they have no effect.
-    remedy
-        What to do, in front of the names.
+    """Refuse options that are given (neither None, False nor empty) but without effect; say
+    ``what``.
 
     Raises
     ------

@@ -77,20 +77,12 @@ class Step:
 
     Parameters
     ----------
-    name, title
-        What it is called.
-    to_do
-        What the operator does, in plain words.
-    filling
-        How its recording is filled.
     placements
         What is to be taken, one after the other; empty where the hand moves freely.
     least
         With fewer of them the job is not worth a try.
     needs
         Steps whose documents it rests on.
-    is_optional
-        The journey goes on without it.
     """
 
     name: StepName
@@ -241,20 +233,10 @@ class SessionSettings:
     ----------
     rig
         The rig that fills it: path of ``rig.toml``, or ``twin:HEAD?seed=1``; empty for none.
-    target
-        Specification of the calibration target.
-    n_cameras
-        Cameras of the head.
     ball_mm
         Certified diameter of the reference ball.
-    part
-        Model of the part that scans are compared with; empty for none.
     tolerance
         As of ``armscan inspect cad``; empty for none.
-    needs_latency
-        Camera and arm have no trigger in common.
-    seeing
-        In place of what the rig's description says; None for that.
     """
 
     rig: str = ""
@@ -273,8 +255,6 @@ class StepResult:
 
     Parameters
     ----------
-    verdict
-        Whether to go on with it.
     reasons
         Why it is not good, or what to look at, as sentences.
     values
@@ -283,8 +263,6 @@ class StepResult:
         Files, relative to the session.
     rests_on
         SHA-256 of every input, by its path relative to the session.
-    next_step
-        What to do now.
     """
 
     verdict: Verdict
@@ -328,15 +306,7 @@ INSPECTIONS = ("CAD model", "plate", "ball")
 
 
 class Journey:
-    """A session folder.
-
-    Parameters
-    ----------
-    folder
-        Where it lies; see `open_journey`.
-    settings
-        As written there.
-    """
+    """A session folder, with its settings as written there; see `open_journey`."""
 
     def __init__(self, folder: Path, settings: SessionSettings) -> None:
         self.folder = folder

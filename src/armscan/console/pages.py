@@ -65,8 +65,6 @@ class ConsolePage:
 
     Parameters
     ----------
-    server
-        From `armscan.console.server.open_server`.
     folder
         The session, made if need be.
     bench
@@ -644,18 +642,7 @@ def run_console(
     port: int | None = None,
     tell: Callable[[str], object] = print,
 ) -> None:
-    """Open a session's page and serve it until an interrupt.
-
-    Parameters
-    ----------
-    folder
-        The session, made if need be.
-    rig
-        As of `armscan.console.rig.open_bench`; empty for none.
-    host, port
-        As of `armscan.console.server.open_server`.
-    tell
-        Told the page's address.
+    """Open a session's page and serve it until an interrupt; ``tell`` is told its address.
 
     Raises
     ------

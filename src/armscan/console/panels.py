@@ -61,12 +61,7 @@ START_BUTTON, UNDO_BUTTON = "0", "1"
 class Controls:
     """Buttons of a page, and what went wrong with the last one.
 
-    Parameters
-    ----------
-    server
-        Of the page.
-    refresh
-        Shows what became of a press.
+    ``refresh`` shows what became of a press.
     """
 
     def __init__(self, server: viser.ViserServer, refresh: Callable[[], None]) -> None:
@@ -157,13 +152,7 @@ class Controls:
 
 
 class PointsPanel:
-    """Which points stand in space, how many of them, and what their colours mean.
-
-    Parameters
-    ----------
-    view
-        The space.
-    """
+    """Which points stand in space, how many of them, and what their colours mean."""
 
     def __init__(self, view: SceneView) -> None:
         self.view = view
@@ -204,12 +193,7 @@ class PointsPanel:
 class SeeingPanel:
     """How the cameras see the laser's line, and what counts as one.
 
-    Parameters
-    ----------
-    controls
-        Of the page.
-    keep
-        Told of new settings; of None for what the rig's description says.
+    ``keep`` is told of new settings; of None for what the rig's description says.
     """
 
     def __init__(self, controls: Controls, keep: Callable[[SeeingSettings | None], object]) -> None:
@@ -323,12 +307,7 @@ class SeeingPanel:
 class TipPanel:
     """Where the tip of the probe is, for a session whose plate a person touches.
 
-    Parameters
-    ----------
-    controls
-        Of the page.
-    place
-        Gives the file that holds it.
+    ``place`` gives the file that holds it.
     """
 
     def __init__(self, controls: Controls, place: Callable[[], Path]) -> None:
@@ -380,10 +359,6 @@ class ScanPanel:
 
     Parameters
     ----------
-    controls
-        Of the page.
-    points
-        Where the live cloud is shown.
     finish
         What ends a scan.
     look

@@ -435,15 +435,7 @@ class _Latest:
 
 
 class DeviceBench:
-    """Real devices, or any that were opened.
-
-    Parameters
-    ----------
-    rig
-        Opened; `close` closes it.
-    name
-        What the session calls it.
-    """
+    """Real devices, or any that were opened; ``close`` closes their rig."""
 
     def __init__(self, rig: Rig, name: str) -> None:
         self.rig, self.name = rig, name
@@ -674,12 +666,7 @@ def _later(grown: GrowingRecording, instant: MatchedInstant) -> int:
 
 
 def open_bench(rig: str) -> Bench:
-    """Open what fills a session.
-
-    Parameters
-    ----------
-    rig
-        Path of ``rig.toml``, or ``twin:HEAD?seed=1`` for the simulator.
+    """Open what fills a session: ``rig.toml``, or ``twin:HEAD?seed=1`` for the simulator.
 
     Raises
     ------

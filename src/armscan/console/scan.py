@@ -59,10 +59,6 @@ class GrowingRecording:
         What it holds already is kept.
     session
         Its facts; pixels as exposures deliver them.
-    rows
-        The exposures that are listed.
-    samples
-        Time, pose and trigger id of samples of the arm.
     """
 
     folder: Path
@@ -218,20 +214,9 @@ class ScanRecorder(LiveRecorder):
 
     Parameters
     ----------
-    path, rig
-        As of `LiveRecorder`.
     keeps_times
         Times are the devices' own, of one clock: a simulated hand arrives as fast as its images are
         rendered, and this computer's time says nothing of it.
-
-    Attributes
-    ----------
-    pose_of
-        The tool's pose by the instant's number.
-    latest_joints_rad
-        (J,) angles of the arm, where it gives them.
-    n_left_out
-        Exposures that were taken back.
     """
 
     def __init__(self, path: Path, rig: Rig, *, keeps_times: bool = False) -> None:
@@ -300,10 +285,6 @@ class LiveScan:
 
     Parameters
     ----------
-    bench
-        What is scanned with.
-    step
-        Scan, daily check or latency.
     path
         Of the recording, ``.mcap``; must not exist.
     scanner

@@ -41,19 +41,9 @@ def inspect_plane(
 ) -> PlaneInspection | FitFailure:
     """Inspect a flat face.
 
-    Parameters
-    ----------
-    cloud
-        Points in any frame.
-    reference
-        The plane to be met, in the same frame; without it the plane that most points lie near is
-        looked for, and only the fitted reference is reported.
-    reference_text
-        Where it came from, for the definitions.
-    region
-        Only points inside are looked at.
-    options
-        What belongs to the face; the default if None.
+    ``reference``: the plane to be met, in the same frame; without it the plane that most points lie
+    near is looked for, and only the fitted reference is reported. ``reference_text``: where it came
+    from, for the definitions.
 
     Raises
     ------

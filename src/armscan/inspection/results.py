@@ -35,12 +35,6 @@ class Statistic:
     ----------
     key
         Name for programs, with its unit.
-    label
-        Name for people.
-    value, unit
-        The number; NaN where it is not defined.
-    reference
-        What the deviations are counted from.
     formula
         How it follows from the deviations, in words.
     definition
@@ -63,12 +57,8 @@ class Deviations(ArrayRecord):
     ----------
     reference, reference_text
         What they are counted from, as a kind and in words.
-    points_text
-        Which points these are, in words.
     deviations_mm
         (N,) signed, in the order of the points.
-    statistics
-        Of them.
     """
 
     reference: ReferenceKind
@@ -119,8 +109,6 @@ class MeasuredLength:
 
     Parameters
     ----------
-    value_mm
-        The length.
     sigma_scatter_mm
         Standard deviation from what differs between exposures (jackknife over them, and over
         blocks of neighbours: the larger); NaN where there are too few.
@@ -152,20 +140,12 @@ class PlaneInspection(ArrayRecord):
 
     Parameters
     ----------
-    plane
-        Least-squares plane.
     reference
         The plane that was to be met, or None.
     rows
         (N,) rows of the feature's points in the cloud.
     is_fitted
         (N,) True for those that the fit used.
-    counts
-        What became of the points.
-    fitted
-        Distances from ``plane``.
-    nominal
-        Distances from ``reference``; None without one.
     offset
         Height of ``plane`` over ``reference`` at the middle of the points; None without one.
     tilt_mrad
@@ -194,14 +174,8 @@ class SphereInspection(ArrayRecord):
 
     Parameters
     ----------
-    sphere
-        Least-squares sphere, radius free.
-    nominal_diameter_mm
-        Of the standard ball.
     diameter
         Fitted, with its standard deviation.
-    rows, is_fitted, counts
-        As for a plane.
     fitted
         Distances from the fitted sphere: distance to its centre minus the fitted radius.
     nominal
@@ -231,20 +205,14 @@ class StepInspection(ArrayRecord):
         Rows of both faces' points in the cloud, margins taken off.
     normal
         (3,) common unit normal, from the lower face to the upper one.
-    nominal_height_mm
-        Of the standard.
     height
         Distance between the parallel planes that were fitted jointly.
-    counts
-        What became of the points.
     fitted
         Distances of the points of both faces from their own fitted plane.
     nominal
         Heights of the upper face's points over the fitted lower plane, minus the nominal height.
     heights_mm
         (U,) the same heights themselves (figure 5.19).
-    normal_rule
-        Where the normal came from, in words.
     """
 
     lower: IntArray = ints(None)
@@ -279,8 +247,6 @@ class Histogram(ArrayRecord):
         (B + 1,) limits of the bins.
     counts
         (B,) points in each.
-    n_below, n_above
-        Points beyond the first and the last limit: shown as numbers, never dropped in silence.
     """
 
     edges_mm: FloatArray = floats(None)
@@ -316,17 +282,7 @@ def narrowest_shell_mm(values_mm: FloatArray, share: float = SHELL_SHARE) -> flo
 def describe_deviations(
     deviations_mm: FloatArray, reference: ReferenceKind, reference_text: str, points_text: str
 ) -> Deviations:
-    """Deviations with their statistics, each defined in words.
-
-    Parameters
-    ----------
-    deviations_mm
-        (N,) signed deviations.
-    reference, reference_text
-        What they are counted from.
-    points_text
-        Which points they are of.
-    """
+    """Deviations (N,), signed, with their statistics, each defined in words."""
     d = np.asarray(deviations_mm, dtype=np.float64)
     n = len(d)
     mean, rms = (float(d.mean()), float(np.sqrt(d @ d / n))) if n else (math.nan, math.nan)

@@ -43,17 +43,6 @@ def inspect_sphere(
 ) -> SphereInspection | FitFailure:
     """Find a ball of known diameter anywhere in a cloud and inspect it.
 
-    Parameters
-    ----------
-    cloud
-        Points in any frame; other objects may be among them.
-    diameter_mm
-        Of the standard ball.
-    region
-        Only points inside are looked at.
-    options
-        What belongs to the ball; the default if None.
-
     Raises
     ------
     InputError

@@ -277,19 +277,8 @@ def inspect_step(
     height is ``d cos(e)``, with e from ``normal`` if that is given, else zero. Only e is taken
     from ``normal``: a direct projection on it would turn an error of 0.1 degrees into 0.03 mm.
 
-    Parameters
-    ----------
-    cloud
-        Points in any frame.
-    height_mm
-        Nominal height.
-    normal
-        (3,) normal of the faces in the cloud's frame, from the arm's pose and a plate; used for a
-        single exposure only.
-    region
-        Only points inside are looked at.
-    options, step_options
-        What belongs to the faces; the defaults if None.
+    ``normal``: (3,) normal of the faces in the cloud's frame, from the arm's pose and a plate; used
+    for a single exposure only.
 
     Raises
     ------

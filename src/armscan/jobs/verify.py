@@ -117,28 +117,10 @@ def verify(
 ) -> Summary:
     """Measure, compare with what the calibration predicts, and judge.
 
-    Parameters
-    ----------
-    job
-        Where to write the page, if anywhere.
-    scan
-        A recording's folder, or a cloud in Base.
-    scanner
-        ``scanner.json``; may be None for a cloud only, which must have been measured with it.
-    standard
-        What was scanned.
-    arm
-        ``arm.toml`` for a recording of joint angles; None to look for it in the recording.
-    region
-        ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm; empty for all.
-    options, inspection
-        How it is judged, and what belongs to ball or plate.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the standard is not found; nothing is
-        written then.
+    ``scan``: a recording's folder, or a cloud in Base. ``scanner``: ``scanner.json``; may be None
+    for a cloud only, which must have been measured with it. ``arm``: ``arm.toml`` for a recording
+    of joint angles; None to look for it in the recording. ``region``: ``xmin, xmax, ymin, ymax,
+    zmin, zmax`` in mm; empty for all.
     """
     options, inspection = options or VerifyOptions(), inspection or InspectionOptions()
     box = region_of(region)

@@ -167,20 +167,9 @@ def camera_page(
     *,
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the report.
+    """Lay out the report; ``exposures`` by source name, those that are missing are not shown.
 
-    Parameters
-    ----------
-    fit
-        The calibration.
-    not_found
-        Source and reason of each image without a usable target.
-    exposures
-        The photographs by source name; those that are missing are not shown.
-    provenance
-        How the calibration came to be.
-    is_simulated
-        True if the photographs were rendered.
+    ``not_found`` are source and reason of images without a usable target.
     """
     n_images = len(fit.views) + len(not_found)
     told = camera_quantities(fit, n_images)

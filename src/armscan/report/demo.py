@@ -360,20 +360,8 @@ def head_demo_page(
 ) -> Page:
     """Lay out the page of one head.
 
-    Parameters
-    ----------
-    demo
-        What was found.
-    name, head
-        Name of the head, and the same figures as `head_data` gives them.
-    photographs
-        One exposure of each scene, by the scene's name.
-    warnings
-        Of the hand-eye.
-    commands
-        How to repeat each step.
-    footer
-        One line about origin.
+    ``name``, ``head``: name of the head, and the same figures as `head_data` gives them.
+    ``photographs``: one exposure of each scene, by the scene's name.
     """
     rule = Text(
         f"Of plate, ball and part, {FRACTION_RULE}. Of a step's faces the margins are left out. "
@@ -515,15 +503,7 @@ def _part_pictures(demo: HeadDemo) -> Gallery:
 
 
 def heads_page(heads: Mapping[str, Figures], demos: Mapping[str, HeadDemo], footer: str) -> Page:
-    """Lay out the comparison of several heads, as figures 5.25 and 5.40 to 5.42 do.
-
-    Parameters
-    ----------
-    heads, demos
-        Figures of each head, and what was found, by its name.
-    footer
-        One line about origin.
-    """
+    """Lay out the comparison of several heads, as figures 5.25 and 5.40 to 5.42 do."""
     reading = Text(
         "In brackets: the thesis's own figures, measured on real heads, whose lines and windows "
         "differ from these. The single line lies along the long side of the camera's window, the "

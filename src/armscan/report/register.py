@@ -57,8 +57,6 @@ class MarkerScene:
         (L, 3) markers without partner.
     stations
         Labels with (3,) positions: where views were taken from, or the bases of the arm.
-    clouds
-        Clouds in the common frame, drawn pale.
     is_z_up
         True for Base.
     """
@@ -76,22 +74,7 @@ class MarkerScene:
 class RegisterReport:
     """One registration, ready for a page and a terminal.
 
-    Parameters
-    ----------
-    title, subtitle
-        What was joined.
-    quantities, cards
-        All that is told of it, and the key figures.
-    scans
-        Table of what was carried.
-    residuals, residuals_are
-        Of the markers, and what minus what they are.
-    scene
-        What to draw in space.
-    drift
-        Chart of the uncertainty along a chain of views; None for one step.
-    warnings
-        Sentences that a person should read first.
+    ``residuals_are`` says what minus what; ``drift`` is the uncertainty along a chain of views.
     """
 
     title: str

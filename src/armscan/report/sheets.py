@@ -233,19 +233,7 @@ def laser_page(
     *,
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the report.
-
-    Parameters
-    ----------
-    fit
-        The calibration.
-    exposures
-        The photographs by source name; those that are missing are not shown.
-    provenance
-        How the calibration came to be.
-    is_simulated
-        True if the photographs were rendered.
-    """
+    """Lay out the report; ``exposures`` by source name, those that are missing are not shown."""
     along = tuple(_residuals_along(fit, index) for index in range(len(fit.sheets)))
     fits = (Gallery(along, 560), Gallery((_residual_histogram(fit),), 420))
     sections = [

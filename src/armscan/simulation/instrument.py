@@ -107,16 +107,9 @@ class ProbeErrors:
 
 
 class PlateProbing(ArrayRecord):
-    """What a program gets; see `armscan.devices.sources.Probing`.
+    """What a program gets, a sample a touch; see `armscan.devices.sources.Probing`.
 
-    Parameters
-    ----------
-    arm
-        One sample a touch.
-    tool_from_probe_mm
-        (3,) calibrated centre of the tip in Tool.
-    tip_diameter_mm
-        Calibrated diameter of the tip.
+    ``tool_from_probe_mm`` (3,) is the calibrated centre of the tip in Tool.
     """
 
     arm: ArmTrack
@@ -177,8 +170,6 @@ class Mechanics:
 
     Parameters
     ----------
-    arm, probe, hand
-        Sizes of their errors.
     exposure_s
         Exposure time during scans: what the hand does meanwhile blurs the image.
     target_mm
@@ -210,21 +201,7 @@ MECHANICS: dict[Preset, Mechanics] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instrument:
-    """Head, arm, fixtures and calibration target of one twin.
-
-    Parameters
-    ----------
-    head
-        Camera, laser and mounting.
-    arm
-        True and believed.
-    fixtures
-        What stands around.
-    target
-        The print of the calibration target, as it was made.
-    mechanics
-        What they were drawn from.
-    """
+    """Head, arm, fixtures and calibration target of one twin, and what they were drawn from."""
 
     head: Head
     arm: MeasuringArm

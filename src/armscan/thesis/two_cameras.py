@@ -185,14 +185,7 @@ def find_coded_lines(
 ) -> tuple[DecodedLine, ...]:
     """Every code among N points; a point that two codes claim makes both void.
 
-    Parameters
-    ----------
-    points_px
-        (N, 2) image points, free of distortion.
-    covariance_px2
-        (N, 2, 2) their covariance.
-    codes, max_sigmas
-        As in `decode_line`.
+    Arguments as of `decode_line`.
     """
     sigma = np.sqrt(np.linalg.eigvalsh(covariance_px2)[:, 1]) if len(points_px) else np.zeros(0)
     found: list[DecodedLine] = []
@@ -260,13 +253,6 @@ def match_after_thesis(first: MarkerSet, second: MarkerSet, limit_mm: float) -> 
     by its distance to that pair alone (steps (6)-(8)), so two markers at equal distances from it
     are confused. Nothing is checked afterwards. Known failures: equal distances, a wrong first
     pair, markers that only one set holds.
-
-    Parameters
-    ----------
-    first, second
-        The sets.
-    limit_mm
-        The threshold T.
 
     Returns
     -------

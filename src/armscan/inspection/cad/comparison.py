@@ -144,18 +144,12 @@ class FaceComparison:
 
     Parameters
     ----------
-    name
-        The face's.
-    statistics
-        Of its points.
     u_mean_mm
         U (k = 2) of the mean, of the points' errors or of how far exposures disagree, the larger;
         NaN where not known, and of a face without points.
     spot_mm, u_spot_mm, spot_place_mm
         Median deviation of the spot that decides, of those the one that deviates most, its U, and
         (3,) where in Cad it is; NaN where no spot has enough points.
-    tolerance_mm
-        Of the face; NaN for none.
     decision
         The worse of those on the mean and on every spot; empty without a tolerance.
     is_seen_once
@@ -179,10 +173,6 @@ class CadComparison(RowRecord):
 
     Parameters
     ----------
-    alignment
-        Where the cloud was laid.
-    options
-        In force.
     rows
         (N,) rows of the cloud within reach; the rest of the fields are of these.
     points_mm, closest_mm, normals
@@ -198,14 +188,6 @@ class CadComparison(RowRecord):
         be of either face. It counts in ``overall`` alone.
     decision
         (N,) number in `DECISIONS`; -1 without a tolerance, or beside an edge.
-    overall
-        Statistics over all.
-    faces
-        Each face.
-    n_given
-        Points of the cloud.
-    spot_width_mm
-        Width of a spot.
     is_fused
         True if the cloud no longer tells its exposures apart.
     """
@@ -263,19 +245,6 @@ def compare_with_part(
     errors_known: bool,
 ) -> CadComparison | FitFailure:
     """Deviations of an aligned cloud.
-
-    Parameters
-    ----------
-    surface
-        The part.
-    cloud
-        Its points.
-    alignment
-        Where they lie.
-    options
-        What belongs to the part and what is allowed.
-    errors_known
-        True if the cloud's covariances are to be used.
 
     Returns
     -------

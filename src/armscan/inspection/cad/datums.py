@@ -85,8 +85,6 @@ class DatumFeature:
 
     Parameters
     ----------
-    name
-        Of the datum.
     shape
         Where it should be, in Cad; its size holds nothing.
     face
@@ -103,16 +101,8 @@ class DatumFeature:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Datums:
-    """What an alignment rests on.
-
-    Parameters
-    ----------
-    faces
-        Numbers of three faces, for ``321``.
-    features
-        For ``features``, in the order in which they hold.
-    points
-        For ``points`` and ``markers``.
+    """What an alignment rests on: by ``321`` three numbers of faces, by ``features`` these in their
+    order, by ``points`` and ``markers`` reference points.
     """
 
     faces: tuple[int, ...] = ()
@@ -163,14 +153,7 @@ def align(
 ) -> Alignment | FitFailure:
     """Lay a cloud on its part: by the best fit, from there on its datums, or on reference points.
 
-    Parameters
-    ----------
-    surface, cloud, errors_known
-        As of `align_best`.
-    method
-        How.
-    datums
-        What it rests on; those of the method.
+    ``surface``, ``cloud``, ``errors_known`` as of `align_best`.
 
     Returns
     -------
@@ -232,15 +215,6 @@ def align_datums(
 
     The first face takes as many motions as it holds, three for a plane; the second and the third
     what the ones before left. A face is met by all its points on the model's own surface.
-
-    Parameters
-    ----------
-    surface, cloud, errors_known
-        As of `align_best`.
-    faces
-        Numbers of the part's faces.
-    start
-        A best fit.
     """
     at = _Placing.of(surface, cloud, errors_known)
     pose = start.cad_from_part
@@ -275,15 +249,6 @@ def align_features(
     far as the ones before left it, its direction before its place (ISO 5459 constrains a later
     datum in orientation, not in location), by least squares over its points. Sizes hold nothing:
     a bore that is too large stays where its axis is.
-
-    Parameters
-    ----------
-    surface, cloud, errors_known
-        As of `align_best`.
-    features
-        In the order in which they hold.
-    start
-        A best fit: it says which points are a feature's.
 
     Returns
     -------
@@ -514,8 +479,6 @@ class _Fitted:
 
     Parameters
     ----------
-    feature
-        Where it should be.
     shape
         Fitted, in the cloud's frame.
     source

@@ -34,12 +34,6 @@ class PartModel(ArrayRecord):
         (F, 3) rows of ``vertices_mm``, anticlockwise seen from outside.
     face
         (F,) index into ``face_names``.
-    face_names
-        Names of the faces.
-    source
-        Where it was read from, in words.
-    notes
-        What is odd about it, in words.
     """
 
     vertices_mm: FloatArray = floats("V", 3)
@@ -101,14 +95,8 @@ def part_of(
 ) -> PartModel:
     """Join loose triangles to a part.
 
-    Parameters
-    ----------
-    corners_mm
-        (F, 3, 3) corners of each triangle.
-    source
-        Where they come from, in words.
-    face, face_names
-        (F,) face of each triangle and the faces' names; None to group them by creases.
+    ``corners_mm``: (F, 3, 3) corners of each triangle. ``face``, ``face_names``: (F,) face of each
+    triangle and the faces' names; None to group them by creases.
 
     Raises
     ------

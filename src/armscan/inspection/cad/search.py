@@ -57,8 +57,6 @@ class PoseCandidate:
 
     Parameters
     ----------
-    cad_from_part
-        The pose.
     cost
         Mean square deviation over the best pose's robust variance, each clipped at `CLIPPED`.
     scale_mm
@@ -85,14 +83,8 @@ def search_pose(
 ) -> tuple[PoseCandidate, ...]:
     """Find where a cloud lies on a part.
 
-    Parameters
-    ----------
-    surface
-        The part.
-    points_mm
-        (N, 3) the cloud, in a frame of its own.
-    normals
-        (N, 3) outward unit normals, or None; with them both sides of a plate are told apart.
+    ``points_mm``: (N, 3) the cloud, in a frame of its own. ``normals``: (N, 3) outward unit
+    normals, or None; with them both sides of a plate are told apart.
 
     Returns
     -------
@@ -442,14 +434,7 @@ def unit_mismatch(
 ) -> FitFailure | None:
     """Notice a cloud or a part in another unit by how much better the cloud fits when scaled.
 
-    Parameters
-    ----------
-    surface
-        The part.
-    cloud
-        Its points, of a size that a scan of the part may have.
-    best
-        Where they fit best as they are.
+    ``best`` is where the points, of a size that a scan may have, fit best as they are.
     """
     ours, theirs = across_mm(cloud.points_mm), surface.diagonal_mm
     if best.scale_mm <= DOUBTFUL * ours:

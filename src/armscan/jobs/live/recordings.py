@@ -84,15 +84,6 @@ def convert_recording(
 ) -> Summary:
     """Write a folder recording as one file, or the other way.
 
-    Parameters
-    ----------
-    source, output
-        From where to where.
-    is_overwriting
-        Replace a file of that name.
-    is_stripe_band
-        Keep pixels near stripes alone; see `WriterOptions`.
-
     Raises
     ------
     OptionError

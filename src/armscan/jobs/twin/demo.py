@@ -100,19 +100,9 @@ class DemoRequest:
 
     Parameters
     ----------
-    folder
-        Made if need be; an earlier demo in it is replaced.
-    head
-        Name of the head.
-    seed
-        Everything random follows from it.
-    preset
-        How good the instrument and how kind the surroundings are.
     most_views
         Views of a scene that are used, evenly chosen; where lasers are chosen meanwhile, exposures
         of a pass. Scenes that are not named are used whole.
-    processes
-        Processes that render.
     """
 
     folder: Path

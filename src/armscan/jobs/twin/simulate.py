@@ -17,17 +17,7 @@ OF_TARGET = ("camera", "laser")
 
 @dataclass(frozen=True, slots=True)
 class SimulateRequest:
-    """What to simulate.
-
-    Parameters
-    ----------
-    head, scene
-        Names of the head and of what it looks at.
-    folder
-        Of the recording.
-    options
-        Preset, seed, processes.
-    """
+    """What to simulate."""
 
     head: str
     scene: TwinScene
@@ -36,13 +26,7 @@ class SimulateRequest:
 
 
 def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Summary:
-    """Write the recording, and its truth beside it.
-
-    Raises
-    ------
-    ArmscanError
-        As `simulate_scene`.
-    """
+    """Write the recording, and its truth beside it."""
     found = simulate_scene(request.folder, request.head, request.scene, request.options, progress)
     counts = [fact("images", str(found.n_images))] if found.n_images else []
     counts += [fact("arm samples", str(found.n_arm_samples))] if found.n_arm_samples else []

@@ -324,21 +324,7 @@ def cad_page(
     *,
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the page.
-
-    Parameters
-    ----------
-    found
-        The comparison.
-    part, cloud
-        What was compared.
-    provenance
-        How it came to be.
-    warnings
-        What is odd.
-    is_simulated
-        True if the images were rendered.
-    """
+    """Lay out the page."""
     told = cad_quantities(found, part)
     limit = colour_limit_mm(found)
     definitions = tuple((label, meaning) for label, meaning in DEFINITIONS.values())

@@ -38,15 +38,7 @@ COLOURS_TEXT = (
 
 
 def part_page(run: FollowedRecipe, row: PartRow, page: Page) -> Page:
-    """The page of one part: its features before what a comparison's page shows.
-
-    Parameters
-    ----------
-    run, row
-        What was found.
-    page
-        The comparison's, or one without sections but for its origin.
-    """
+    """The page of one part: its features before what ``page``, that of a comparison, shows."""
     sections = list(page.sections)
     values = [one for one in row.quantities if one.kind == "feature"]
     if values:
@@ -156,17 +148,7 @@ def parts_table(rows: Sequence[PartRow]) -> Table:
 
 
 def recipe_page(title: str, rows: Sequence[PartRow], provenance: Provenance) -> Page:
-    """Lay out the page of all parts.
-
-    Parameters
-    ----------
-    title
-        Of the recipe.
-    rows
-        The parts, in the order of the trend.
-    provenance
-        Of this run.
-    """
+    """Lay out the page of all parts."""
     told = recipe_quantities(title, rows)
     counts = told[2].value
     labels = _labels(rows)
@@ -252,14 +234,7 @@ def _chart_sections(
 def trend_chart(rows: Sequence[PartRow], name: str, kinds: Sequence[str]) -> Picture:
     """Deviations of one feature or face over the parts, with U and limits.
 
-    Parameters
-    ----------
-    rows
-        The parts.
-    name
-        Of the feature or face.
-    kinds
-        Of its quantities, drawn beside each other.
+    ``kinds``: of its quantities, drawn beside each other.
     """
     with styled():
         figure = new_figure(PAGE_WIDTH / 2.0, 2.9)

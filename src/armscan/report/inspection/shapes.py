@@ -93,22 +93,8 @@ colour-blind readers."""
 class InspectionReport:
     """One inspection, ready for a page, a terminal and a program.
 
-    Parameters
-    ----------
-    title, subtitle
-        What was inspected.
-    quantities
-        All that is told of it.
-    cards
-        Key figures.
-    references
-        Deviations with a heading for each, nominal first.
-    histograms, views
-        Pictures.
-    counts
-        What became of the points.
-    warnings
-        Sentences that a person should read first.
+    ``references`` are deviations with a heading for each, nominal first; ``counts`` is what became
+    of the points.
     """
 
     title: str
@@ -553,17 +539,8 @@ def deviation_histogram(
 
     As the thesis's figures 5.12 and 5.14.
 
-    Parameters
-    ----------
-    deviations
-        What to count.
-    title, axis_label
-        Texts of the picture and of its horizontal axis.
-    band_mm
-        Half width of the band that is drawn and whose share is stated, one of
-        `armscan.inspection.results.WITHIN_MM`.
-    caption
-        Put before what the picture says of itself.
+    ``band_mm``: half width of the band that is drawn and whose share is stated, one of
+    `armscan.inspection.results.WITHIN_MM`. ``caption``: put before what the picture says of itself.
     """
     values = deviations.deviations_mm
     half_width = _half_width_mm(values, band_mm)
@@ -640,18 +617,9 @@ def feature_view(cloud: PointCloud, rows: IntArray, deviations: Deviations) -> P
 def deviation_view(
     points_mm: FloatArray, deviations_mm: FloatArray, *, title: str, frame: str, reference: str
 ) -> Picture:
-    """Points in space, coloured by deviation: dark inside or below, light outside or above.
+    """(N, 3) points in mm, coloured by deviation: dark inside or below, light outside or above.
 
-    Parameters
-    ----------
-    points_mm, deviations_mm
-        (N, 3) and (N,).
-    title
-        Of the picture.
-    frame
-        Name of the coordinate frame.
-    reference
-        What the deviations are counted from, in words.
+    ``reference`` is what the deviations are counted from, in words.
     """
     step = max(1, math.ceil(len(points_mm) / MAX_SHOWN))
     limit = max(float(np.percentile(np.abs(deviations_mm), 98)), 1e-6)

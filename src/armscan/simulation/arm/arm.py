@@ -40,8 +40,6 @@ class ScrewArm:
         (7, 3) unit directions of the joints' axes in Base, all angles zero.
     points_mm
         (7, 3) a point on each axis, in Base.
-    rest
-        ``base_from_tool`` with all angles zero.
     """
 
     axes: FloatArray
@@ -230,10 +228,6 @@ class MeasuringArm(ArrayRecord, kw_only=False):
 
     Parameters
     ----------
-    true, nominal
-        The arm that stands there, and the drawing.
-    white_rad
-        Standard deviation of one reading.
     waves_rad
         (7, 4) cosine and sine amplitudes once per turn, then twice per turn, of each encoder.
     """

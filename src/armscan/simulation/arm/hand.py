@@ -202,14 +202,10 @@ class HandTremor:
 
     Parameters
     ----------
-    tilt_deg
-        About each axis of the head.
     depth_mm
         Of the stand-off.
     aside_mm
         Across the way.
-    speed
-        Of the speed, over its mean.
     """
 
     tilt_deg: float = 1.5
@@ -270,14 +266,6 @@ class ScanPass:
         (3, 3) rotation of the face that is scanned; z is its normal.
     start_mm, end_mm
         (3,) where the middle of the stripe shall go from and to, in Base.
-    aim
-        How the head is held.
-    speed_mm_s
-        Mean speed.
-    n_exposures
-        Images to keep, evenly from all that the camera's clock gives.
-    pace
-        Slowest and fastest progress, and whether the camera takes every tick of its clock.
     """
 
     base_from_face: FloatArray
@@ -302,8 +290,6 @@ class Trajectory(ArrayRecord):
     t_s, joints_rad
         (N,) times of the knots from the start of the pass, from a little before its first exposure
         to a little after its last, and (N, 7) true joint angles there.
-    exposure_t_ns
-        (M,) mid-exposure times, ns from the start of the pass.
     """
 
     t_s: FloatArray = floats("N")
@@ -594,10 +580,7 @@ _HISTORY_NS = 12_000_000_000
 class HandHistory:
     """Where the joints were over the last seconds: ways, each followed by a wait at its end.
 
-    Parameters
-    ----------
-    joints_rad
-        (7,) where the arm rests at first.
+    It begins at rest at ``joints_rad`` (7,).
     """
 
     def __init__(self, joints_rad: FloatArray) -> None:

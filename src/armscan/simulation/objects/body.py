@@ -172,10 +172,6 @@ class MetaballLimb:
 
     Parameters
     ----------
-    start_mm, end_mm
-        Centres of the balls in the Part frame.
-    start_radius_mm, end_radius_mm
-        Their radii.
     blend_mm
         Over this length the limb melts into those named before it; 0 gives a sharp edge.
     is_hollow
@@ -220,16 +216,9 @@ class MetaballLimb:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body(OneColour):
-    """Limbs joined in order, standing somewhere in the scene.
+    """Limbs joined in order, at least one, the first solid, standing somewhere in the scene.
 
-    Parameters
-    ----------
-    limbs
-        At least one; the first is solid.
-    sensor_from_part
-        Where the body stands.
-    colour
-        (3,) albedo.
+    ``colour`` is the albedo (3,).
     """
 
     limbs: tuple[MetaballLimb, ...]

@@ -143,14 +143,6 @@ class Fixtures:
     ----------
     plate, base_from_plate
         The reference plate; z = 0 of its frame is the best plane through it.
-    ball
-        In Base.
-    base_from_ground
-        Frame of the ground plate under the gauge blocks, its normal along z.
-    ground
-        That plate, in its frame.
-    part, base_from_part
-        The free-form part in its own frame, and where it stands.
     waves, base_from_waves
         The wavy plate in its own frame, and where it lies.
     marked, base_from_marked

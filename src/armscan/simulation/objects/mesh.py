@@ -178,8 +178,6 @@ class Mesh(OneColour):
     ----------
     triangles_mm
         (T, 3, 3) corners, anticlockwise as seen from outside.
-    colour
-        (3,) albedo.
 
     Raises
     ------

@@ -38,8 +38,6 @@ class RingMarker(ArrayRecord, kw_only=False):
         (3,) middle of the disc, on the face, and the face's normal.
     disc_mm, ring_mm
         Diameters of the bright disc and of the dark ring around it.
-    light, dark
-        Albedo of the two tones.
     """
 
     centre_mm: FloatArray = floats(3)
@@ -93,15 +91,7 @@ def _covered(inside_mm: FloatArray, sides_mm: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marked:
-    """A surface with markers on it; it is a `Surface` itself.
-
-    Parameters
-    ----------
-    surface
-        What the markers are on.
-    markers
-        In the frame of the surface.
-    """
+    """A surface with markers in its frame; it is a `Surface` itself."""
 
     surface: Surface
     markers: Sequence[RingMarker]
@@ -146,18 +136,9 @@ _RAY_TOLERANCE = 1e-8
 def draw_markers(
     light: FloatArray, markers: Sequence[RingMarker], scene: Scene, camera: RenderCamera
 ) -> FloatArray:
-    """Image (H, W) of the room's light with markers drawn into it.
+    """Image (H, W) of the room's light with markers drawn into ``light`` (H, W), that of the faces.
 
-    Parameters
-    ----------
-    light
-        (H, W) light of the faces without markers.
-    markers
-        In the scene's frame.
-    scene
-        What may hide them; its origin is the camera.
-    camera
-        Lens and sensor; its image is H x W.
+    Markers are in the scene's frame, whose origin is the camera; the scene may hide them.
     """
     drawn = np.array(light, dtype=np.float64)
     for marker in markers:

@@ -86,12 +86,7 @@ class RenderCamera:
     def rays(self, pixels_px: FloatArray, tolerance: float = STEP_TOLERANCE) -> FloatArray:
         """Return the ideal coordinates ``X/Z, Y/Z`` (..., 2) seen by (..., 2) pixels.
 
-        Parameters
-        ----------
-        pixels_px
-            (..., 2) pixels.
-        tolerance
-            Size of the step after which the search ends; what is left is smaller by far.
+        ``tolerance``: size of the step after which the search ends; what is left is smaller by far.
 
         Raises
         ------

@@ -31,10 +31,6 @@ class CentreSpot:
 
     Parameters
     ----------
-    source_mm
-        (3,) where it starts.
-    direction
-        (3,) unit.
     sigma_mm
         Gaussian sigma of its cross-section.
     irradiance
@@ -79,16 +75,7 @@ def stray_lights(
 ) -> tuple[TracedLight, ...]:
     """All that one light source casts besides its lines; nothing if it has a single line.
 
-    Parameters
-    ----------
-    source
-        In the frame of the camera.
-    things
-        In Base, with the gloss that they are to have.
-    base_from_eye
-        Where the camera is.
-    imaging
-        How strong.
+    ``source`` is in the camera's frame, ``things`` in Base, with the gloss that they are to have.
     """
     if len(source.sheets) == 1:
         return ()

@@ -102,10 +102,6 @@ class PosedView:
 
     Parameters
     ----------
-    scene
-        Surfaces in the Sensor frame.
-    finishes
-        One for each surface.
     nodes
         Hits of the coarse grid's rays.
     numbers

@@ -136,9 +136,6 @@ class Cleaning(ArrayRecord):
         return tuple(found)
 
 
-Filter = Callable[[PointCloud, float, CleaningOptions], BoolArray]
-
-
 def clean_cloud(cloud: PointCloud, options: CleaningOptions) -> Cleaning:
     """Take points out of a cloud, each filter of what those before it left.
 

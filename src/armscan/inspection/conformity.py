@@ -390,17 +390,13 @@ def _near_plate(cloud: PointCloud, found: PlaneInspection, within: BoolArray) ->
     local = (cloud.points_mm - found.plane.point_mm) @ found.plane.axes.T
     rows = np.flatnonzero(within & (np.abs(local[:, 2]) <= PLATE_MM))
     try:
-        outline = Delaunay(local[found.rows[found.is_fitted], :2][_hull_sample(found)])
+        fitted = local[found.rows[found.is_fitted], :2]
+        outline = Delaunay(fitted[:: max(1, len(fitted) // 20_000)])
     except QhullError:
         rows = rows[:0]
     else:
         rows = rows[outline.find_simplex(local[rows, :2]) >= 0]
     return _Near(rows, local[rows, 2], np.broadcast_to(found.plane.normal, (len(rows), 3)))
-
-
-def _hull_sample(found: PlaneInspection) -> slice:
-    """Few enough points for an outline."""
-    return slice(None, None, max(1, int(found.is_fitted.sum()) // 20_000))
 
 
 def _second_ball(cloud: PointCloud, found: SphereInspection, rest: BoolArray) -> set[int]:

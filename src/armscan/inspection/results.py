@@ -265,17 +265,17 @@ def histogram(values_mm: FloatArray, half_width_mm: float, n_bins: int = 81) -> 
     return Histogram(edges_mm=edges, counts=counts.astype(np.int64), n_below=below, n_above=above)
 
 
-def narrowest_shell_mm(values_mm: FloatArray, share: float = SHELL_SHARE) -> float:
-    """Width of the narrowest interval that holds a share of the values (P_Form D95 of 10360).
+def narrowest_shell_mm(values_mm: FloatArray) -> float:
+    """Width of the narrowest interval that holds 95 % of the values (P_Form D95 of 10360).
 
-    It holds ``ceil(share * n)`` values; NaN for no values.
+    It holds ``ceil(0.95 * n)`` values; NaN for no values.
     """
     n = len(values_mm)
     if n == 0:
         return math.nan
     ordered = np.sort(values_mm)
     # 0.95 * 20 is 19.000000000000004 or 18.999...: a rounding error must not cost a whole point
-    k = max(1, math.ceil(share * n - 1e-9))
+    k = max(1, math.ceil(SHELL_SHARE * n - 1e-9))
     return float((ordered[k - 1 :] - ordered[: n - k + 1]).min())
 
 

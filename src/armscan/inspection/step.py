@@ -297,7 +297,9 @@ def inspect_step(
     if float(start @ section.axes @ _upwards(selection)) < 0.0:
         start = -start
     lean, _ = _lean(section, start @ section.axes, normal)
-    section = _unbowed(section, start, lean)
+    # points of a bowed sheet are moved along the faces, on which they lie, into the sheet's plane
+    moved = section.flat_mm + math.tan(lean) * section.out_mm[:, None] * start
+    section = replace(section, flat_mm=moved)
     # faces stand further apart within a sheet that leans
     within = height_mm / math.cos(lean)
     faces = find_levels(section.flat_mm, start, within, HEIGHT_TOLERANCE * within)
@@ -309,12 +311,6 @@ def inspect_step(
     if isinstance(chosen, FitFailure):
         return chosen
     return _measured(search, chosen, *_lean(section, chosen.faces.normal @ section.axes, normal))
-
-
-def _unbowed(section: _Section, towards: FloatArray, lean: float) -> _Section:
-    """Points of a bowed sheet moved along the faces, on which they lie, into the sheet's plane."""
-    moved = section.flat_mm + math.tan(lean) * section.out_mm[:, None] * towards
-    return replace(section, flat_mm=moved)
 
 
 def _explained(failure: FitFailure, section: _Section, normal: FloatArray | None) -> FitFailure:

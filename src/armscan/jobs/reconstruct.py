@@ -196,7 +196,7 @@ def reconstruct(
             return measure(recordings[0], job)
         files = [path for path in (calibration, arm) if path is not None]
         asked = f"{chosen!r} {voxel_mm}"
-        return _scans(Batch(job, ".ply", tell or _unheard), several, files, asked, measure)
+        return _scans(Batch(job, ".ply", tell or (lambda _: None)), several, files, asked, measure)
     of_scans = {
         "--volume": volume,
         "--arm": arm,
@@ -212,10 +212,6 @@ def reconstruct(
                 remedy="give a folder with exposures.csv and --scanner scanner.json",
             )
     return _stills(job, calibration, paths, options, image_options)
-
-
-def _unheard(line: str) -> None:
-    """Nobody listens."""
 
 
 def _scans(

@@ -18,8 +18,7 @@ from armscan.calibration.sheets.result import (
 from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.jobs.job import Job, solved, was_simulated, with_old_layout
-from armscan.models.calibration import CameraCalibration, Provenance
-from armscan.models.two_views import StereoCalibration
+from armscan.models.calibration import Provenance
 from armscan.pipeline.instants import ExposurePair, pair_by_view, pair_exposures
 from armscan.pipeline.laser import (
     LaserOptions,
@@ -108,8 +107,9 @@ def calibrate_sheets(
     options, image_options = options or LaserOptions(), image_options or ImageOptions()
     board = parse_target(target)
     places = job.places(".json", beside=(".npz", ".html"))
-    camera = read_cameras(camera_file)
-    read = _read(images, image_options, is_stereo=isinstance(camera, StereoCalibration))
+    is_stereo = document_schema(camera_file) == STEREO_SCHEMA
+    camera = (read_stereo_calibration if is_stereo else read_camera_calibration)(camera_file)
+    read = _read(images, image_options, is_stereo=is_stereo)
     cache = job.cache
     board = settle_target(read.exposures, board)
     fit = calibrate_sheets_from_pairs(
@@ -188,19 +188,6 @@ def calibrate_sheets_from_file(
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     summary = sheets_summary(fit, written, (), is_simulated=is_simulated)
     return replace(summary, forced=provenance.forced)
-
-
-def read_cameras(path: Path) -> CameraCalibration | StereoCalibration:
-    """Read the calibration of one camera, or of the two of a stereo head.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged or is neither.
-    """
-    if document_schema(path) == STEREO_SCHEMA:
-        return read_stereo_calibration(path)
-    return read_camera_calibration(path)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -291,7 +291,7 @@ def compare_with_part(
             float(limits[k]),
             d[by_face[k]],
             float(u_face[k]),
-            spots.of_face(k),
+            spots.select(spots.face == k),
             is_once=bool(once[k]),
         )
         for k, name in enumerate(part.face_names)
@@ -417,9 +417,6 @@ class _Spots(RowRecord):
     u_mm: FloatArray = floats("N", nan=True)
     place_mm: FloatArray = floats("N", 3)
     is_once: BoolArray = bools("N")
-
-    def of_face(self, k: int) -> _Spots:
-        return self.select(self.face == k)
 
 
 def _spots(closest_mm: FloatArray, face: IntArray, width_mm: float) -> tuple[IntArray, int]:

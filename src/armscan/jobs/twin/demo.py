@@ -198,24 +198,20 @@ class _Run:
         """
         self.place("").mkdir()
         record_touches(self.place("probing"), self.twin)
+        is_single = len(self.twin.truth.sheet_points_mm) == 1
+        unused = ("mesh_search", "naming") if is_single else ("mesh_search",)
         coming = recorded_scenes(
             {scene: self.place(scene) for scene in scenes},
             self.request.twin,
             self.request.most_views,
             processes=self.request.processes,
             progress=self.progress,
-            meanwhile=partial(load_kernels, without=self._unused_kernels),
+            meanwhile=partial(load_kernels, without=unused),
         )
         with closing(coming):
             self._coming.append(coming)
             yield
             self.timed("render", lambda: deque(coming, 0))
-
-    @property
-    def _unused_kernels(self) -> tuple[str, ...]:
-        """Modules of kernels that the head's demo does not need."""
-        is_many = len(self.twin.truth.sheet_points_mm) > 1
-        return ("mesh_search",) if is_many else ("mesh_search", "naming")
 
     def recorded(self, scene: TwinScene) -> Path:
         """Wait until a scene is recorded; returns its folder."""

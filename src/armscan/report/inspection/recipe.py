@@ -151,7 +151,7 @@ def recipe_page(title: str, rows: Sequence[PartRow], provenance: Provenance) -> 
     """Lay out the page of all parts."""
     told = recipe_quantities(title, rows)
     counts = told[2].value
-    labels = _labels(rows)
+    labels = list({(one.name, one.kind): None for row in rows for one in row.quantities})
     features = [name for name, kind in labels if kind == "feature"]
     faces = sorted(
         {name: None for name, kind in labels if kind != "feature"},
@@ -179,12 +179,6 @@ def recipe_page(title: str, rows: Sequence[PartRow], provenance: Provenance) -> 
         cards=cards,
         is_simulated=any(row.is_simulated for row in rows),
     )
-
-
-def _labels(rows: Sequence[PartRow]) -> list[tuple[str, str]]:
-    """Name and kind of every quantity, in the order of the recipe."""
-    found = {(one.name, one.kind): None for row in rows for one in row.quantities}
-    return list(found)
 
 
 def _of(row: PartRow, name: str, kinds: Sequence[str]) -> list[PartQuantity]:

@@ -17,7 +17,6 @@ from armscan.geometry.poses import Part, Pose, Sensor
 from armscan.simulation.kernels import Three, compiled
 from armscan.simulation.optics.scene import OneColour
 
-LIMB_COLUMNS = 12
 MAX_STEPS = 2000
 """A ray that has not met the body after so many steps counts as passing."""
 

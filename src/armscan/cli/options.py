@@ -200,11 +200,6 @@ def given(options: type[T], **values: Any) -> T:
 def refuse_vain(options: Mapping[str, Any], what: str, remedy: str = "leave out") -> None:
     """Refuse options that are given (neither None, False nor empty) but without effect; say
     ``what``.
-
-    Raises
-    ------
-    OptionError
-        If one or more were given.
     """
     from armscan.errors import OptionError
 
@@ -236,13 +231,7 @@ def refuse_given(context: typer.Context, names: str, what: str) -> None:
 
 
 def numbers(text: str, option: str) -> tuple[float, ...]:
-    """Numbers between commas.
-
-    Raises
-    ------
-    OptionError
-        If a word is no number.
-    """
+    """Numbers between commas."""
     from armscan.errors import OptionError
 
     try:

@@ -188,14 +188,9 @@ OF_TWO_CAMERAS = {
 class SeeingSettings:
     """How the cameras look at the laser's line, and how it is found; most keys are ``rig.toml``'s.
 
-    Parameters
-    ----------
-    windows, exposure, stripes
-        As of `armscan.pipeline.live.rig.RigDescription`.
-    photo_us
-        Exposure time of photographs of the target; 0 for the camera's own.
-    voxel_mm, measured_every
-        As of `armscan.pipeline.live.session.LiveOptions`.
+    ``photo_us`` is the exposure time of photographs of the target; 0 for the camera's own. The rest
+    as of `armscan.pipeline.live.rig.RigDescription` and
+    `armscan.pipeline.live.session.LiveOptions`.
     """
 
     windows: tuple[tuple[int, int, int, int], ...] = ()
@@ -314,13 +309,7 @@ class Journey:
         self._known: dict[tuple[Path, int, int], bool] = {}
 
     def change(self, **settings: Any) -> None:
-        """Write other settings.
-
-        Raises
-        ------
-        OutputError
-            If the folder cannot be written.
-        """
+        """Write other settings."""
         self.settings = replace(self.settings, **settings)
         content = toml_bytes(RecordCodec({}).write(self.settings))
         write_files({self.folder / SETTINGS_FILE: content}, is_overwriting=True)
@@ -469,13 +458,7 @@ class Journey:
         return self.steps[-1].name
 
     def start_over(self, step: StepName, scan: str = "") -> None:
-        """Remove what a step has taken, and its result; documents stay until they are replaced.
-
-        Raises
-        ------
-        OutputError
-            If it cannot be removed.
-        """
+        """Remove what a step has taken, and its result; documents stay until they are replaced."""
         place = self.recording(step, scan)
         gone = place.with_name(f".{place.name}.old")
         try:
@@ -587,13 +570,7 @@ def _check_own(folder: Path) -> None:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``console.toml``.
-
-    Raises
-    ------
-    FileFormatError
-        If it is no TOML, or a value is of a wrong type.
-    """
+    """Read ``console.toml``."""
     where, unknown = path_text(path), list[str]()
     remedy = "remove the file: the session asks for its settings again"
     try:

@@ -69,11 +69,6 @@ class ConsolePage:
         The session, made if need be.
     bench
         What fills it; None to look at what is there.
-
-    Raises
-    ------
-    ArmscanError
-        If the folder is no session, or another console has it open.
     """
 
     def __init__(self, server: viser.ViserServer, folder: Path, bench: Bench | None) -> None:
@@ -642,13 +637,7 @@ def run_console(
     port: int | None = None,
     tell: Callable[[str], object] = print,
 ) -> None:
-    """Open a session's page and serve it until an interrupt; ``tell`` is told its address.
-
-    Raises
-    ------
-    ArmscanError
-        If rig, session or port cannot be opened.
-    """
+    """Open a session's page and serve it until an interrupt; ``tell`` is told its address."""
     with open_console(folder, rig, host=host, port=port) as (page, address):
         tell(f"{page.journey.folder}: open {address} in a browser; Ctrl-C ends the console")
         with suppress(KeyboardInterrupt):

@@ -96,7 +96,9 @@ class Controls:
         button.on_click(lambda _: self.tried(work))
         if key:
             command = self.gui.add_command(label, hotkey=cast(Any, key), description=hint)
-            command.on_trigger(lambda _: self.tried(work) if _is_usable(button) else None)
+            command.on_trigger(
+                lambda _: self.tried(work) if button.visible and not button.disabled else None
+            )
         return button
 
     def removing_button(
@@ -357,12 +359,7 @@ class TipPanel:
 class ScanPanel:
     """A scan while it runs: its buttons, images, range bar and figures.
 
-    Parameters
-    ----------
-    finish
-        What ends a scan.
-    look
-        Gives what the cameras see now while no scan runs; none to leave what is shown.
+    ``finish`` ends a scan; ``look`` gives what the cameras see now while no scan runs.
     """
 
     def __init__(
@@ -425,13 +422,7 @@ class ScanPanel:
         self._scanner, self._model, self.live = scanner, model, live
 
     def end(self) -> int:
-        """End the scan; returns how many exposures it recorded, 0 where none runs.
-
-        Raises
-        ------
-        OutputError
-            As `LiveScan.stop`; no scan runs then.
-        """
+        """End the scan; returns how many exposures it recorded, 0 where none runs."""
         live, self.live = self.live, None
         if live is None:
             return 0
@@ -559,7 +550,3 @@ class ScanPanel:
 def put(handle: Any, value: object) -> None:
     """Show a value; typed anew, for the library types values as what a person changes."""
     handle.value = value
-
-
-def _is_usable(button: viser.GuiButtonHandle) -> bool:
-    return bool(button.visible) and not button.disabled

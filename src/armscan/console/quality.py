@@ -178,11 +178,6 @@ def deviations_mm(
         As given or found.
     deviation
         (N,) mm; nan beyond 5 mm, as of a table beside the part.
-
-    Raises
-    ------
-    ArmscanError
-        If the model is unreadable, or the points do not fit it.
     """
     surface = _surface(str(part), part.stat().st_mtime_ns)
     if pose is None:
@@ -215,10 +210,7 @@ def _bare_cloud(points_mm: FloatArray) -> PointCloud:
 class ModelWatch:
     """Compares a cloud that grows with the model of its part, without making anyone wait.
 
-    Parameters
-    ----------
-    worker
-        Does the work in its process; while it does other work, nothing is compared.
+    While ``worker`` does other work, nothing is compared.
     """
 
     def __init__(self, worker: Worker, part: Path) -> None:

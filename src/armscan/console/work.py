@@ -296,11 +296,6 @@ def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> t
     """Whether what was taken last is of use, and what is seen in it, in words.
 
     ``step``: camera, light sheets or hand-eye.
-
-    Raises
-    ------
-    ArmscanError
-        If the recording or the target's specification is damaged.
     """
     journey = Journey(folder, read_settings(folder / SETTINGS_FILE))
     source = read_recording(journey.recording(step))
@@ -505,13 +500,7 @@ def _advice(journey: Journey, step: StepName, result: StepResult) -> str:
 
 
 def write_report(journey: Journey) -> Path:
-    """Write the session's page: every step, its verdict and values, and links to its own page.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Write the session's page: every step, its verdict and values, and links to its own page."""
     sections = []
     for step in journey.steps:
         for scan in journey.scans if step.name in OF_A_SCAN else ("",):

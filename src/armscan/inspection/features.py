@@ -132,13 +132,7 @@ class FeatureInspection(ArrayRecord):
 def inspect_feature(
     cloud: PointCloud, wanted: WantedFeature, options: InspectionOptions | None = None
 ) -> FeatureInspection | FitFailure:
-    """Find a feature in a cloud, fit it, and say how well it is known.
-
-    Raises
-    ------
-    InputError
-        If there are too few points.
-    """
+    """Find a feature in a cloud, fit it, and say how well it is known."""
     selection = select(cloud, wanted.region, options)
     sample = sample_of(selection)
     start = find_shape(sample, wanted)
@@ -177,11 +171,6 @@ def inspect_points(
     """Fit a feature to points that are known to be of it, as those of a face of the part's model.
 
     ``rule`` is how they were chosen, in words, after "points".
-
-    Raises
-    ------
-    InputError
-        If there are too few points.
     """
     selection = select(cloud, wanted.region, None)
     points = selection.points_mm

@@ -43,11 +43,6 @@ def inspect_plane(
     ``reference``: the plane to be met, in the same frame; without it the plane that most points lie
     near is looked for, and only the fitted reference is reported. ``reference_text``: where it came
     from, for the definitions.
-
-    Raises
-    ------
-    InputError
-        If there are too few points.
     """
     selection = select(cloud, region, options)
     points = selection.points_mm

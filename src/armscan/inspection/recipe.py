@@ -102,16 +102,9 @@ class RecipeStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recipe:
-    """What is done with every part.
+    """What is done with every part; ``features``, ``relations`` and ``steps`` after the alignment.
 
-    Parameters
-    ----------
-    surface
-        Of the part's model; None to measure features alone, in the cloud's own frame.
-    align, datums
-        How the cloud is laid on it, and what that rests on.
-    features, relations, steps
-        What is measured after the alignment.
+    Without a ``surface`` features alone are measured, in the cloud's own frame.
     """
 
     title: str = ""
@@ -170,15 +163,8 @@ class PartQuantity:
 class FollowedRecipe:
     """What a recipe found on one part.
 
-    Parameters
-    ----------
-    placed
-        The same cloud where the features were measured: in Cad, or its own frame.
-    features
-        Those that were found, by name.
-    quantities
-        Each value: features, relations and steps as in the recipe, then the faces that have a
-        tolerance.
+    ``placed`` is the cloud where features were measured, in Cad or its own frame; ``quantities``
+    are in the recipe's order, then the faces that have a tolerance.
     """
 
     cloud: PointCloud
@@ -198,11 +184,6 @@ def follow_recipe(recipe: Recipe, cloud: PointCloud) -> FollowedRecipe | FitFail
     -------
     FitFailure
         If the cloud cannot be laid on the model.
-
-    Raises
-    ------
-    InputError
-        If a filter needs what the cloud does not carry, or no point is left.
     """
     cleaning = None if recipe.cleaning is None else clean_cloud(cloud, recipe.cleaning)
     cleaned = cloud if cleaning is None else cleaning.cloud

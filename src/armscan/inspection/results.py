@@ -51,15 +51,7 @@ class Statistic:
 
 
 class Deviations(ArrayRecord):
-    """Deviations of points from one reference.
-
-    Parameters
-    ----------
-    reference, reference_text
-        What they are counted from, as a kind and in words.
-    deviations_mm
-        (N,) signed, in the order of the points.
-    """
+    """Deviations (N,) of points from one reference, signed, in the order of the points."""
 
     reference: ReferenceKind
     reference_text: str
@@ -239,15 +231,7 @@ def within_key(limit_mm: float) -> str:
 
 
 class Histogram(ArrayRecord):
-    """Counts of deviations.
-
-    Parameters
-    ----------
-    edges_mm
-        (B + 1,) limits of the bins.
-    counts
-        (B,) points in each.
-    """
+    """Counts of deviations: (B + 1,) limits of the bins, (B,) points in each, and those beyond."""
 
     edges_mm: FloatArray = floats(None)
     counts: IntArray = ints(None)

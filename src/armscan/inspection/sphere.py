@@ -41,13 +41,7 @@ def inspect_sphere(
     region: Box | None = None,
     options: InspectionOptions | None = None,
 ) -> SphereInspection | FitFailure:
-    """Find a ball of known diameter anywhere in a cloud and inspect it.
-
-    Raises
-    ------
-    InputError
-        If there are too few points or the diameter is not positive.
-    """
+    """Find a ball of known diameter anywhere in a cloud and inspect it."""
     if not 0.0 < diameter_mm < 1e4:
         raise InputError(f"a ball of {diameter_mm:g} mm diameter", remedy="give the diameter in mm")
     selection = select(cloud, region, options)

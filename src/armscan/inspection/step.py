@@ -279,11 +279,6 @@ def inspect_step(
 
     ``normal``: (3,) normal of the faces in the cloud's frame, from the arm's pose and a plate; used
     for a single exposure only.
-
-    Raises
-    ------
-    InputError
-        If there are too few points, the height is not positive, or the normal is zero.
     """
     if not 0.0 < height_mm < 1e4:
         raise InputError(f"a step {height_mm} mm high", remedy="give the height in mm")

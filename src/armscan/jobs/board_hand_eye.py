@@ -57,7 +57,8 @@ MOST_ROWS = 2 * MAX_LOOKS
 
 @dataclass(frozen=True, slots=True)
 class LookSource:
-    """Where the views of the target and the arm's poses are.
+    """Where the views of the target and the arm's poses are; `OptionError` if they do not go
+    together.
 
     Parameters
     ----------
@@ -69,11 +70,6 @@ class LookSource:
         ``arm.toml`` for a recording of joint angles; None to look for it in the recording.
     camera, sensor
         The camera's calibration, by itself or as a part of ``sensor.json``.
-
-    Raises
-    ------
-    OptionError
-        If these do not go together.
     """
 
     images: tuple[str, ...] = ()

@@ -86,6 +86,8 @@ from armscan.vision.stripe.image import StripeOptions
 class StripeSource:
     """Where the stripes are: recordings, or profiles of a sensor that delivers points.
 
+    `OptionError` if these do not go together.
+
     Parameters
     ----------
     scans
@@ -96,11 +98,6 @@ class StripeSource:
         ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
     profiles
         Profiles of points: files, folders or patterns, one a posture.
-
-    Raises
-    ------
-    OptionError
-        If these do not go together.
     """
 
     scans: tuple[Path, ...] = ()
@@ -132,7 +129,7 @@ class StripeSource:
 
 @dataclass(frozen=True, slots=True)
 class Artefact:
-    """What the stripes lie on: a plate or a sphere.
+    """What the stripes lie on: a plate or a sphere; `OptionError` if it is not one of them.
 
     Parameters
     ----------
@@ -144,11 +141,6 @@ class Artefact:
         Axis of Base along which the plate's face looks; None to take it from where the arm was.
     sphere_diameter_mm
         Diameter of the sphere in place of a plate; None for a plate.
-
-    Raises
-    ------
-    OptionError
-        If it is not one of them.
     """
 
     plate: Path | None = None

@@ -170,13 +170,7 @@ class Job:
         return tuple(files)
 
     def refuse(self, page: Page, failure: FitFailure) -> NoReturn:
-        """Write the page of a run without a result, and raise the failure, which names it.
-
-        Raises
-        ------
-        EstimationError
-            Always.
-        """
+        """Write the page of a run without a result, and raise the failure, which names it."""
         remedy = failure.remedy
         if self.output is not None:
             place = self.output.with_suffix(".refused.html")
@@ -201,14 +195,9 @@ LedgerEntry = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class BatchItem:
-    """One of many results in one folder; ``name`` has no suffix.
+    """One of many results in one folder; ``name`` has no suffix, ``n_steps`` are its exposures.
 
-    Parameters
-    ----------
-    mark
-        Hash of all that the result follows from.
-    n_steps
-        Exposures that it is made of.
+    ``mark`` is a hash of all that the result follows from.
     """
 
     name: str
@@ -366,13 +355,7 @@ def _is_entry(entry: object) -> bool:
 
 
 def solved(result: T | FitFailure, where: object = "") -> T:
-    """The result of an estimation.
-
-    Raises
-    ------
-    EstimationError
-        If it failed.
-    """
+    """The result of an estimation; `EstimationError` if it failed."""
     if isinstance(result, FitFailure):
         raise EstimationError(result.reason, where=str(where), remedy=result.remedy)
     return result

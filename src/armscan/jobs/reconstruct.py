@@ -585,14 +585,7 @@ def _check_own_images(paths: StillPaths) -> None:
 
 
 def read_stills(paths: StillPaths, options: ImageOptions, n_cameras: int) -> StillImages:
-    """Read images of files and folders, or the exposures of one recording.
-
-    Raises
-    ------
-    ArmscanError
-        If an image cannot be read, or a recording has not that many cameras, or not one instant of
-        which all have an image.
-    """
+    """Read images of files and folders, or the exposures of one recording."""
     folder = Path(paths.images[0]) if len(paths.images) == 1 else None
     if folder is not None and is_recording(folder) and not (paths.background or paths.right):
         return _stills_of_recording(folder, n_cameras)

@@ -342,12 +342,6 @@ def naming_table(naming: Mapping[Any, NamingErrors]) -> Table:
     return Table(columns, tuple(rows), "", (1, 2, 3, 4, 5, 6))
 
 
-def _seconds_table(seconds: Mapping[str, float]) -> Table:
-    rows = [(stage.replace("_", " "), f"{value:.1f}") for stage, value in seconds.items()]
-    rows.append(("together", f"{sum(seconds.values()):.1f}"))
-    return Table(("stage", "seconds"), tuple(rows))
-
-
 def head_demo_page(
     demo: HeadDemo,
     name: str,
@@ -368,6 +362,8 @@ def head_demo_page(
         "The thesis's figures were measured on a real instrument; ours are simulated, with an arm "
         "and optics made to be like it."
     )
+    seconds = {**head["seconds"], "together": sum(head["seconds"].values())}
+    took = tuple((stage.replace("_", " "), f"{value:.1f}") for stage, value in seconds.items())
     names = (
         Text(
             "Which light sheet drew each stripe, against the truth, over all instants of each "
@@ -397,7 +393,7 @@ def head_demo_page(
             Section("The part", (Text("These points are cloud.ply."), _part_pictures(demo))),
             *((Section("The names of the stripes", names),) if demo.naming else ()),
             Section("Against the truth", (truth_table(demo, head),)),
-            Section("Step by step", (commands, _seconds_table(head["seconds"]))),
+            Section("Step by step", (commands, Table(("stage", "seconds"), took))),
         ),
         is_simulated=True,
         footer=footer,

@@ -86,14 +86,9 @@ class Marks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Labels:
-    """Words on a photograph.
+    """Words on a photograph, (N, 2) the middle of each one's lower edge, in pixels of its exposure.
 
-    Parameters
-    ----------
-    points_px
-        (N, 2) middle of each word's lower edge, in pixels of its exposure.
-    size
-        Height of a letter as a share of the picture's longer side, in thousandths.
+    ``size`` is a letter's height as a share of the picture's longer side, in thousandths.
     """
 
     points_px: FloatArray
@@ -294,14 +289,8 @@ class SceneLines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneValues:
-    """What a click on a dot tells.
-
-    Parameters
-    ----------
-    numbers
-        (N,) numbers by name; NaN is told as not known.
-    names
-        (N,) index and the list that it points into, by name.
+    """What a click on a dot tells: (N,) numbers, NaN for not known, and (N,) index and list of
+    names.
     """
 
     numbers: Mapping[str, FloatArray]

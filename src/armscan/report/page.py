@@ -17,12 +17,8 @@ from armscan.report.quantity import SIGMA_NOTE, Quantity, Table, fact, sentences
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure.
-
-    Parameters
-    ----------
-    markup
-        Trusted HTML: an ``<img>`` with a data URI, or an ``<svg>``, from this package only.
+    """A figure. Its markup is an ``<img>`` with a data URI, or an ``<svg>``, from this package
+    only.
     """
 
     markup: str

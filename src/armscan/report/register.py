@@ -18,7 +18,6 @@ from armscan.report.drawing import (
     ALERT,
     MUTED,
     PALETTE,
-    SceneDots,
     SceneLines,
     chart_markup,
     new_figure,
@@ -180,7 +179,11 @@ def _marker_view(scene: MarkerScene) -> Picture:
     extent = float(np.linalg.norm(np.ptp(scene.points_mm, axis=0)))
     longest = float(np.linalg.norm(scene.residual_mm, axis=1).max(initial=0.0))
     factor = round_below(SHOWN_SHARE * extent / longest) if longest > 0.0 else 1.0
-    dots = [_pale(scene.clouds)] if scene.clouds else []
+    dots = []
+    if scene.clouds:
+        step = max(1, -(-sum(map(len, scene.clouds)) // MAX_CLOUD_DOTS))
+        shown = np.concatenate([cloud.points_mm[::step] for cloud in scene.clouds])
+        dots.append(uniform_dots(shown, CLOUD_GREY))
     lines = []
     for chosen, colour in ((scene.is_used, ACCENT), (~scene.is_used, ALERT)):
         if chosen.any():
@@ -207,12 +210,6 @@ def _marker_view(scene: MarkerScene) -> Picture:
         "Orange: markers that moved. Grey: markers without partner, and the clouds. Violet: "
         "where the measurements were made from.",
     )
-
-
-def _pale(clouds: Sequence[PointCloud]) -> SceneDots:
-    n = sum(len(cloud) for cloud in clouds)
-    step = max(1, -(-n // MAX_CLOUD_DOTS))
-    return uniform_dots(np.concatenate([cloud.points_mm[::step] for cloud in clouds]), CLOUD_GREY)
 
 
 def _rings(centres_mm: FloatArray, radius_mm: float, colour: str) -> SceneLines:

@@ -415,13 +415,7 @@ class Head:
         return "one_line" if len(self.sources) == 1 else "crossed"
 
     def sheets_of(self, sources: tuple[str, ...]) -> tuple[LineLaser, ...]:
-        """All sheets that light up when these sources are switched on.
-
-        Raises
-        ------
-        InputError
-            If a source is not of this head.
-        """
+        """All sheets that light up when these sources of this head are switched on."""
         for source in sources:
             if source not in self.sources:
                 raise InputError(f"head '{self.name}' has no laser '{source}'")
@@ -434,13 +428,7 @@ def build_head(
     seed: int = 1,
     tolerances: Tolerances | None = None,
 ) -> Head:
-    """Draw one instrument of a kind; two seeds give two that differ within the tolerances.
-
-    Raises
-    ------
-    InputError
-        If there is no head of that name.
-    """
+    """Draw one instrument of a kind; two seeds give two that differ within the tolerances."""
     if name not in HEADS:
         raise InputError(
             f"no simulated head is called '{name}'", remedy=f"choose one of: {', '.join(HEADS)}"

@@ -168,12 +168,8 @@ def _tool_at(centre_mm: FloatArray, rng: np.random.Generator) -> Pose[Base, Tool
 class Mechanics:
     """How good the arm and its probe are, and how steady the hand.
 
-    Parameters
-    ----------
-    exposure_s
-        Exposure time during scans: what the hand does meanwhile blurs the image.
-    target_mm
-        Standard deviation by which each circle of the target misses its place along x and y.
+    During ``exposure_s`` of scans the hand blurs the image; each circle of the target misses its
+    place along x and y by ``target_mm``, a standard deviation.
     """
 
     arm: ArmErrors

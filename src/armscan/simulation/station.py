@@ -47,10 +47,7 @@ ROOM = RoomLight(even=0.6, direct=0.4, position_mm=(350.0, -400.0, 900.0), up=(0
 class Target:
     """A printed target in Base, drawn sharply in images under room light.
 
-    Parameters
-    ----------
-    base_from_board
-        Where it is; the board's z axis points away from the viewer, into the board.
+    The board's z axis points away from the viewer, into the board.
     """
 
     pattern: FlatPattern
@@ -88,11 +85,8 @@ class Station:
 class ExposureSettings:
     """What the camera and the lasers do for one image.
 
-    Parameters
-    ----------
-    room_light
-        Brightness of white that faces up under the room's light, as a part of full scale; None for
-        the preset's ambient light.
+    ``room_light``: brightness of white that faces up under the room's light, as a part of full
+    scale; None for the preset's ambient light.
     """
 
     window: Window
@@ -137,11 +131,6 @@ def render_exposure(
 
     ``base_from_sensor``: poses over the exposure time, equally long each; one if the head stands
     still.
-
-    Raises
-    ------
-    InputError
-        If a laser or camera is not of this head or no pose is given.
     """
     if not base_from_sensor:
         raise InputError("an exposure needs a pose")
@@ -378,10 +367,7 @@ class RenderRequest:
 class TwinScan:
     """One scene, in the form of any recording; see `armscan.devices.sources.ScanSource`.
 
-    Parameters
-    ----------
-    seed
-        (K,) numbers from which, with the row, the noise of an exposure follows.
+    From ``seed`` (K,) and the row the noise of an exposure follows.
     """
 
     name: str

@@ -335,11 +335,6 @@ def build_twin(
     """Draw one instrument; everything random follows from the seed.
 
     ``part_mm`` (T, 3, 3) are triangles of a part in place of the workpiece.
-
-    Raises
-    ------
-    OptionError
-        If there is no such head or preset, or if the seed is negative.
     """
     if head not in HEADS:
         raise OptionError(

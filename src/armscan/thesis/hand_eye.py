@@ -52,14 +52,8 @@ def plane_in_tool(plane_base: FloatArray, base_from_tool: Pose[Base, Tool]) -> F
 
 
 def design_rows(plane_tool: FloatArray, points_mm: FloatArray) -> FloatArray:
-    """Rows H_ij (N, 12) of eqs. 2.72 and 2.75.
-
-    Parameters
-    ----------
-    plane_tool
-        (4,) the plate in Tool.
-    points_mm
-        (N, 3) in the Sensor frame.
+    """Rows H_ij (N, 12) of eqs. 2.72 and 2.75, of the plate (4,) in Tool and points (N, 3) in
+    Sensor.
     """
     points = homogeneous(points_mm)
     rows = plane_tool[None, :3, None] * points[:, None, :]

@@ -47,20 +47,7 @@ def cross_ratio(a: float, b: float, c: float, d: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class LineCode:
-    """Four points on a line.
-
-    Parameters
-    ----------
-    name
-        What the code stands for.
-    positions_mm
-        Places of the points along their line, increasing.
-
-    Raises
-    ------
-    InputError
-        If there are not four increasing positions.
-    """
+    """Four points on a line, and what they stand for; their places along it increase."""
 
     name: str
     positions_mm: tuple[float, ...]
@@ -82,10 +69,7 @@ class LineCode:
 def parse_code(text: str) -> LineCode:
     """Read ``NAME=A,B,C,D``: a code and the places of its four points along their line, mm.
 
-    Raises
-    ------
-    OptionError
-        If it is not of that form, or the places do not increase.
+    `OptionError` if it is not of that form, or the places do not increase.
     """
     name, _, places = text.partition("=")
     try:

@@ -81,16 +81,10 @@ TURNS_OF: dict[ShapeKind, tuple[int, ...]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DatumFeature:
-    """A feature of the part that an alignment rests on.
+    """A feature of the part that an alignment rests on: where it should be, in Cad; its size is
+    free.
 
-    Parameters
-    ----------
-    shape
-        Where it should be, in Cad; its size holds nothing.
-    face
-        Number of the model's face that it is; -1 for one that the model does not have.
-    region
-        In Cad; of a datum that is no face, only points inside are its own.
+    ``face`` is the model's, -1 for none; then only points inside ``region``, in Cad, are its own.
     """
 
     name: str

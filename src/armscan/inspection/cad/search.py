@@ -105,7 +105,8 @@ def search_pose(
         (SOME, LAST, diagonal * np.geomspace(0.04, 0.01, 8)),
     ):
         few = _thinned(len(centred), count)
-        costs = _descended(centred[few], _part_of(facing, few), grid, widths, poses)
+        looks = np.zeros((0, 3)) if facing is None else np.ascontiguousarray(facing[few])
+        costs = _descended(centred[few], looks, grid, widths, poses)
         poses = _distinct(poses, costs, centred, APART * diagonal, kept)
     candidates = [_typed(pose, middle) for pose in poses]
     compared = spread_rows(points_mm, ALL)
@@ -229,10 +230,6 @@ def even_turns(count: int) -> FloatArray:
 def _thinned(n: int, count: int) -> IntArray:
     random = np.random.default_rng(1)
     return np.arange(n) if n <= count else random.choice(n, count, replace=False)
-
-
-def _part_of(values: FloatArray | None, rows: IntArray) -> FloatArray:
-    return np.zeros((0, 3)) if values is None else np.ascontiguousarray(values[rows])
 
 
 def _distance_grid(surface: PartSurface) -> _DistanceGrid:

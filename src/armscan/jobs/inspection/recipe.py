@@ -206,13 +206,7 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
 
 
 def clouds_of(places: Sequence[Path]) -> dict[str, Path]:
-    """Clouds by the names of their parts; those of a folder in the order of their numbers.
-
-    Raises
-    ------
-    OptionError
-        If a folder holds none, or two have one name.
-    """
+    """Clouds by the names of their parts; those of a folder in the order of their numbers."""
     found: dict[str, Path] = {}
     seen: dict[str, Path] = {}
     for place in places:

@@ -281,13 +281,7 @@ def inspect_relation(
 
 
 def parse_feature(text: str, where: str) -> WantedFeature:
-    """The feature of a description such as ``cylinder:diameter=20:seed=1,2,3``.
-
-    Raises
-    ------
-    OptionError
-        If it is not understood.
-    """
+    """The feature of a description such as ``cylinder:diameter=20:seed=1,2,3``."""
     kind, *parts = text.split(":")
     words = ", ".join(WORDS)
     remedy = f"write KIND:WORD=VALUE:..., as cylinder:diameter=20:seed=1,2,3; words are {words}"
@@ -308,13 +302,7 @@ def parse_feature(text: str, where: str) -> WantedFeature:
 
 
 def wanted_feature(kind: str, where: str, given: dict[str, object]) -> WantedFeature:
-    """A feature of values that are numbers, or tuples of them, by field; None for not given.
-
-    Raises
-    ------
-    OptionError
-        If one of them is wrong.
-    """
+    """A feature of values that are numbers, or tuples of them, by field; None for not given."""
     values = {name: value for name, value in given.items() if value not in (None, ())}
     for name, value in values.items():
         single = name in ("diameter_mm", "half_angle_deg")

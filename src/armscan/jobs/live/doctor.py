@@ -66,10 +66,7 @@ OPTIONAL = {
 def examine_installation(*, warm: bool = False) -> Summary:
     """Check packages, the compiler and the folder for temporary files; what is wrong is a warning.
 
-    Parameters
-    ----------
-    warm
-        Also compile all kernels, so that the first use does not wait.
+    ``warm``: also compile all kernels, so that the first use does not wait.
     """
     problems: list[str] = []
     facts = [

@@ -63,15 +63,7 @@ class RecordRequest:
     is_stripe_band: bool = False
 
     def description(self) -> RigDescription:
-        """The rig that is asked for.
-
-        Raises
-        ------
-        OptionError
-            If none is, or two are.
-        FileFormatError
-            If its description cannot be read.
-        """
+        """The rig that is asked for."""
         self._check_numbers()
         is_named = bool(self.devices.cameras or self.devices.arm or self.devices.lasers)
         if self.rig and is_named:

@@ -237,15 +237,13 @@ class _Run:
 
 
 def run_head_demo(request: DemoRequest, progress: Progress = silent) -> Summary:
-    """Record, calibrate, measure, inspect, compare with the truth, and write it all.
-
-    Raises
-    ------
-    ArmscanError
-        If the head has no demo, the folder holds something else than an earlier demo or cannot be
-        written, or a stage does not determine its result.
-    """
-    _check_head(request)
+    """Record, calibrate, measure, inspect, compare with the truth, and write it all."""
+    if request.head not in KINDS:
+        raise OptionError(
+            f"there is no demo of the head {request.head!r}",
+            remedy=f"give one of {', '.join(KINDS)}",
+        )
+    request.twin.build()
     with demo_folder(request.folder) as place:
         return make_head_demo(request, place, progress)[0]
 
@@ -280,15 +278,6 @@ def run_all_heads(request: DemoRequest, progress: Progress = silent) -> Summary:
         document = render_page(heads_page(heads, demos, footer(provenance)))
         write_files({page: document, result: summary_json(summary).encode()})
         return summary
-
-
-def _check_head(request: DemoRequest) -> None:
-    if request.head not in KINDS:
-        raise OptionError(
-            f"there is no demo of the head {request.head!r}",
-            remedy=f"give one of {', '.join(KINDS)}",
-        )
-    request.twin.build()
 
 
 def calibrate_head(request: DemoRequest, folder: Path, progress: Progress = silent) -> Calibrated:

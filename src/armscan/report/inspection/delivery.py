@@ -162,13 +162,7 @@ def require_pdf() -> None:
 
 
 def pdf_bytes(page: bytes) -> bytes:
-    """The PDF of a page, A4; nothing is loaded from elsewhere.
-
-    Raises
-    ------
-    OptionError
-        As `require_pdf`.
-    """
+    """The PDF of a page, A4; nothing is loaded from elsewhere."""
     weasyprint = _weasyprint()
     logging.getLogger("fontTools").setLevel(logging.ERROR)
     logging.getLogger("weasyprint").setLevel(logging.CRITICAL)

@@ -139,12 +139,8 @@ def reach(
     start_rad: FloatArray = COMFORTABLE_RAD,
     preferred_rad: FloatArray = COMFORTABLE_RAD,
 ) -> FloatArray:
-    """Joint angles (7,) with which an arm holds its tool at a pose.
-
-    Raises
-    ------
-    EstimationError
-        If the pose is out of reach.
+    """Joint angles (7,) with which an arm holds its tool at a pose; `EstimationError` beyond its
+    reach.
     """
     joints = np.array(start_rad, dtype=np.float64)
     for _ in range(_MAX_STEPS):
@@ -208,10 +204,7 @@ class ArmErrors:
 class MeasuringArm(ArrayRecord, kw_only=False):
     """The true arm, the controller's arm and the encoders between them.
 
-    Parameters
-    ----------
-    waves_rad
-        (7, 4) cosine and sine amplitudes once per turn, then twice per turn, of each encoder.
+    ``waves_rad`` (7, 4): cosine and sine amplitudes once per turn, then twice, of each encoder.
     """
 
     true: ScrewArm

@@ -283,13 +283,9 @@ class ScanPass:
 
 
 class Trajectory(ArrayRecord):
-    """What the person did: joint angles over time, cubic between knots.
+    """What the person did: joint angles over time, cubic between knots, in ns and s from the start.
 
-    Parameters
-    ----------
-    t_s, joints_rad
-        (N,) times of the knots from the start of the pass, from a little before its first exposure
-        to a little after its last, and (N, 7) true joint angles there.
+    Knots (N,) begin a little before the pass's first exposure and end a little after its last.
     """
 
     t_s: FloatArray = floats("N")
@@ -356,11 +352,6 @@ def bounce(
     """Hold the head over a spot (3,) as a pass begins, moved nearer and away, aside and tilted.
 
     Exposures are ``start.n_exposures`` at every second tick of the camera's clock.
-
-    Raises
-    ------
-    EstimationError
-        If the arm does not reach.
     """
     ticks = 2 * np.arange(1, start.n_exposures + 1, dtype=np.int64)
     knots = np.arange(-2 * _MARGIN_S, 1e-9 * CAMERA_CLOCK_NS * ticks[-1] + 2 * _MARGIN_S, _KNOT_S)

@@ -167,14 +167,9 @@ GRADIENT_STEP_MM = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class MetaballLimb:
-    """A rounded cone between two balls.
+    """A rounded cone between two balls, centres in the Part frame; taken away if it is hollow.
 
-    Parameters
-    ----------
-    blend_mm
-        Over this length the limb melts into those named before it; 0 gives a sharp edge.
-    is_hollow
-        True if the limb is taken away instead of added.
+    Over ``blend_mm`` it melts into those named before it; 0 gives a sharp edge.
     """
 
     start_mm: tuple[float, float, float]

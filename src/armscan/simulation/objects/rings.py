@@ -30,14 +30,9 @@ _OFF_FACE_MM = 0.5
 
 
 class RingMarker(ArrayRecord, kw_only=False):
-    """One marker.
+    """One marker: (3,) middle of its disc, on a face, and the face's normal.
 
-    Parameters
-    ----------
-    centre_mm, normal
-        (3,) middle of the disc, on the face, and the face's normal.
-    disc_mm, ring_mm
-        Diameters of the bright disc and of the dark ring around it.
+    ``disc_mm`` and ``ring_mm`` are diameters of the bright disc and of the dark ring around it.
     """
 
     centre_mm: FloatArray = floats(3)
@@ -156,7 +151,8 @@ def draw_markers(
         )
         disc, ring, visible = _cover(marker, scene, camera, patch)
         # all light that the face sends back, as though it were white
-        white = drawn[inside] / marker_face_albedo(marker, scene)
+        face = scene.trace(marker.centre_mm + marker.normal, -marker.normal[None, :])
+        white = drawn[inside] / float(scene.albedo(face)[0, 0])
         shown = (
             disc[own] * marker.light * white
             + ring[own] * marker.dark * white
@@ -164,13 +160,6 @@ def draw_markers(
         )
         drawn[inside] = np.where(visible[own], shown, drawn[inside])
     return drawn
-
-
-def marker_face_albedo(marker: RingMarker, scene: Scene) -> float:
-    """Reflected part of the light on the face beside the marker's middle."""
-    above = marker.centre_mm + marker.normal
-    hits = scene.trace(above, -marker.normal[None, :])
-    return float(scene.albedo(hits)[0, 0])
 
 
 def _patch(marker: RingMarker, camera: RenderCamera) -> tuple[int, int, int, int] | None:

@@ -87,11 +87,6 @@ class RenderCamera:
         """Return the ideal coordinates ``X/Z, Y/Z`` (..., 2) seen by (..., 2) pixels.
 
         ``tolerance``: size of the step after which the search ends; what is left is smaller by far.
-
-        Raises
-        ------
-        InputError
-            If the fixed-point steps do not settle: the distortion folds over inside the image.
         """
         pixels = np.asarray(pixels_px, dtype=np.float64)
         seen_x = (pixels[..., 0] - self.cx) / self.fx

@@ -149,14 +149,9 @@ COARSE_STEP_PX = 8
 
 @dataclass(frozen=True, slots=True)
 class Speckle:
-    """Grain of laser light.
+    """Grain of laser light: standard deviation over its mean before the lens's blur, and its sigma.
 
-    Parameters
-    ----------
-    contrast
-        Standard deviation of the light over its mean, before the lens's blur.
-    grain_px
-        Gaussian sigma of the grain; 0 gives independent samples.
+    A grain of 0 px gives independent samples.
     """
 
     contrast: float = 0.2

@@ -57,29 +57,19 @@ MOST_ROWS = 2 * MAX_LOOKS
 
 @dataclass(frozen=True, slots=True)
 class LookSource:
-    """Where the views of the target and the arm's poses are.
+    """Where the views of the target and the arm's poses are; `OptionError` if they do not go
+    together.
 
     Parameters
     ----------
-    images
-        Photographs: files, folders or patterns, in the order of the poses.
     poses
         Table of the robot's poses, one a photograph.
     euler
         What angles in ``poses`` mean; None for ``extrinsic-xyz``.
-    scan
-        Recording with an arm, instead of photographs.
     arm
         ``arm.toml`` for a recording of joint angles; None to look for it in the recording.
     camera, sensor
         The camera's calibration, by itself or as a part of ``sensor.json``.
-    leave_out
-        Images that are not used: names or patterns.
-
-    Raises
-    ------
-    OptionError
-        If these do not go together.
     """
 
     images: tuple[str, ...] = ()
@@ -144,25 +134,7 @@ def calibrate_hand_eye_on_board(
     options: HandEyeOptions | None = None,
     image_options: ImageOptions | None = None,
 ) -> Summary:
-    """Read, calibrate, write ``scanner.json``, ``.npz`` and ``.html``, and say what came out.
-
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json``.
-    source
-        What to calibrate from.
-    target
-        Specification of the target, which stays where it is.
-    options, image_options
-        The arm's scatter, where it is known, and how pixels are read.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the postures do not determine the
-        hand-eye; no document is written then. Where it is the postures, a page shows them.
-    """
+    """Read, calibrate, write ``scanner.json``, ``.npz`` and ``.html``, and say what came out."""
     options, image_options = options or HandEyeOptions(), image_options or ImageOptions()
     places = job.places(".json", beside=(".npz", ".html"))
     plate = parse_target(target)

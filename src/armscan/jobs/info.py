@@ -119,7 +119,8 @@ def describe_recording(folder: Path) -> dict[str, Any]:
         "kind": scan.session.kind,
         "simulated": scan.is_simulated,
         "exposures": len(scan.rows),
-        "views": _n_views(scan),
+        # a row without a view is an arrangement of its own
+        "views": len({row if row.view is None else row.view for row in scan.rows}),
         "seconds": round((max(times) - min(times)) / NS_PER_S, 3),
         **_steps("exposure", np.unique(np.array(times, dtype=np.int64))),
         **({"lasers": lasers} if lasers else {}),
@@ -241,12 +242,6 @@ def _camera_line(setup: CameraSetup) -> str:
     window = setup.window
     place = f" at {window.x_px}, {window.y_px}" if window.x_px or window.y_px else ""
     return f"{setup.width_px} x {setup.height_px} px{place}, {setup.bits_used} bits, {setup.colour}"
-
-
-def _n_views(scan: FolderRecording) -> int:
-    """Arrangements that were seen: a row without a view is one of its own."""
-    named = {row.view for row in scan.rows if row.view is not None}
-    return len(named) + sum(row.view is None for row in scan.rows)
 
 
 def _track(track: ArmTrack) -> dict[str, Any]:

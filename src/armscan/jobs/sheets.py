@@ -262,13 +262,20 @@ def _read_scan(folder: Path, leave_out: Sequence[str], *, is_stereo: bool) -> _I
     # without its image without laser a view is no pair any more
     named |= {one.view for one in exposures if one.view and not one.lasers and one.source in named}
     gone = {one.source for one in exposures if one.view in named or one.source in named}
+    alone: tuple[str, ...] = ()
+    if is_stereo and len({recording.rows[k].camera for k in rows}) == 1:
+        alone = (
+            f"{folder} holds images of camera {recording.rows[rows[0]].camera} alone, the "
+            "calibration is of two: the other camera told nothing of the sheets; is it the right "
+            "recording?",
+        )
     return _Images(
         exposures,
         tuple(folder / recording.rows[k].source for k in rows),
         pair_by_view([one for one in exposures if one.source not in gone]),
         _skipped([one for one in exposures if one.lasers], gone),
         recording_tables(folder),
-        (*recording.warnings, *recording.session.assumed),
+        (*recording.warnings, *recording.session.assumed, *alone),
     )
 
 

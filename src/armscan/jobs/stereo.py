@@ -192,7 +192,7 @@ def _stereo_summary(run: StereoRun, written: Sequence[Path], *, is_simulated: bo
         tables=tuple(table for table in tables if table.rows),
         warnings=sentences(fit.warnings),
         written=tuple(written),
-        next_step=f"open {written[-1]}, then `armscan calibrate laser -h`",
+        next_step=f"open {written[-1]}, then `armscan calibrate laser --camera {written[0]} -h`",
         extra={
             "kind": "stereo calibration",
             "simulated": is_simulated,

@@ -134,11 +134,11 @@ def _found(pattern: str) -> list[Path]:
     return sorted(files, key=lambda item: natural_key(item.as_posix()))
 
 
-LEVELS = 3
+LEVELS = 4
 
 
 def are_simulated(paths: Iterable[Path]) -> bool:
-    """True if any file lies, up to three folders deep, beside a mark of the simulator.
+    """True if any file lies, up to four folders deep, beside a mark of the simulator.
 
     The mark is ``simulated = true`` in a recording's ``session.toml``, or ``"simulated": true`` in
     the ``truth.json`` of rendered photographs; the truth itself is never read.

@@ -56,9 +56,6 @@ def test_exact_without_delay(device0, host0, drift, rate):
     fit = monitor.clock.fit
     assert isinstance(fit, ClockFit)
     assert fit.drift == pytest.approx(drift, abs=2e-9)
-    back = [fit.to_device_ns(one) for one in found]
-    assert np.abs(np.array(back) - device[-50:]).max() <= 1
-    assert np.array_equal(fit.all_to_other_ns(device[-50:]), found)
 
 
 def delays(kind, n, rng):

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armscan.calibration.hand_eye.board_looks import BoardLook, board_poses
+from armscan.calibration.sheets.board_points import BoardBow
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Board, Pose, Sensor, Tool
@@ -45,16 +46,21 @@ def board_rig(
     turned: bool = False,
     one_axis: bool = False,
     images: int = 1,
+    bow: BoardBow | None = None,
+    true_bow_mm: tuple[float, float] = (0.0, 0.0),
 ) -> BoardRig:
     """Draw ``n`` postures with so many images each; ``scale`` is the true size over the stated.
 
     ``turned`` numbers every second view of a symmetric target from its other end; ``one_axis`` has
-    the camera turn about its optical axis only.
+    the camera turn about its optical axis only. The target's bow is ``true_bow_mm``, and the views'
+    poses are found with ``bow``.
     """
     generator = np.random.default_rng(seed)
     plate = parse_target(target)
     camera = _calibrated(generator)
     points = plate.points_board_mm
+    true_points = scale * points
+    true_points[:, 2] += arched(points) @ true_bow_mm
     hand_eye: Pose[Tool, Sensor] = Pose(
         Rotation.random(random_state=seed).as_matrix(), generator.uniform(-80, 80, 3)
     )
@@ -64,7 +70,7 @@ def board_rig(
     looks: list[BoardLook] = []
     while len(looks) < n * images:
         seen = _seen_from(generator, scale * points.mean(axis=0), one_axis=one_axis)
-        pixels = projected(seen, scale * points)
+        pixels = projected(seen, true_points)
         if pixels.min() < 10 or pixels[:, 0].max() > WIDTH - 10 or pixels[:, 1].max() > HEIGHT - 10:
             continue
         held = board @ seen.inverse() @ hand_eye.inverse()
@@ -86,12 +92,18 @@ def board_rig(
             )
             if turned and len(looks) % 2:
                 view = renumbered(view, plate, numberings(plate)[1])
-            poses = board_poses(view, plate, camera.camera)
+            poses = board_poses(view, plate, camera.camera, bow)
             if not isinstance(poses, FitFailure):
                 posture = source if images == 1 else f"p{len(looks) // images}"
                 taken.append(BoardLook(posture, told, poses))
         looks += taken if len(taken) == images else []
     return BoardRig(tuple(looks), camera, hand_eye, board)
+
+
+def arched(points_mm: FloatArray) -> FloatArray:
+    """(N, 2) arches ``1 - u^2`` and ``1 - v^2``, where u and v go from -1 to 1 over the target."""
+    low, high = points_mm[:, :2].min(axis=0), points_mm[:, :2].max(axis=0)
+    return np.asarray(1.0 - ((2.0 * points_mm[:, :2] - low - high) / (high - low)) ** 2)
 
 
 def projected(pose: Pose[Sensor, Board], points_mm: FloatArray) -> FloatArray:

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -81,6 +83,37 @@ def test_photographs_with_a_table_give_the_same_beside_the_camera_as_given(
     back = scanner.hand_eye.tool_from_sensor.retract(-follow[:, : len(step)] @ step)
     np.testing.assert_allclose(back.matrix, hand_eye.tool_from_sensor.matrix, atol=1e-9)
     assert (np.diag(hand_eye.covariance) >= np.diag(scanner.covariance)[-6:] * 0.999).all()
+
+
+def test_of_a_recording_what_shows_the_target_best_is_taken(
+    calibrated: Bench, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exposures without laser before those with one; what has no pose, or another camera, is told.
+
+    Those with a laser are black here: had one been taken, it would be among what was not used.
+    """
+    folder = tmp_path / "scan"
+    shutil.copytree(scan, folder)
+    black = cv2.imread(str(folder / "images" / "0.png"), cv2.IMREAD_GRAYSCALE) * 0
+    for name in ("black0", "black1", "black2", "late"):
+        cv2.imwrite(str(folder / "images" / f"{name}.png"), black)
+    session, table = folder / "session.toml", folder / "exposures.csv"
+    size = f"[[camera]]\nwidth_px = {black.shape[1]}\nheight_px = {black.shape[0]}\n"
+    session.write_text(session.read_text() + size)
+    header, *rows = (line.split(",") for line in table.read_text().splitlines())
+    rows += [["", f"{10**9 * k + 5 * 10**6}", "0", f"images/black{k}.png", "A", ""] for k in (1, 2)]
+    rows += [["", f"{10**9}", "1", "images/black0.png", "", ""]]
+    rows += [["", f"{90 * 10**9}", "0", "images/late.png", "", ""]]
+    rows.sort(key=lambda row: int(row[1]))
+    lines = [",".join([str(k), *row[1:]]) for k, row in enumerate(rows)]
+    table.write_text("\n".join([",".join(header), *lines]) + "\n")
+    words = words_of("--scan", folder, "--camera", calibrated.camera, "-o", tmp_path / "out.json")
+    assert main([*words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["n_postures"] == len(POSTURES)
+    assert "1 exposure of other cameras" in str(told["warnings"])
+    assert "1 view was not used: images/late.png (the arm gave no pose for it)" in str(told)
+    assert "black" not in str(told)
 
 
 @pytest.mark.parametrize(

@@ -162,14 +162,8 @@ class LatencyFit:
         separate clocks, of those that then have a pose.
     normal_base
         (3,) of the plate, in Base.
-    motion
-        What the motion told.
-    noise
-        Of heights and of the leans along the stripes.
     n_left_out
         Exposures that do not fit the plate, or had no pose.
-    warnings
-        In words.
     """
 
     estimate: Estimate[int]
@@ -264,22 +258,8 @@ def calibrate_latency(
     process), as restricted maximum likelihood says; exposures off by more than `FARTHEST` sigmas
     are left out.
 
-    Parameters
-    ----------
-    looks
-        What the exposures see of the plate.
-    arm
-        The arm's track.
-    tool_from_sensor
-        The hand-eye.
-    is_shared
-        False if camera and arm have clocks of their own: any offset is searched for that lets
-        the exposures lie within the track, and the drift is estimated.
-
-    Returns
-    -------
-    LatencyFit | FitFailure
-        A failure if too little was seen, or the motion does not tell.
+    Unless ``is_shared``, camera and arm have clocks of their own: any offset is searched for that
+    lets the exposures lie within the track, and the drift is estimated.
     """
     if len(looks) < FEWEST_EXPOSURES:
         return FitFailure(
@@ -609,7 +589,7 @@ def _result(problem: _Problem, fine: _Solution, before_ns: int) -> LatencyFit | 
         drift, sigma_drift = _drift_left(system, fine.noise)
     kept = np.zeros(len(problem.t_ns), dtype=np.bool_)
     kept[system.rows] = True
-    earlier = _linearise(problem, _shifted(fine.state, before_ns), kept)[0]
+    earlier = _linearise(problem, replace(fine.state, shift_ns=before_ns, drift=0.0), kept)[0]
     return LatencyFit(
         estimate=Estimate(
             value=fine.state.shift_ns,
@@ -650,10 +630,6 @@ def _widened(fine: _Solution, motion: StandOffMotion) -> FloatArray:
             scores += inverse.solve(jacobian @ fine.covariance[k]) * part
         factors[k] = max(1.0, score_sigma(scores, lag) / float(np.sqrt(fine.covariance[k, k])))
     return np.asarray(fine.covariance * np.outer(factors, factors))
-
-
-def _shifted(state: _State, shift_ns: int) -> _State:
-    return replace(state, shift_ns=shift_ns, drift=0.0)
 
 
 def _drift_left(system: _System, noise: tuple[ResidualNoise, ...]) -> tuple[float, float]:

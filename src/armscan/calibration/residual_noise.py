@@ -20,15 +20,7 @@ from armscan.geometry.least_squares import robust_sigma
 
 @dataclass(frozen=True, slots=True)
 class ResidualNoise:
-    """Scatter of one kind of residual: white, and one that fades exponentially in time.
-
-    Parameters
-    ----------
-    white_mm, slow_mm
-        Standard deviations.
-    fades_s
-        Time in which the correlation of the slow part falls to 1/e.
-    """
+    """Scatter of one kind of residual: white, and one whose correlation fades in time (1/e)."""
 
     white_mm: float
     slow_mm: float

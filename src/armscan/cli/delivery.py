@@ -144,13 +144,7 @@ def _tell_compilation() -> None:
 
 
 def _with_delivery(job: Job, title_block: Sequence[str], pdf: Path | None) -> Job:
-    """The job with the title block and PDF that were asked for.
-
-    Raises
-    ------
-    ArmscanError
-        If the title block is not understood, or there is no page for the PDF.
-    """
+    """The job with the title block and PDF that were asked for."""
     from armscan.errors import OptionError
     from armscan.storage.parts.recipes import read_title_block
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -19,9 +19,6 @@ from armscan.cli.options import (
     given,
     numbers,
 )
-
-if TYPE_CHECKING:
-    from armscan.report.quantity import Summary
 
 PLANE_EXAMPLE = (
     "\b\nExample:\n  armscan inspect plane plate.ply --plate plate.csv -o plate-inspection.html"
@@ -133,11 +130,10 @@ def step(
     )
 
 
-def _code(summary: Summary) -> int:
-    return 0 if summary.data["verdict"] == "still valid" else EXIT_NOT_PASSED
-
-
-@job_command(PageOption, None, code=_code)
+@job_command(
+    PageOption, None,
+    code=lambda said: 0 if said.data["verdict"] == "still valid" else EXIT_NOT_PASSED,
+)  # fmt: skip
 def verify(
     scan: Annotated[
         Path,

@@ -5,16 +5,13 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from armscan.cli.delivery import OF_INSPECTIONS, Work, job_command
 from armscan.cli.inspect import EXIT_NOT_PASSED, CloudArgument
 from armscan.cli.options import DefaultOf, PageOption, RegionOption, given, numbers
-
-if TYPE_CHECKING:
-    from armscan.report.quantity import Summary
 
 CAD_EXAMPLE = (
     "\b\nExample:\n"
@@ -99,15 +96,10 @@ ResultsFolder = Annotated[
 ]
 
 
-def _code_of_part(summary: Summary) -> int:
-    return 0 if summary.data.get("verdict", "pass") == "pass" else EXIT_NOT_PASSED
-
-
-def _code_of_parts(summary: Summary) -> int:
-    return 0 if summary.data["all_passed"] else EXIT_NOT_PASSED
-
-
-@job_command(PageOption, None, also=OF_INSPECTIONS, code=_code_of_part)
+@job_command(
+    PageOption, None, also=OF_INSPECTIONS,
+    code=lambda said: 0 if said.data.get("verdict", "pass") == "pass" else EXIT_NOT_PASSED,
+)  # fmt: skip
 def cad(
     cloud: CloudArgument,
     part: PartArgument,
@@ -173,7 +165,7 @@ def cad(
     )
 
 
-@job_command(ResultsFolder, code=_code_of_parts)
+@job_command(ResultsFolder, code=lambda said: 0 if said.data["all_passed"] else EXIT_NOT_PASSED)
 def recipe(
     recipe: Annotated[
         Path, typer.Argument(help="What to do with every part (TOML).", show_default=False)

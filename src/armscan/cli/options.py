@@ -198,21 +198,8 @@ def given(options: type[T], **values: Any) -> T:
 
 
 def refuse_vain(options: Mapping[str, Any], what: str, remedy: str = "leave out") -> None:
-    """Refuse options that would be without effect.
-
-    Parameters
-    ----------
-    options
-        Value of each option by its name; None, False, or empty where it was not given.
-    what
-        Why they have no effect.
-    remedy
-        What to do, in front of the names.
-
-    Raises
-    ------
-    OptionError
-        If one or more were given.
+    """Refuse options that are given (neither None, False nor empty) but without effect; say
+    ``what``.
     """
     from armscan.errors import OptionError
 
@@ -244,13 +231,7 @@ def refuse_given(context: typer.Context, names: str, what: str) -> None:
 
 
 def numbers(text: str, option: str) -> tuple[float, ...]:
-    """Numbers between commas.
-
-    Raises
-    ------
-    OptionError
-        If a word is no number.
-    """
+    """Numbers between commas."""
     from armscan.errors import OptionError
 
     try:

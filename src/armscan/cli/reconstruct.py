@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -23,9 +23,6 @@ from armscan.cli.options import (
     refuse_given,
     refuse_vain,
 )
-
-if TYPE_CHECKING:
-    from armscan.report.quantity import Summary
 
 EXIT_INPUT = 2
 OF_IMAGES = (
@@ -114,11 +111,10 @@ CloudFile = Annotated[
 ]
 
 
-def _code(summary: Summary) -> int:
-    return EXIT_INPUT if summary.extra.get("n_failed") else 0
-
-
-@job_command(CloudsPlace, Path("cloud.ply"), also="cache force", code=_code)
+@job_command(
+    CloudsPlace, Path("cloud.ply"), also="cache force",
+    code=lambda said: EXIT_INPUT if said.extra.get("n_failed") else 0,
+)  # fmt: skip
 def reconstruct(
     context: typer.Context,
     *,
@@ -157,7 +153,12 @@ def reconstruct(
     from armscan.vision.stripe.image import StripeOptions
 
     names = (images, background, right, right_background)
-    _check_poses(context, poses, euler)
+    if poses is None:
+        refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
+    else:
+        refuse_given(
+            context, OF_IMAGES, "profiles with --poses are points already: no image is read"
+        )
     options = MeasureOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
         depths=None if depth_margin is None else DepthRange(depth_margin),
@@ -197,13 +198,3 @@ def fuse(
     from armscan.jobs.fuse import fuse as fuse_clouds
 
     return lambda job: fuse_clouds(job, clouds, voxel)
-
-
-def _check_poses(context: typer.Context, poses: Path | None, euler: str | None) -> None:
-    """Refuse options without effect on profiles, and angles of no table."""
-    if poses is None:
-        refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
-    else:
-        refuse_given(
-            context, OF_IMAGES, "profiles with --poses are points already: no image is read"
-        )

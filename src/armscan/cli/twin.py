@@ -173,7 +173,7 @@ def simulate(
     a part with two faults, whose CAD model comes with armscan, or --part; latency is the plate with
     the head moved nearer and away, and an arm with a clock of its own.
     """
-    from armscan.jobs.twin.simulate import SimulateRequest, run_simulation
+    from armscan.jobs.twin.simulate import run_simulation
     from armscan.pipeline.simulate import SimulateOptions
 
     quality = None if preset is None else preset.value
@@ -186,5 +186,5 @@ def simulate(
         unit=None if unit is None else unit.value,
     )
     with progress_bar() as progress:
-        summary = run_simulation(SimulateRequest(head, scene.value, output, options), progress)
+        summary = run_simulation(head, scene.value, output, options, progress)
     show(summary, as_json=as_json)

@@ -21,16 +21,9 @@ TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": WRONG, "old": "#b07d12
 
 
 def overview(session: str, rig: str, states: Mapping[str, tuple[Status, bool]], link: str) -> str:
-    """HTML of a session's steps.
+    """HTML of a session's steps: of each its status, and whether it is the one that is shown.
 
-    Parameters
-    ----------
-    session, rig
-        What they are called.
-    states
-        By the title of each step its status, and whether it is the one that is shown.
-    link
-        HTML of the way to the report.
+    ``link`` is the HTML of the way to the report.
     """
     rows = []
     for title, (status, is_shown) in states.items():

@@ -77,20 +77,12 @@ class Step:
 
     Parameters
     ----------
-    name, title
-        What it is called.
-    to_do
-        What the operator does, in plain words.
-    filling
-        How its recording is filled.
     placements
         What is to be taken, one after the other; empty where the hand moves freely.
     least
         With fewer of them the job is not worth a try.
     needs
         Steps whose documents it rests on.
-    is_optional
-        The journey goes on without it.
     """
 
     name: StepName
@@ -196,14 +188,9 @@ OF_TWO_CAMERAS = {
 class SeeingSettings:
     """How the cameras look at the laser's line, and how it is found; most keys are ``rig.toml``'s.
 
-    Parameters
-    ----------
-    windows, exposure, stripes
-        As of `armscan.pipeline.live.rig.RigDescription`.
-    photo_us
-        Exposure time of photographs of the target; 0 for the camera's own.
-    voxel_mm, measured_every
-        As of `armscan.pipeline.live.session.LiveOptions`.
+    ``photo_us`` is the exposure time of photographs of the target; 0 for the camera's own. The rest
+    as of `armscan.pipeline.live.rig.RigDescription` and
+    `armscan.pipeline.live.session.LiveOptions`.
     """
 
     windows: tuple[tuple[int, int, int, int], ...] = ()
@@ -241,20 +228,10 @@ class SessionSettings:
     ----------
     rig
         The rig that fills it: path of ``rig.toml``, or ``twin:HEAD?seed=1``; empty for none.
-    target
-        Specification of the calibration target.
-    n_cameras
-        Cameras of the head.
     ball_mm
         Certified diameter of the reference ball.
-    part
-        Model of the part that scans are compared with; empty for none.
     tolerance
         As of ``armscan inspect cad``; empty for none.
-    needs_latency
-        Camera and arm have no trigger in common.
-    seeing
-        In place of what the rig's description says; None for that.
     """
 
     rig: str = ""
@@ -273,8 +250,6 @@ class StepResult:
 
     Parameters
     ----------
-    verdict
-        Whether to go on with it.
     reasons
         Why it is not good, or what to look at, as sentences.
     values
@@ -283,8 +258,6 @@ class StepResult:
         Files, relative to the session.
     rests_on
         SHA-256 of every input, by its path relative to the session.
-    next_step
-        What to do now.
     """
 
     verdict: Verdict
@@ -328,15 +301,7 @@ INSPECTIONS = ("CAD model", "plate", "ball")
 
 
 class Journey:
-    """A session folder.
-
-    Parameters
-    ----------
-    folder
-        Where it lies; see `open_journey`.
-    settings
-        As written there.
-    """
+    """A session folder, with its settings as written there; see `open_journey`."""
 
     def __init__(self, folder: Path, settings: SessionSettings) -> None:
         self.folder = folder
@@ -344,13 +309,7 @@ class Journey:
         self._known: dict[tuple[Path, int, int], bool] = {}
 
     def change(self, **settings: Any) -> None:
-        """Write other settings.
-
-        Raises
-        ------
-        OutputError
-            If the folder cannot be written.
-        """
+        """Write other settings."""
         self.settings = replace(self.settings, **settings)
         content = toml_bytes(RecordCodec({}).write(self.settings))
         write_files({self.folder / SETTINGS_FILE: content}, is_overwriting=True)
@@ -499,13 +458,7 @@ class Journey:
         return self.steps[-1].name
 
     def start_over(self, step: StepName, scan: str = "") -> None:
-        """Remove what a step has taken, and its result; documents stay until they are replaced.
-
-        Raises
-        ------
-        OutputError
-            If it cannot be removed.
-        """
+        """Remove what a step has taken, and its result; documents stay until they are replaced."""
         place = self.recording(step, scan)
         gone = place.with_name(f".{place.name}.old")
         try:
@@ -617,13 +570,7 @@ def _check_own(folder: Path) -> None:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``console.toml``.
-
-    Raises
-    ------
-    FileFormatError
-        If it is no TOML, or a value is of a wrong type.
-    """
+    """Read ``console.toml``."""
     where, unknown = path_text(path), list[str]()
     remedy = "remove the file: the session asks for its settings again"
     try:

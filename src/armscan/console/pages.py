@@ -65,17 +65,10 @@ class ConsolePage:
 
     Parameters
     ----------
-    server
-        From `armscan.console.server.open_server`.
     folder
         The session, made if need be.
     bench
         What fills it; None to look at what is there.
-
-    Raises
-    ------
-    ArmscanError
-        If the folder is no session, or another console has it open.
     """
 
     def __init__(self, server: viser.ViserServer, folder: Path, bench: Bench | None) -> None:
@@ -644,24 +637,7 @@ def run_console(
     port: int | None = None,
     tell: Callable[[str], object] = print,
 ) -> None:
-    """Open a session's page and serve it until an interrupt.
-
-    Parameters
-    ----------
-    folder
-        The session, made if need be.
-    rig
-        As of `armscan.console.rig.open_bench`; empty for none.
-    host, port
-        As of `armscan.console.server.open_server`.
-    tell
-        Told the page's address.
-
-    Raises
-    ------
-    ArmscanError
-        If rig, session or port cannot be opened.
-    """
+    """Open a session's page and serve it until an interrupt; ``tell`` is told its address."""
     with open_console(folder, rig, host=host, port=port) as (page, address):
         tell(f"{page.journey.folder}: open {address} in a browser; Ctrl-C ends the console")
         with suppress(KeyboardInterrupt):

@@ -61,12 +61,7 @@ START_BUTTON, UNDO_BUTTON = "0", "1"
 class Controls:
     """Buttons of a page, and what went wrong with the last one.
 
-    Parameters
-    ----------
-    server
-        Of the page.
-    refresh
-        Shows what became of a press.
+    ``refresh`` shows what became of a press.
     """
 
     def __init__(self, server: viser.ViserServer, refresh: Callable[[], None]) -> None:
@@ -101,7 +96,9 @@ class Controls:
         button.on_click(lambda _: self.tried(work))
         if key:
             command = self.gui.add_command(label, hotkey=cast(Any, key), description=hint)
-            command.on_trigger(lambda _: self.tried(work) if _is_usable(button) else None)
+            command.on_trigger(
+                lambda _: self.tried(work) if button.visible and not button.disabled else None
+            )
         return button
 
     def removing_button(
@@ -157,13 +154,7 @@ class Controls:
 
 
 class PointsPanel:
-    """Which points stand in space, how many of them, and what their colours mean.
-
-    Parameters
-    ----------
-    view
-        The space.
-    """
+    """Which points stand in space, how many of them, and what their colours mean."""
 
     def __init__(self, view: SceneView) -> None:
         self.view = view
@@ -204,12 +195,7 @@ class PointsPanel:
 class SeeingPanel:
     """How the cameras see the laser's line, and what counts as one.
 
-    Parameters
-    ----------
-    controls
-        Of the page.
-    keep
-        Told of new settings; of None for what the rig's description says.
+    ``keep`` is told of new settings; of None for what the rig's description says.
     """
 
     def __init__(self, controls: Controls, keep: Callable[[SeeingSettings | None], object]) -> None:
@@ -323,12 +309,7 @@ class SeeingPanel:
 class TipPanel:
     """Where the tip of the probe is, for a session whose plate a person touches.
 
-    Parameters
-    ----------
-    controls
-        Of the page.
-    place
-        Gives the file that holds it.
+    ``place`` gives the file that holds it.
     """
 
     def __init__(self, controls: Controls, place: Callable[[], Path]) -> None:
@@ -378,16 +359,7 @@ class TipPanel:
 class ScanPanel:
     """A scan while it runs: its buttons, images, range bar and figures.
 
-    Parameters
-    ----------
-    controls
-        Of the page.
-    points
-        Where the live cloud is shown.
-    finish
-        What ends a scan.
-    look
-        Gives what the cameras see now while no scan runs; none to leave what is shown.
+    ``finish`` ends a scan; ``look`` gives what the cameras see now while no scan runs.
     """
 
     def __init__(
@@ -450,13 +422,7 @@ class ScanPanel:
         self._scanner, self._model, self.live = scanner, model, live
 
     def end(self) -> int:
-        """End the scan; returns how many exposures it recorded, 0 where none runs.
-
-        Raises
-        ------
-        OutputError
-            As `LiveScan.stop`; no scan runs then.
-        """
+        """End the scan; returns how many exposures it recorded, 0 where none runs."""
         live, self.live = self.live, None
         if live is None:
             return 0
@@ -584,7 +550,3 @@ class ScanPanel:
 def put(handle: Any, value: object) -> None:
     """Show a value; typed anew, for the library types values as what a person changes."""
     handle.value = value
-
-
-def _is_usable(button: viser.GuiButtonHandle) -> bool:
-    return bool(button.visible) and not button.disabled

@@ -97,12 +97,7 @@ class Incidence:
         A call asks for the newest exposures that are not known, up to 100,000 points: a large cloud
         is known after some calls.
 
-        Parameters
-        ----------
-        cloud
-            Rows of an exposure lie together.
-        seen_from_mm
-            (3,) where the sensor stood, by exposure.
+        ``seen_from_mm``: (3,) where the sensor stood, by exposure.
         """
         number, start, count = np.unique(cloud.exposure, return_index=True, return_counts=True)
         if not len(number):
@@ -144,14 +139,7 @@ class Incidence:
 def surface_normals(points_mm: FloatArray, exposure: IntArray, is_asked: BoolArray) -> FloatArray:
     """(M, 3) unit normals, of either side, at the points asked for; nan where there is no surface.
 
-    Parameters
-    ----------
-    points_mm
-        (N, 3) points, on lines.
-    exposure
-        (N,) which line.
-    is_asked
-        (N,) where M of them are True.
+    ``points_mm``: (N, 3) points, on lines. ``exposure``: (N,) which line.
     """
     normals = np.full((int(is_asked.sum()), 3), np.nan)
     if len(points_mm) <= NEIGHBOURS:
@@ -181,16 +169,8 @@ def deviations_mm(
 ) -> tuple[Pose[Cad, Part], FloatArray]:
     """Signed distances of a cloud from the model of its part, positive outside.
 
-    Parameters
-    ----------
-    part
-        The model.
-    points_mm
-        (N, 3) points.
-    pose
-        Where they lie on it; None to lay them as `armscan.inspection.cad.alignment.align_best`.
-    progress
-        Not told.
+    ``pose``: where they lie on it; None to lay them as
+    `armscan.inspection.cad.alignment.align_best`.
 
     Returns
     -------
@@ -198,11 +178,6 @@ def deviations_mm(
         As given or found.
     deviation
         (N,) mm; nan beyond 5 mm, as of a table beside the part.
-
-    Raises
-    ------
-    ArmscanError
-        If the model is unreadable, or the points do not fit it.
     """
     surface = _surface(str(part), part.stat().st_mtime_ns)
     if pose is None:
@@ -235,17 +210,7 @@ def _bare_cloud(points_mm: FloatArray) -> PointCloud:
 class ModelWatch:
     """Compares a cloud that grows with the model of its part, without making anyone wait.
 
-    Parameters
-    ----------
-    worker
-        Does the work in its process; while it does other work, nothing is compared.
-    part
-        The model.
-
-    Attributes
-    ----------
-    problem
-        Why there is no comparison, as a sentence; empty if there is one.
+    While ``worker`` does other work, nothing is compared.
     """
 
     def __init__(self, worker: Worker, part: Path) -> None:

@@ -226,11 +226,6 @@ class TwinBench:
     address
         ``twin:HEAD?seed=1&preset=thesis&scene=workpiece&views=24&rate=10``; ``scene`` is what is
         scanned, ``views`` how many exposures of a scan are taken, 0 for all.
-
-    Raises
-    ------
-    OptionError
-        If the address is wrong.
     """
 
     def __init__(self, address: str) -> None:
@@ -435,15 +430,7 @@ class _Latest:
 
 
 class DeviceBench:
-    """Real devices, or any that were opened.
-
-    Parameters
-    ----------
-    rig
-        Opened; `close` closes it.
-    name
-        What the session calls it.
-    """
+    """Real devices, or any that were opened; ``close`` closes their rig."""
 
     def __init__(self, rig: Rig, name: str) -> None:
         self.rig, self.name = rig, name
@@ -635,13 +622,7 @@ class DeviceBench:
 
 
 def take_back(step: StepName, folder: Path) -> None:
-    """Take the latest placement or touch out of a step's recording.
-
-    Raises
-    ------
-    ArmscanError
-        If the recording is damaged, or cannot be written.
-    """
+    """Take the latest placement or touch out of a step's recording."""
     if BY_NAME[step].filling != "touches":
         grown = GrowingRecording.of(folder, read_recording(folder).session)
         grown.take_back()
@@ -674,18 +655,7 @@ def _later(grown: GrowingRecording, instant: MatchedInstant) -> int:
 
 
 def open_bench(rig: str) -> Bench:
-    """Open what fills a session.
-
-    Parameters
-    ----------
-    rig
-        Path of ``rig.toml``, or ``twin:HEAD?seed=1`` for the simulator.
-
-    Raises
-    ------
-    ArmscanError
-        If it is not there, or a device does not open.
-    """
+    """Open what fills a session: ``rig.toml``, or ``twin:HEAD?seed=1`` for the simulator."""
     if rig.startswith(TWIN):
         return TwinBench(rig)
     description = read_rig(Path(rig))

@@ -51,19 +51,7 @@ ArmReading = tuple[int, Pose[Base, Tool] | None, int]
 
 @dataclass(slots=True)
 class GrowingRecording:
-    """A folder recording that is whole after every `flush`.
-
-    Parameters
-    ----------
-    folder
-        What it holds already is kept.
-    session
-        Its facts; pixels as exposures deliver them.
-    rows
-        The exposures that are listed.
-    samples
-        Time, pose and trigger id of samples of the arm.
-    """
+    """A folder recording that is whole after every `flush`; what the folder holds is kept."""
 
     folder: Path
     session: Session
@@ -72,13 +60,7 @@ class GrowingRecording:
 
     @staticmethod
     def of(folder: Path, session: Session) -> GrowingRecording:
-        """That of a folder, empty if there is none.
-
-        Raises
-        ------
-        FileFormatError
-            If what is there is damaged.
-        """
+        """That of a folder, empty if there is none."""
         cameras = tuple(replace(one, align="low") for one in session.cameras)
         grown = GrowingRecording(folder, replace(session, cameras=cameras))
         if (folder / EXPOSURES_FILE).is_file():
@@ -89,13 +71,7 @@ class GrowingRecording:
         return grown
 
     def add(self, row: ExposureRow, exposure: Exposure) -> None:
-        """Write an image; `flush` lists it.
-
-        Raises
-        ------
-        OutputError
-            If the disk is full or refuses.
-        """
+        """Write an image; `flush` lists it."""
         content = encoded_png(exposure, self.session.cameras[row.camera])
         path = self.folder / row.source
         make_folder(path.parent, with_parents=True)
@@ -161,26 +137,14 @@ class Bench(Protocol):
         """How they are looked at where nothing else is said."""
 
     def see(self, seeing: SeeingSettings | None) -> None:
-        """Have cameras and lines looked at so from now; None for what the rig's description says.
-
-        Raises
-        ------
-        InputError
-            If windows do not fit the cameras.
-        """
+        """Look at cameras and lines so from now; None for what the rig's description says."""
 
     @property
     def n_placements(self) -> dict[StepName, int]:
         """Placements or touches of a step, where the rig knows them better than the list."""
 
     def take(self, step: StepName, folder: Path, k: int) -> tuple[Exposure, ...]:
-        """Record placement ``k`` of a step into a folder; returns an image of each camera to show.
-
-        Raises
-        ------
-        ArmscanError
-            If a device does not deliver, or the disk refuses.
-        """
+        """Record placement ``k`` of a step into a folder; returns an image a camera to show."""
 
     def touch(self, folder: Path, k: int) -> None:
         """Record touch ``k``; raises as `take`."""
@@ -189,11 +153,6 @@ class Bench(Protocol):
         """What each camera sees now, before placement ``k`` is taken; none if nothing is new.
 
         The lasers that the step is about are on meanwhile, until `rest`.
-
-        Raises
-        ------
-        ArmscanError
-            If a device does not open.
         """
 
     def rest(self) -> None:
@@ -216,22 +175,8 @@ class Bench(Protocol):
 class ScanRecorder(LiveRecorder):
     """Records a live scan to one file, and knows what came with which frame.
 
-    Parameters
-    ----------
-    path, rig
-        As of `LiveRecorder`.
-    keeps_times
-        Times are the devices' own, of one clock: a simulated hand arrives as fast as its images are
-        rendered, and this computer's time says nothing of it.
-
-    Attributes
-    ----------
-    pose_of
-        The tool's pose by the instant's number.
-    latest_joints_rad
-        (J,) angles of the arm, where it gives them.
-    n_left_out
-        Exposures that were taken back.
+    ``keeps_times``: times are the devices' own, of one clock: a simulated hand arrives as fast as
+    its images are rendered, and this computer's time says nothing of it.
     """
 
     def __init__(self, path: Path, rig: Rig, *, keeps_times: bool = False) -> None:
@@ -300,10 +245,6 @@ class LiveScan:
 
     Parameters
     ----------
-    bench
-        What is scanned with.
-    step
-        Scan, daily check or latency.
     path
         Of the recording, ``.mcap``; must not exist.
     scanner

@@ -47,20 +47,8 @@ STEEP_DEG = 60.0
 class ShownPoints:
     """Points to show, whatever they come from.
 
-    Parameters
-    ----------
-    points_mm
-        (N, 3) in their frame.
-    sheet
-        (N,) index of the sheet.
-    sigma_mm
-        (N,) standard deviation.
-    incidence_deg
-        (N,) angle between normal and line of sight; None where not known.
-    deviation_mm
-        (N,) from the model of the part; None where not compared.
-    limit_mm
-        At which deviation the colours end.
+    ``incidence_deg`` (N,) is the angle of normal and line of sight, ``deviation_mm`` (N,) from the
+    part's model; None where not known. Colours end at ``limit_mm``.
     """
 
     points_mm: FloatArray
@@ -134,13 +122,7 @@ def thinned(n: int, most: int = MOST_POINTS) -> slice:
 
 
 class SceneView:
-    """What stands in the browser's space; lengths in mm.
-
-    Parameters
-    ----------
-    server
-        Of the page.
-    """
+    """The browser's space; lengths in mm."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._scene = server.scene
@@ -208,14 +190,7 @@ class SceneView:
     ) -> None:
         """Draw the head where it is, with its light sheets, and the arm.
 
-        Parameters
-        ----------
-        pose
-            Of the tool; None to draw nothing.
-        scanner
-            What the head is.
-        arm_mm
-            (K, 3) from the arm's base along its axes to the tool; None for a straight line.
+        ``arm_mm``: (K, 3) from the arm's base along its axes to the tool; None for a straight line.
         """
         with self._server.atomic():
             for handle in self._head:

@@ -50,14 +50,9 @@ _patching = threading.Lock()
 
 @dataclass(frozen=True, slots=True)
 class Door:
-    """Decides which requests come in.
+    """Decides which requests come in: those of this computer's loopback address, or with the token.
 
-    Parameters
-    ----------
-    token
-        Whoever does not come from this computer, by its loopback address, must bring it.
-    folder_of_pages
-        Gives the folder whose HTML pages are served.
+    ``folder_of_pages`` gives the folder whose HTML pages are served.
     """
 
     token: str

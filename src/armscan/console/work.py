@@ -211,16 +211,7 @@ def run_step(
 ) -> StepResult:
     """Run a step's job on what was taken, and keep what it says in the session.
 
-    Parameters
-    ----------
-    folder
-        The session.
-    step, scan
-        Which job, and on which scan.
-    compare
-        What an inspection compares with, one of `INSPECTIONS`.
-    progress
-        Told of every step of the job.
+    ``compare``: what an inspection compares with, one of `INSPECTIONS`.
 
     Returns
     -------
@@ -272,12 +263,7 @@ def run_step(
 def recover_scans(folder: Path, progress: Progress = silent) -> tuple[str, ...]:
     """Make recordings that were cut short whole again, with all exposures that are.
 
-    Parameters
-    ----------
-    folder
-        The session, which nobody records into.
-    progress
-        Not told.
+    Nobody may record into the session meanwhile.
 
     Returns
     -------
@@ -309,19 +295,7 @@ def recover_scans(folder: Path, progress: Progress = silent) -> tuple[str, ...]:
 def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> tuple[bool, str]:
     """Whether what was taken last is of use, and what is seen in it, in words.
 
-    Parameters
-    ----------
-    folder
-        The session.
-    step
-        Camera, light sheets or hand-eye.
-    progress
-        Not told.
-
-    Raises
-    ------
-    ArmscanError
-        If the recording or the target's specification is damaged.
+    ``step``: camera, light sheets or hand-eye.
     """
     journey = Journey(folder, read_settings(folder / SETTINGS_FILE))
     source = read_recording(journey.recording(step))
@@ -526,13 +500,7 @@ def _advice(journey: Journey, step: StepName, result: StepResult) -> str:
 
 
 def write_report(journey: Journey) -> Path:
-    """Write the session's page: every step, its verdict and values, and links to its own page.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Write the session's page: every step, its verdict and values, and links to its own page."""
     sections = []
     for step in journey.steps:
         for scan in journey.scans if step.name in OF_A_SCAN else ("",):

@@ -19,7 +19,7 @@ from math import hypot, inf, sqrt
 import numpy as np
 
 from armscan.errors import EstimationError
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 
 FIRST_BLOCK = 4
@@ -53,8 +53,6 @@ class ClockFit:
         Part by which the other clock runs faster.
     sigma_offset_ns, sigma_drift
         Standard deviations of ``other_ns`` and of the drift, which do not correlate.
-    last_device_ns
-        Latest time that the fit rests on.
     scatter_ns
         Of the fastest elements of the blocks about the line.
     """
@@ -64,23 +62,12 @@ class ClockFit:
     drift: float
     sigma_offset_ns: float
     sigma_drift: float
-    last_device_ns: int
     scatter_ns: float
 
     def to_other_ns(self, t_device_ns: int) -> int:
         """Time of the other clock, in whole ns."""
         since = t_device_ns - self.device_ns
         return self.other_ns + since + round(self.drift * since)
-
-    def to_device_ns(self, t_other_ns: int) -> int:
-        """Time of the device's clock, in whole ns."""
-        since = t_other_ns - self.other_ns
-        return self.device_ns + since - round(since * (self.drift / (1.0 + self.drift)))
-
-    def all_to_other_ns(self, t_device_ns: IntArray) -> IntArray:
-        """Times (N,) of the other clock."""
-        since = np.asarray(t_device_ns, dtype=np.int64) - self.device_ns
-        return np.asarray(self.other_ns + since + np.rint(self.drift * since).astype(np.int64))
 
     def sigma_ns(self, t_device_ns: int) -> float:
         """Standard deviation of `to_other_ns`, the constant least delay apart."""
@@ -92,13 +79,6 @@ class ClockModel:
 
     `add` takes a microsecond; once a block it fits anew. The state has a fixed size.
     A clock that jumped, or a transport that became slower for good, starts it anew.
-
-    Attributes
-    ----------
-    fit
-        `ClockFit`, or why there is none yet.
-    n_jumps
-        How often it began anew.
     """
 
     def __init__(self) -> None:
@@ -230,10 +210,7 @@ def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
     leaves out pairs that are late as a whole; then fits by least squares and lowers the line by
     the scatter, by which the mean of delays with a hard lower limit lies above that limit.
 
-    Parameters
-    ----------
-    fastest
-        (device, other) times in ns, in time order, each the fastest of a block.
+    Pairs of times (device, other) in ns are in time order, each the fastest of a block.
     """
     if len(fastest) < FEWEST_BLOCKS:
         return FitFailure(f"{len(fastest)} of {FEWEST_BLOCKS} blocks of elements are complete")
@@ -264,7 +241,6 @@ def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
         drift=drift,
         sigma_offset_ns=hypot(known / sqrt(n), RESOLUTION_NS),
         sigma_drift=known / sqrt(spread),
-        last_device_ns=fastest[-1][0],
         scatter_ns=scatter,
     )
 
@@ -363,13 +339,6 @@ class StreamMonitor:
     """Watches count and times of one device's stream and keeps the model of its clock.
 
     Call `check` for every element in the order of arrival; then ask `clock` for its time.
-
-    Attributes
-    ----------
-    clock
-        From the device's clock to this computer's.
-    counts
-        What was seen so far.
     """
 
     def __init__(self) -> None:
@@ -390,15 +359,7 @@ class StreamMonitor:
         return not self.clock.missing(self._t_device_ns)
 
     def check(self, number: int, t_device_ns: int, t_host_ns: int) -> ElementStatus:
-        """Take one element.
-
-        Parameters
-        ----------
-        number
-            The device's count.
-        t_device_ns, t_host_ns
-            When it was taken by the device's clock, and when it arrived by this computer's.
-        """
+        """Take one element by its count and its times by the device's and this computer's clock."""
         self.counts.n_elements += 1
         last = self._number
         if last is not None and number <= last:

@@ -22,13 +22,6 @@ class Inbox(Generic[T]):
 
     Where nobody reads, the oldest are lost: elements bear the device's own count, which shows it.
 
-    Parameters
-    ----------
-    name
-        What messages call the device.
-    most
-        Elements that it holds.
-
     Attributes
     ----------
     n_lost
@@ -67,13 +60,7 @@ class Inbox(Generic[T]):
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> T | None:
-        """The oldest element; None if none came in time.
-
-        Raises
-        ------
-        DeviceError
-            If the device failed, or if this is called after `close`.
-        """
+        """The oldest element; None if none came in time."""
         found = self._take(timeout_s, 1)
         return found[0] if found else None
 
@@ -133,15 +120,7 @@ class Inbox(Generic[T]):
 
 
 class DeviceClock:
-    """A device's clock: an offset, a drift, and jumps on demand.
-
-    Parameters
-    ----------
-    offset_ns, drift
-        What it shows at ``zero_ns`` and by how much it runs faster.
-    zero_ns
-        Of this computer's monotonic clock.
-    """
+    """A device's clock: offset at ``zero_ns`` of this computer's, a drift, and jumps on demand."""
 
     def __init__(self, offset_ns: int, drift: float, zero_ns: int) -> None:
         self.offset_ns = offset_ns
@@ -157,19 +136,8 @@ class DeviceClock:
 class FaultyLine(Generic[T]):
     """From a device that is played to its reader: clock, delay, and faults on demand.
 
-    Parameters
-    ----------
-    name
-        What messages call the device.
-    most
-        Elements that its inbox holds.
-    clock
-        The device's.
-    delay_ns, spread_ns
-        Least time on the way, and the mean of what comes on top by chance, exponentially
-        distributed as on a busy computer.
-    rng
-        Of that chance.
+    The mean of what comes on top of the least delay is ``spread_ns``, by chance, exponentially
+    distributed as on a busy computer.
     """
 
     def __init__(

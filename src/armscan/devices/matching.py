@@ -222,10 +222,7 @@ class InstantMatcher:
     def take(self, now_ns: int) -> tuple[MatchedInstant, ...]:
         """Instants that are complete, or have waited long enough, in the order of their frames.
 
-        Parameters
-        ----------
-        now_ns
-            All that arrived before this time, by this computer's monotonic clock, was added.
+        All that arrived before ``now_ns``, by this computer's monotonic clock, was added.
         """
         done: list[MatchedInstant] = []
         while self._open:

@@ -31,8 +31,6 @@ class DeviceInfo:
     ----------
     address
         Opens it, for example ``webcam:0`` or ``tcp:127.0.0.1:4712``.
-    kind
-        What it is.
     label
         Maker, model and serial number, as far as the device says.
     """
@@ -82,8 +80,6 @@ class CameraSettings:
 
     Parameters
     ----------
-    exposure_us, gain_db
-        Exposure time and gain.
     rate_hz
         Frames a second, where the camera triggers itself.
     window
@@ -313,8 +309,6 @@ class DeviceDriver(Protocol):
     def open(self, kind: DeviceKind, place: str) -> Camera | Arm | LaserController:
         """Open the device at the rest of its address.
 
-        Raises
-        ------
-        DeviceError
-            If it is not there, taken, or no device of that kind.
+        Raises `DeviceError` if it is not there, taken, or no device of that kind; `OptionError` if
+        the address cannot be read.
         """

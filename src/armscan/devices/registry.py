@@ -59,14 +59,7 @@ def open_device(kind: Literal["lasers"], address: str) -> LaserController: ...
 @overload
 def open_device(kind: DeviceKind, address: str) -> Camera | Arm | LaserController: ...
 def open_device(kind: DeviceKind, address: str) -> Camera | Arm | LaserController:
-    """Open the device at an address.
-
-    Parameters
-    ----------
-    kind
-        What it is.
-    address
-        Driver and place, for example ``tcp:127.0.0.1:4712``.
+    """Open the device at an address: driver and place, for example ``tcp:127.0.0.1:4712``.
 
     Raises
     ------
@@ -76,8 +69,6 @@ def open_device(kind: DeviceKind, address: str) -> Camera | Arm | LaserControlle
         If a package that the driver needs is not installed.
     DeviceTakenError
         If somebody else has the device open.
-    DeviceError
-        If it is not there, does not answer, or is not of that kind.
     """
     name, _, place = address.partition(":")
     driver = _load(_entry_point(name, address))
@@ -149,14 +140,7 @@ def _load(point: EntryPoint) -> DeviceDriver:
 
 
 def needed_package(module: str, install: str) -> Any:
-    """Import what a driver needs when it is first used.
-
-    Parameters
-    ----------
-    module
-        To import, for example ``pypylon.pylon``.
-    install
-        How to get it, as an imperative: ``pip install 'armscan[pylon]'``.
+    """Import what a driver needs when it is first used; ``install`` says how to get it.
 
     Raises
     ------

@@ -284,16 +284,6 @@ class StreamedArm:
     """See `armscan.devices.protocols.Arm`.
 
     A connection that ends is told of by `read`, and opened again when the arm is there again.
-
-    Parameters
-    ----------
-    scheme, place
-        Kind of the link and its address.
-
-    Raises
-    ------
-    DeviceError
-        If there is no connection, or nothing that comes is a frame of an arm.
     """
 
     def __init__(self, scheme: type[TcpLink] | type[SerialLink], place: str) -> None:
@@ -391,13 +381,7 @@ class StreamedArm:
 
 @dataclass(frozen=True, slots=True)
 class ArmStreamDriver:
-    """Opens ``tcp:HOST:PORT`` or ``serial:PORT:BAUD``.
-
-    Parameters
-    ----------
-    link
-        Which of the two.
-    """
+    """Opens ``tcp:HOST:PORT`` or ``serial:PORT:BAUD``."""
 
     link: Any
     kinds: tuple[DeviceKind, ...] = ("arm",)
@@ -409,15 +393,7 @@ class ArmStreamDriver:
         return ()
 
     def open(self, kind: DeviceKind, place: str) -> Arm:
-        """Connect to the arm at a place.
-
-        Raises
-        ------
-        DeviceError
-            If there is no connection, or what comes is no arm's stream.
-        OptionError
-            If the address cannot be read.
-        """
+        """Connect to the arm at a place."""
         return StreamedArm(self.link, place)
 
 

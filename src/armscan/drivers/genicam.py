@@ -63,8 +63,6 @@ class RawFrame:
 
     Parameters
     ----------
-    image
-        A copy of the pixels.
     number
         The camera's own count.
     t_camera_ns
@@ -120,11 +118,6 @@ class GenICamCamera:
         Opens it.
     trigger_line
         Where an external trigger comes in.
-
-    Raises
-    ------
-    DeviceError
-        If it cannot be opened, or its pixels cannot be read.
     """
 
     def __init__(
@@ -389,13 +382,7 @@ class _Count:
 
 
 def image_of(data: bytes, width: int, height: int, form: str) -> ImageArray:
-    """An array of its own of (H, W) or (H, W, 3) pixels; missing bytes at the end are black.
-
-    Raises
-    ------
-    DeviceError
-        If the format of the pixels is not known.
-    """
+    """An array of its own of (H, W) or (H, W, 3) pixels; missing bytes at the end are black."""
     if form not in _FORMATS:
         raise DeviceError(
             f"pixels of the format {form} are not read",

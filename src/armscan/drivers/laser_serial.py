@@ -51,16 +51,6 @@ def sources_word(lasers: Sequence[str]) -> str:
 class SerialLasers:
     """See `armscan.devices.protocols.LaserController`.
 
-    Parameters
-    ----------
-    place
-        ``PORT:BAUD``.
-
-    Raises
-    ------
-    DeviceError
-        If the port cannot be opened, or nothing there speaks the protocol.
-
     Attributes
     ----------
     n_damaged
@@ -277,13 +267,7 @@ class LaserSerialDriver:
         return ()
 
     def open(self, kind: DeviceKind, place: str) -> LaserController:
-        """Open the controller at a port; its lasers are off then.
-
-        Raises
-        ------
-        DeviceError
-            If the port is not there or taken, or nothing there speaks the protocol.
-        """
+        """Open the controller at a port; its lasers are off then."""
         return SerialLasers(place)
 
 

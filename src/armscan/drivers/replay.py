@@ -80,19 +80,12 @@ class Playback:
 
     Parameters
     ----------
-    source
-        What is played.
     rate_hz
         Middle rate of the exposures of one camera; 0 for that of the recording.
     is_loop
         Begin anew at the end; triggers and times go on.
     is_ahead
         Read all images into memory first.
-
-    Raises
-    ------
-    DeviceError
-        If the recording has no exposures, or one of them cannot be read.
     """
 
     def __init__(
@@ -339,13 +332,7 @@ def _usual_step_ns(source: ScanSource) -> int:
 
 
 class _Played:
-    """What the devices of a recording have in common.
-
-    Attributes
-    ----------
-    rig
-        The recording that is played; faults are made there.
-    """
+    """What the devices of a recording have in common."""
 
     def __init__(self, rig: Playback, device: str) -> None:
         rig.open(device)
@@ -491,15 +478,7 @@ class ReplayDriver:
         return ()
 
     def open(self, kind: DeviceKind, place: str) -> Camera | Arm | LaserController:
-        """Open one device of a recording.
-
-        Raises
-        ------
-        DeviceError
-            If there is no such recording, or it has no such device.
-        OptionError
-            If the address cannot be read.
-        """
+        """Open one device of a recording."""
         plan, camera = _plan(place)
         with _PLAYED_LOCK:
             rig = _PLAYED.get(plan) or _playback(plan)

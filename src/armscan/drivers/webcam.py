@@ -42,17 +42,10 @@ class Webcam:
     ----------
     place
         Number of the camera as the system counts them, or path of a video file.
-    is_grey
-        Deliver grey images.
     rate_hz
         Of a file; 0 for its own.
     is_loop
         Begin a file anew at its end.
-
-    Raises
-    ------
-    DeviceError
-        If there is no such camera or file, or it gives no image.
     """
 
     def __init__(self, place: str, *, is_grey: bool, rate_hz: float, is_loop: bool) -> None:
@@ -204,15 +197,7 @@ class WebcamDriver:
         return tuple(found)
 
     def open(self, kind: DeviceKind, place: str) -> Camera:
-        """Open a webcam or a video file.
-
-        Raises
-        ------
-        DeviceError
-            If it is not there or taken, or gives no image.
-        OptionError
-            If the address cannot be read.
-        """
+        """Open a webcam or a video file."""
         path, options = split_place(place, ("colour", "rate", "loop"))
         colour, loop = options.get("colour", "mono"), options.get("loop", "0")
         if not path or colour not in ("mono", "rgb") or loop not in ("0", "1"):

@@ -64,12 +64,7 @@ class SpoolPiece:
 class PointSpool:
     """Points of exposures in one frame, appended one exposure after another.
 
-    Parameters
-    ----------
-    frame, sheet_names
-        As of `PointCloud`.
-    folder
-        Of its files, which are its own; None keeps everything in memory.
+    ``folder`` is that of its files, which are its own; None keeps everything in memory.
     """
 
     frame: CloudFrame

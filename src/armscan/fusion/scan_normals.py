@@ -142,15 +142,7 @@ def _rows_of(means: _MeansFile, rows: IntArray) -> FloatArray:
 
 @dataclass(slots=True, eq=False)
 class ScanNormals:
-    """Tangent planes of a spool's points, as `armscan.reconstruction.place.estimate_normals`.
-
-    Parameters
-    ----------
-    spool
-        The points.
-    radius_mm
-        Points within this distance make a point's tangent plane.
-    """
+    """Tangent planes of a spool's points, as `armscan.reconstruction.place.estimate_normals`."""
 
     spool: PointSpool
     radius_mm: float

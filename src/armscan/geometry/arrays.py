@@ -289,15 +289,9 @@ class RowRecord(ArrayRecord):
 
     @classmethod
     def concat(cls, parts: Sequence[Self], **changes: Any) -> Self:
-        """The rows of all ``parts``, in turn.
+        """The rows of all ``parts``, in turn, with ``changes`` as for `dataclasses.replace`.
 
-        Parameters
-        ----------
-        parts
-            One record at least.
-        changes
-            Fields to set instead, as for `dataclasses.replace`. Fields that do not count rows must
-            otherwise be the same in all parts.
+        Other fields that do not count rows must be the same in all parts.
 
         Raises
         ------

@@ -20,8 +20,6 @@ class Estimate(ArrayRecord, Generic[T]):
 
     Parameters
     ----------
-    value
-        The estimate.
     parameter_names
         Names with units of the P free parameters, in the order of ``covariance``.
     covariance

@@ -35,8 +35,6 @@ class Shape(ArrayRecord):
 
     Parameters
     ----------
-    kind
-        Which of them.
     point_mm
         (3,) a point of the plane, line or axis; the centre of a circle or sphere. After a fit it is
         the one nearest to the points' middle.
@@ -305,20 +303,8 @@ def fit_shape(
 
     A circle is fitted within the least-squares plane of its points, as is usual in metrology.
 
-    Parameters
-    ----------
-    kind
-        What to fit.
-    points_mm
-        (N, 3) points.
-    start
-        Where to begin; without one it is looked for.
-
-    Returns
-    -------
-    Estimate
-        Covariance of `parameter_names`, the noise taken from the residuals (zero without
-        redundancy); residuals (R,) in mm, two a point of a line; chi2 in units of that noise.
+    Covariance of `parameter_names`, the noise taken from the residuals (zero without redundancy);
+    residuals (R,) in mm, two a point of a line; chi2 in units of that noise.
 
     Raises
     ------
@@ -478,15 +464,7 @@ N_STARTS = 6
 
 
 def starts_of(kind: ShapeKind, points_mm: FloatArray) -> tuple[Shape, ...]:
-    """Shapes from which a fit to points (N, 3) may begin, the best first; none if there are none.
-
-    Parameters
-    ----------
-    kind
-        What to look for.
-    points_mm
-        (N, 3) points about their mean.
-    """
+    """Shapes from which a fit to points (N, 3) about their mean may begin, the best first."""
     spread = np.linalg.svd(points_mm, full_matrices=False)[2]
     main = np.stack([*spread[:2], np.cross(spread[0], spread[1])])
     if kind in ("plane", "line"):

@@ -136,15 +136,7 @@ class Whitening:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DenseSystem:
-    """Whitened residuals and their Jacobian at a state.
-
-    Parameters
-    ----------
-    residuals
-        (N,) whitened.
-    jacobian
-        (N, K) derivative by the step.
-    """
+    """Whitened residuals (N,) and their Jacobian (N, K) by the step at a state."""
 
     residuals: FloatArray
     jacobian: FloatArray
@@ -183,19 +175,7 @@ class DenseSystem:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Minimum(Generic[S, L]):
-    """Where a search ended.
-
-    Parameters
-    ----------
-    state
-        The best state.
-    system
-        The problem linearised there.
-    chi2
-        The minimum.
-    is_settled
-        False if the steps ran out.
-    """
+    """Where a search ended; ``is_settled`` is False if the steps ran out."""
 
     state: S
     system: L
@@ -213,24 +193,10 @@ def levenberg_marquardt(
 ) -> Minimum[S, DenseSystem] | None:
     """Minimise the sum of squared residuals over a state.
 
-    Parameters
-    ----------
-    start
-        Where to begin.
-    linearise
-        Whitened residuals (N,) at a state and their derivative (N, K) by a step from it, or None
-        where the state is impossible.
-    retract
-        The state after a step (K,).
-    settled
-        Part of chi2 by which a step must lower it.
-    max_steps
-        Most evaluations.
-
-    Returns
-    -------
-    Minimum
-        None if the start is impossible.
+    ``linearise`` gives whitened residuals (N,) at a state and their derivative (N, K) by a step
+    from it, or None where the state is impossible, as the start may be; ``retract`` the state after
+    a step (K,). It ends where a step lowers chi2 by less than the part ``settled``, or after
+    ``max_steps`` evaluations.
     """
 
     def evaluate(state: S) -> tuple[float, DenseSystem] | None:
@@ -257,17 +223,9 @@ def minimise(
 ) -> Minimum[S, L] | None:
     """Levenberg-Marquardt's loop for systems that are not dense (see `levenberg_marquardt`).
 
-    Parameters
-    ----------
-    start
-        Where to begin.
-    evaluate
-        Chi2 at a state and whatever ``propose`` needs of it; None where it is impossible.
-    propose
-        For a damping relative to the diagonal: the state after the damped step, and the decrease
-        of chi2 that the linear model promises; None if there is no such step.
-    settled, max_steps
-        As for `levenberg_marquardt`.
+    ``evaluate`` gives chi2 at a state and whatever ``propose`` needs of it, or None where it is
+    impossible; ``propose``, for a damping relative to the diagonal, the state after the damped step
+    and the decrease of chi2 that the linear model promises, or None.
     """
     found = evaluate(start)
     if found is None:

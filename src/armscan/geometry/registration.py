@@ -38,14 +38,9 @@ it would be uncertain by more than a tenth of a radian."""
 
 
 class PointPairs(RowRecord):
-    """The same N points in two frames, A and B, each with its covariance.
+    """The same N points in two frames, A and B, each with its covariance (N, 3, 3).
 
-    Parameters
-    ----------
-    points_a_mm, points_b_mm
-        (N, 3).
-    covariance_a_mm2, covariance_b_mm2
-        (N, 3, 3), independent between points and lists; their sum is positive definite.
+    These are independent between points and lists; their sum is positive definite.
     """
 
     points_a_mm: FloatArray = floats("N", 3)
@@ -58,14 +53,9 @@ class PointPairs(RowRecord):
 class PointMisfit(Generic[A]):
     """How far each point of one list is from where all the others put it, in A.
 
-    Parameters
-    ----------
-    offset_mm
-        (N, 3) the point in A minus the point of B carried there by the motion that the OTHER
-        points determine; NaN where these determine none.
-    chi2
-        (N,) the offset's square in units of its covariance: chi-square of three degrees if the
-        point did not move.
+    ``offset_mm`` (N, 3) is the point in A minus that of B carried there by the motion that the
+    OTHERS determine, NaN where these determine none; ``chi2`` (N,) its square in units of its
+    covariance, of three degrees if the point did not move.
     """
 
     offset_mm: FloatArray
@@ -107,13 +97,9 @@ def register_points(pairs: PointPairs) -> Estimate[Pose[A, B]] | FitFailure:
     Gauss-Newton from the closed form; the weight of a pair is the inverse of
     ``C_a + R C_b R'`` at the rotation found.
 
-    Returns
-    -------
-    Estimate
-        Covariance of `REGISTRATION_PARAMETERS`, by the covariances given. Residuals: (N, 3) in mm,
-        point in A minus carried point of B, in A.
-    FitFailure
-        With fewer than three points, or points on a line.
+    Covariance of `REGISTRATION_PARAMETERS`, by the covariances given; residuals (N, 3) in mm, point
+    in A minus carried point of B, in A. There is none of fewer than three points, or points on a
+    line.
 
     Raises
     ------
@@ -155,15 +141,7 @@ def register_points(pairs: PointPairs) -> Estimate[Pose[A, B]] | FitFailure:
 
 
 def misfits(pairs: PointPairs, fit: Estimate[Pose[A, B]]) -> PointMisfit[A]:
-    """Each point's offset from where the others put it (deleted residuals, Baarda's test).
-
-    Parameters
-    ----------
-    pairs
-        What was registered.
-    fit
-        Its registration, with every point in it.
-    """
+    """Each point's offset from where the others put it (deleted residuals, Baarda's test)."""
     residuals, jacobian, weights = _linearised(pairs, fit.value)
     covariance = np.linalg.inv(weights)
     own = covariance - jacobian @ fit.covariance @ np.swapaxes(jacobian, 1, 2)

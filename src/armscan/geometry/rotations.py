@@ -66,20 +66,7 @@ def nearest_rotation(matrix: FloatArray) -> FloatArray:
 
 
 def slerp(start: FloatArray, end: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Turn from ``start`` towards ``end`` by a part of the shortest way.
-
-    Parameters
-    ----------
-    start, end
-        (N, 3, 3) proper rotations.
-    fraction
-        (N,) part of the way, 0 at the start and 1 at the end.
-
-    Returns
-    -------
-    FloatArray
-        (N, 3, 3) ``start exp(fraction log(start' end))``.
-    """
+    """Turn (N, 3, 3) from ``start`` to ``end`` by a part (N,) of the shortest way."""
     if len(start) == 0:
         return np.zeros((0, 3, 3))
     first = Rotation.from_matrix(start)

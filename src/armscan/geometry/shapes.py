@@ -66,15 +66,7 @@ class Plane(ArrayRecord, kw_only=False):
 
 
 def fit_line(points: FloatArray, weights: FloatArray | None = None) -> Line | FitFailure:
-    """Fit a line to (N, D) points: least sum of squared distances.
-
-    Parameters
-    ----------
-    points
-        (N, D) points.
-    weights
-        (N,) one over variance, or None for equal ones.
-    """
+    """Fit a line to (N, D) points: least squared distances, weighted by 1 / variance (N,)."""
     points = np.asarray(points, dtype=np.float64)
     w = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
     if int((w > 0.0).sum()) < 2:
@@ -125,22 +117,14 @@ def fit_plane(
 ) -> Estimate[Plane] | FitFailure:
     """Fit a plane to (N, 3) points: least sum of squared distances along the normal.
 
-    Parameters
-    ----------
-    points_mm
-        (N, 3) points.
-    prior_sigma_mm, prior_freedom
-        What is known of a point's noise beforehand, and how many degrees of freedom that is worth:
-        the noise's variance is (prior_freedom prior_sigma_mm^2 + squared residuals) /
-        (prior_freedom + N - 3). That is the expected variance if it was drawn from the scaled
-        inverse chi-square distribution of prior_freedom + 2 degrees and that mean.
+    ``prior_sigma_mm`` and ``prior_freedom`` are what is known of a point's noise beforehand, and
+    how many degrees of freedom that is worth: the noise's variance is (prior_freedom
+    prior_sigma_mm^2 + squared residuals) / (prior_freedom + N - 3). That is the expected variance
+    if it was drawn from the scaled inverse chi-square distribution of prior_freedom + 2 degrees and
+    that mean.
 
-    Returns
-    -------
-    Estimate
-        Covariance of `PLANE_PARAMETERS` (tilts about the centroid along axis 1 and 2, offset);
-        without a prior the noise is taken from the residuals alone, and is zero for three points;
-        residuals in mm; chi2 in units of that noise.
+    Covariance of `PLANE_PARAMETERS` (tilts about the centroid along axis 1 and 2, offset), zero for
+    three points without a prior; residuals in mm; chi2 in units of the noise.
     """
     points = np.asarray(points_mm, dtype=np.float64)
     n = len(points)
@@ -219,20 +203,10 @@ def fit_sphere(
 ) -> Estimate[Sphere] | FitFailure:
     """Fit a sphere to (N, 3) points: least sum of squared distances (the Gaussian sphere).
 
-    Parameters
-    ----------
-    points_mm
-        (N, 3) points; four at least, and not all on one plane.
-    outlier_sigmas
-        Reject points further from the surface than this many robust standard deviations, after a
-        start by least median of squares; None to use all.
-
-    Returns
-    -------
-    Estimate
-        Covariance of `SPHERE_PARAMETERS`, the size of the noise taken from the residuals (zero
-        without redundancy). Residuals: (N,) distance of every point in mm, positive outside, of
-        rejected points too. ``chi2`` in units of that noise.
+    Points further from the surface than ``outlier_sigmas`` robust standard deviations are rejected,
+    after a start by least median of squares; None uses all. Covariance of `SPHERE_PARAMETERS`, the
+    noise taken from the residuals (zero without redundancy); residuals (N,) of every point in mm,
+    positive outside, of rejected points too; chi2 in units of that noise.
 
     Raises
     ------

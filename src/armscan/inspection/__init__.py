@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured points against what a part should be: planes, balls, steps."""
+"""Measured points against what a part should be: planes, balls, steps.
+
+Too few points are an `InputError`; a feature that is not there is a `FitFailure`.
+"""
 
 import lazy_loader
 

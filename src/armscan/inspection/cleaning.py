@@ -36,16 +36,12 @@ class CleaningOptions:
 
     Parameters
     ----------
-    region
-        Keep only points inside.
     max_incidence_deg
         Largest angle between the surface's normal and the direction to the sensor.
     isolated_mm
         Take out points with fewer than `FEWEST_NEIGHBOURS` others within this radius.
     hole_mm
         A gap along a stripe wider than this ends a piece of it; narrower ones do not.
-    line_deviation_mm
-        Largest distance of a point from the line through its neighbours on the piece.
     line_spacing_mm
         Largest distance to the nearer neighbour along the stripe: sparse points are dust.
     edge_mm
@@ -140,18 +136,8 @@ class Cleaning(ArrayRecord):
         return tuple(found)
 
 
-Filter = Callable[[PointCloud, float, CleaningOptions], BoolArray]
-
-
 def clean_cloud(cloud: PointCloud, options: CleaningOptions) -> Cleaning:
     """Take points out of a cloud, each filter of what those before it left.
-
-    Parameters
-    ----------
-    cloud
-        Points in any frame.
-    options
-        Which filters, and how much they let pass.
 
     Raises
     ------

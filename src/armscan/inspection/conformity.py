@@ -45,20 +45,12 @@ class Check:
 
     Parameters
     ----------
-    name, definition
-        What was tested, in a few words and exactly.
-    unit
-        Of the numbers: mm, or sigma.
-    error
-        E.
     predicted
         Standard deviation of E that the calibration's covariance predicts.
     limit, limit_rule
         MPE and where it comes from.
     uncertainty, uncertainty_rule
         U and what it holds.
-    verdict
-        By `RULE`.
     """
 
     name: str
@@ -100,21 +92,10 @@ def check_size(
 ) -> Check:
     """Check a size or a place.
 
-    Parameters
-    ----------
-    name, definition
-        What it is.
-    error_mm
-        Measured minus nominal.
-    sigma_calibration_mm
-        Standard deviation that the calibration's covariance predicts.
-    sigma_scan_mm
-        Standard deviation that the scan adds by its own scatter.
-    reference_u_mm
-        Expanded uncertainty (k = 2) of the nominal value.
-    mpe_mm
-        Limit; if None it follows from ``sigma_calibration_mm``, so that a calibration that is as
-        good as it says passes.
+    ``sigma_calibration_mm``: standard deviation that the calibration's covariance predicts.
+    ``sigma_scan_mm``: standard deviation that the scan adds by its own scatter. ``reference_u_mm``:
+    expanded uncertainty (k = 2) of the nominal value. ``mpe_mm``: limit; if None it follows from
+    ``sigma_calibration_mm``, so that a calibration that is as good as it says passes.
     """
     if mpe_mm is not None and not mpe_mm > 0.0:
         raise InputError(f"a limit of {mpe_mm} mm", remedy="give a positive --mpe")
@@ -140,13 +121,7 @@ def check_size(
 
 
 def check_contradictions(found: tuple[str, ...]) -> Check:
-    """Whether arm, clock and images contradict each other, whatever the standard says.
-
-    Parameters
-    ----------
-    found
-        Each contradiction in words.
-    """
+    """Whether arm, clock and images contradict each other, whatever the standard says."""
     return Check(
         name="contradictions",
         definition="places at which the arm's track, the clock or passes of this scan contradict "
@@ -356,15 +331,6 @@ def check_exposures_off(
 ) -> Check | None:
     """Count exposures that show the standard somewhere else than the fit has it.
 
-    Parameters
-    ----------
-    cloud
-        All points.
-    found
-        The fit.
-    within
-        (N,) points in the region that was asked for.
-
     Returns
     -------
     Check
@@ -424,17 +390,13 @@ def _near_plate(cloud: PointCloud, found: PlaneInspection, within: BoolArray) ->
     local = (cloud.points_mm - found.plane.point_mm) @ found.plane.axes.T
     rows = np.flatnonzero(within & (np.abs(local[:, 2]) <= PLATE_MM))
     try:
-        outline = Delaunay(local[found.rows[found.is_fitted], :2][_hull_sample(found)])
+        fitted = local[found.rows[found.is_fitted], :2]
+        outline = Delaunay(fitted[:: max(1, len(fitted) // 20_000)])
     except QhullError:
         rows = rows[:0]
     else:
         rows = rows[outline.find_simplex(local[rows, :2]) >= 0]
     return _Near(rows, local[rows, 2], np.broadcast_to(found.plane.normal, (len(rows), 3)))
-
-
-def _hull_sample(found: PlaneInspection) -> slice:
-    """Few enough points for an outline."""
-    return slice(None, None, max(1, int(found.is_fitted.sum()) // 20_000))
 
 
 def _second_ball(cloud: PointCloud, found: SphereInspection, rest: BoolArray) -> set[int]:

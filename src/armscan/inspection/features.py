@@ -80,22 +80,12 @@ class FeatureInspection(ArrayRecord):
 
     Parameters
     ----------
-    wanted
-        What was looked for.
-    shape
-        The least-squares shape.
     rows
         (N,) rows of the feature's points in the cloud.
     is_fitted
         (N,) True for those that the fit used.
-    counts
-        What became of the points.
-    fitted
-        Distances from ``shape``.
     nominal
         The same with the nominal diameter or half angle; None without one.
-    diameter
-        Fitted; None for a kind without one.
     half_angle
         Of a cone; else None.
     direction_sigma_rad
@@ -142,22 +132,7 @@ class FeatureInspection(ArrayRecord):
 def inspect_feature(
     cloud: PointCloud, wanted: WantedFeature, options: InspectionOptions | None = None
 ) -> FeatureInspection | FitFailure:
-    """Find a feature in a cloud, fit it, and say how well it is known.
-
-    Parameters
-    ----------
-    cloud
-        Points in any frame; other faces may be among them.
-    wanted
-        What is looked for.
-    options
-        Which points belong to it; the default if None.
-
-    Raises
-    ------
-    InputError
-        If there are too few points.
-    """
+    """Find a feature in a cloud, fit it, and say how well it is known."""
     selection = select(cloud, wanted.region, options)
     sample = sample_of(selection)
     start = find_shape(sample, wanted)
@@ -195,19 +170,7 @@ def inspect_points(
 ) -> FeatureInspection | FitFailure:
     """Fit a feature to points that are known to be of it, as those of a face of the part's model.
 
-    Parameters
-    ----------
-    cloud
-        The points, and no others.
-    wanted
-        What they are points of.
-    rule
-        How they were chosen, in words, after "points".
-
-    Raises
-    ------
-    InputError
-        If there are too few points.
+    ``rule`` is how they were chosen, in words, after "points".
     """
     selection = select(cloud, wanted.region, None)
     points = selection.points_mm
@@ -481,14 +444,10 @@ class Relation:
 
     Parameters
     ----------
-    first, second
-        The features.
     distance
         Between them, as ``distance_text`` defines it; None where they cross.
     angle
         Between their directions, or of a line to a plane; None where one has none.
-    distance_text, angle_text
-        What was measured, in words.
     parallelism, perpendicularity
         Width of the zone, parallel or square to the second feature, that holds the first one's
         fitted plane or axis as far as its points reach (ISO 1101 orientation; its form is not in

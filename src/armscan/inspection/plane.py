@@ -11,7 +11,6 @@ from armscan.geometry.arrays import Box, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Plane, fit_plane
 from armscan.inspection.results import (
-    MeasuredLength,
     PlaneInspection,
     PointCounts,
     describe_deviations,
@@ -41,24 +40,9 @@ def inspect_plane(
 ) -> PlaneInspection | FitFailure:
     """Inspect a flat face.
 
-    Parameters
-    ----------
-    cloud
-        Points in any frame.
-    reference
-        The plane to be met, in the same frame; without it the plane that most points lie near is
-        looked for, and only the fitted reference is reported.
-    reference_text
-        Where it came from, for the definitions.
-    region
-        Only points inside are looked at.
-    options
-        What belongs to the face; the default if None.
-
-    Raises
-    ------
-    InputError
-        If there are too few points.
+    ``reference``: the plane to be met, in the same frame; without it the plane that most points lie
+    near is looked for, and only the fitted reference is reported. ``reference_text``: where it came
+    from, for the definitions.
     """
     selection = select(cloud, region, options)
     points = selection.points_mm
@@ -140,7 +124,11 @@ def _inspected(
         nominal = describe_deviations(
             reference.distance_mm(points), "nominal", reference_text, text
         )
-        offset = _offset(plane, reference, cloud, feature[is_fitted])
+        used = feature[is_fitted]
+        height = float(reference.distance_mm(plane.point_mm[None, :])[0])
+        offset = measured_length(
+            height, linearised_plane(plane, cloud.points_mm[used]), cloud, used
+        )
         sine = np.linalg.norm(np.cross(plane.normal, reference.normal))
         tilt = 1000.0 * math.asin(min(1.0, float(sine)))
         is_on = np.abs(plane.distance_mm(selection.points_mm)) <= SEARCH_BAND_MM
@@ -193,9 +181,3 @@ def linearised_plane(plane: Plane, points_mm: FloatArray) -> FitLinearised:
         local[:, 2],
         np.array([0.0, 0.0, 1.0]),
     )
-
-
-def _offset(plane: Plane, reference: Plane, cloud: PointCloud, used: IntArray) -> MeasuredLength:
-    fit = linearised_plane(plane, cloud.points_mm[used])
-    height = float(reference.distance_mm(plane.point_mm[None, :])[0])
-    return measured_length(height, fit, cloud, used)

@@ -47,8 +47,6 @@ class RecipeFeature:
 
     Parameters
     ----------
-    name
-        Of the feature on the drawing.
     wanted
         What is looked for, in the model's frame.
     nominal, tolerance
@@ -74,16 +72,7 @@ RelationMeasure = Literal["distance", "angle", "parallelism", "perpendicularity"
 class RecipeRelation:
     """How two features of the recipe stand to each other, as `armscan.inspection.features.relate`.
 
-    Parameters
-    ----------
-    name
-        Of the relation.
-    of
-        Names of both features.
-    measure
-        What is measured.
-    nominal, tolerance
-        In mm, of an angle in degrees; NaN for none.
+    ``nominal`` and ``tolerance`` are in mm, of an angle in degrees; NaN for none.
     """
 
     name: str
@@ -102,16 +91,7 @@ class RecipeRelation:
 class RecipeStep:
     """A step between parallel faces, as `armscan.inspection.step.inspect_step` measures it.
 
-    Parameters
-    ----------
-    name
-        Of the step.
-    height_mm
-        Nominal height.
-    tolerance_mm
-        Of the height; NaN for none.
-    region
-        In the model's frame; None for the whole cloud.
+    ``tolerance_mm`` is NaN for none; ``region`` in the model's frame, None for the whole cloud.
     """
 
     name: str
@@ -122,22 +102,9 @@ class RecipeStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recipe:
-    """What is done with every part.
+    """What is done with every part; ``features``, ``relations`` and ``steps`` after the alignment.
 
-    Parameters
-    ----------
-    title
-        Of the inspection.
-    surface
-        Of the part's model; None to measure features alone, in the cloud's own frame.
-    align, datums
-        How the cloud is laid on it, and what that rests on.
-    options
-        Tolerances of the faces.
-    cleaning
-        Filters before all else; None for none.
-    features, relations, steps
-        What is measured after the alignment.
+    Without a ``surface`` features alone are measured, in the cloud's own frame.
     """
 
     title: str = ""
@@ -196,25 +163,8 @@ class PartQuantity:
 class FollowedRecipe:
     """What a recipe found on one part.
 
-    Parameters
-    ----------
-    cloud
-        After cleaning, in the cloud's own frame.
-    cleaning
-        What the filters took; None without filters.
-    errors_known
-        True if the cloud's covariances were used.
-    comparison
-        With the model; None without one.
-    placed
-        The same cloud where the features were measured: in Cad, or its own frame.
-    features
-        Those that were found, by name.
-    quantities
-        Each value: features, relations and steps as in the recipe, then the faces that have a
-        tolerance.
-    notes
-        What was not found, and why.
+    ``placed`` is the cloud where features were measured, in Cad or its own frame; ``quantities``
+    are in the recipe's order, then the faces that have a tolerance.
     """
 
     cloud: PointCloud
@@ -230,22 +180,10 @@ class FollowedRecipe:
 def follow_recipe(recipe: Recipe, cloud: PointCloud) -> FollowedRecipe | FitFailure:
     """Do with a cloud what a recipe says.
 
-    Parameters
-    ----------
-    recipe
-        As of `armscan.storage.parts.recipes.read_recipe`.
-    cloud
-        Of one part, in any frame.
-
     Returns
     -------
     FitFailure
         If the cloud cannot be laid on the model.
-
-    Raises
-    ------
-    InputError
-        If a filter needs what the cloud does not carry, or no point is left.
     """
     cleaning = None if recipe.cleaning is None else clean_cloud(cloud, recipe.cleaning)
     cleaned = cloud if cleaning is None else cleaning.cloud
@@ -466,24 +404,9 @@ def face_values(face: FaceComparison) -> tuple[PartQuantity, ...]:
 
 @dataclass(frozen=True, slots=True)
 class PartRow:
-    """One part in the table of all.
+    """One part in the table of all; without ``quantities`` and with a ``reason`` if not inspected.
 
-    Parameters
-    ----------
-    name
-        Of the part, and of its folder.
-    cloud
-        File that it was scanned to.
-    quantities
-        What was measured; empty if it was not.
-    notes
-        What a person should know, in words.
-    reason
-        Why it was not inspected; empty if it was.
-    n_points
-        Of the cloud after cleaning.
-    is_simulated, forced
-        As of the cloud.
+    ``n_points`` are those of the cloud after cleaning.
     """
 
     name: str

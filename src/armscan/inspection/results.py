@@ -35,12 +35,6 @@ class Statistic:
     ----------
     key
         Name for programs, with its unit.
-    label
-        Name for people.
-    value, unit
-        The number; NaN where it is not defined.
-    reference
-        What the deviations are counted from.
     formula
         How it follows from the deviations, in words.
     definition
@@ -57,19 +51,7 @@ class Statistic:
 
 
 class Deviations(ArrayRecord):
-    """Deviations of points from one reference.
-
-    Parameters
-    ----------
-    reference, reference_text
-        What they are counted from, as a kind and in words.
-    points_text
-        Which points these are, in words.
-    deviations_mm
-        (N,) signed, in the order of the points.
-    statistics
-        Of them.
-    """
+    """Deviations (N,) of points from one reference, signed, in the order of the points."""
 
     reference: ReferenceKind
     reference_text: str
@@ -119,8 +101,6 @@ class MeasuredLength:
 
     Parameters
     ----------
-    value_mm
-        The length.
     sigma_scatter_mm
         Standard deviation from what differs between exposures (jackknife over them, and over
         blocks of neighbours: the larger); NaN where there are too few.
@@ -152,20 +132,12 @@ class PlaneInspection(ArrayRecord):
 
     Parameters
     ----------
-    plane
-        Least-squares plane.
     reference
         The plane that was to be met, or None.
     rows
         (N,) rows of the feature's points in the cloud.
     is_fitted
         (N,) True for those that the fit used.
-    counts
-        What became of the points.
-    fitted
-        Distances from ``plane``.
-    nominal
-        Distances from ``reference``; None without one.
     offset
         Height of ``plane`` over ``reference`` at the middle of the points; None without one.
     tilt_mrad
@@ -194,14 +166,8 @@ class SphereInspection(ArrayRecord):
 
     Parameters
     ----------
-    sphere
-        Least-squares sphere, radius free.
-    nominal_diameter_mm
-        Of the standard ball.
     diameter
         Fitted, with its standard deviation.
-    rows, is_fitted, counts
-        As for a plane.
     fitted
         Distances from the fitted sphere: distance to its centre minus the fitted radius.
     nominal
@@ -231,20 +197,14 @@ class StepInspection(ArrayRecord):
         Rows of both faces' points in the cloud, margins taken off.
     normal
         (3,) common unit normal, from the lower face to the upper one.
-    nominal_height_mm
-        Of the standard.
     height
         Distance between the parallel planes that were fitted jointly.
-    counts
-        What became of the points.
     fitted
         Distances of the points of both faces from their own fitted plane.
     nominal
         Heights of the upper face's points over the fitted lower plane, minus the nominal height.
     heights_mm
         (U,) the same heights themselves (figure 5.19).
-    normal_rule
-        Where the normal came from, in words.
     """
 
     lower: IntArray = ints(None)
@@ -271,17 +231,7 @@ def within_key(limit_mm: float) -> str:
 
 
 class Histogram(ArrayRecord):
-    """Counts of deviations.
-
-    Parameters
-    ----------
-    edges_mm
-        (B + 1,) limits of the bins.
-    counts
-        (B,) points in each.
-    n_below, n_above
-        Points beyond the first and the last limit: shown as numbers, never dropped in silence.
-    """
+    """Counts of deviations: (B + 1,) limits of the bins, (B,) points in each, and those beyond."""
 
     edges_mm: FloatArray = floats(None)
     counts: IntArray = ints(None)
@@ -299,34 +249,24 @@ def histogram(values_mm: FloatArray, half_width_mm: float, n_bins: int = 81) -> 
     return Histogram(edges_mm=edges, counts=counts.astype(np.int64), n_below=below, n_above=above)
 
 
-def narrowest_shell_mm(values_mm: FloatArray, share: float = SHELL_SHARE) -> float:
-    """Width of the narrowest interval that holds a share of the values (P_Form D95 of 10360).
+def narrowest_shell_mm(values_mm: FloatArray) -> float:
+    """Width of the narrowest interval that holds 95 % of the values (P_Form D95 of 10360).
 
-    It holds ``ceil(share * n)`` values; NaN for no values.
+    It holds ``ceil(0.95 * n)`` values; NaN for no values.
     """
     n = len(values_mm)
     if n == 0:
         return math.nan
     ordered = np.sort(values_mm)
     # 0.95 * 20 is 19.000000000000004 or 18.999...: a rounding error must not cost a whole point
-    k = max(1, math.ceil(share * n - 1e-9))
+    k = max(1, math.ceil(SHELL_SHARE * n - 1e-9))
     return float((ordered[k - 1 :] - ordered[: n - k + 1]).min())
 
 
 def describe_deviations(
     deviations_mm: FloatArray, reference: ReferenceKind, reference_text: str, points_text: str
 ) -> Deviations:
-    """Deviations with their statistics, each defined in words.
-
-    Parameters
-    ----------
-    deviations_mm
-        (N,) signed deviations.
-    reference, reference_text
-        What they are counted from.
-    points_text
-        Which points they are of.
-    """
+    """Deviations (N,), signed, with their statistics, each defined in words."""
     d = np.asarray(deviations_mm, dtype=np.float64)
     n = len(d)
     mean, rms = (float(d.mean()), float(np.sqrt(d @ d / n))) if n else (math.nan, math.nan)

@@ -95,8 +95,6 @@ class WantedFeature:
 
     Parameters
     ----------
-    kind
-        Plane, line, circle, sphere, cylinder or cone.
     diameter_mm
         Nominal diameter of a circle, sphere or cylinder; None if there is none.
     diameter_range_mm

@@ -33,13 +33,9 @@ MIN_POINTS = 30
 
 @dataclass(frozen=True, slots=True)
 class InspectionOptions:
-    """Which points belong to a feature.
+    """Which points belong to a feature: those up to ``feature_mm`` from its surface.
 
-    Parameters
-    ----------
-    feature_mm
-        Points up to this far from the surface belong to the feature: every statistic counts them,
-        outliers included. Points further away are other objects and are only counted.
+    Every statistic counts them, outliers included; points further away are only counted.
     """
 
     feature_mm: float = 1.0

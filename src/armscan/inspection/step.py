@@ -277,24 +277,8 @@ def inspect_step(
     height is ``d cos(e)``, with e from ``normal`` if that is given, else zero. Only e is taken
     from ``normal``: a direct projection on it would turn an error of 0.1 degrees into 0.03 mm.
 
-    Parameters
-    ----------
-    cloud
-        Points in any frame.
-    height_mm
-        Nominal height.
-    normal
-        (3,) normal of the faces in the cloud's frame, from the arm's pose and a plate; used for a
-        single exposure only.
-    region
-        Only points inside are looked at.
-    options, step_options
-        What belongs to the faces; the defaults if None.
-
-    Raises
-    ------
-    InputError
-        If there are too few points, the height is not positive, or the normal is zero.
+    ``normal``: (3,) normal of the faces in the cloud's frame, from the arm's pose and a plate; used
+    for a single exposure only.
     """
     if not 0.0 < height_mm < 1e4:
         raise InputError(f"a step {height_mm} mm high", remedy="give the height in mm")
@@ -308,7 +292,9 @@ def inspect_step(
     if float(start @ section.axes @ _upwards(selection)) < 0.0:
         start = -start
     lean, _ = _lean(section, start @ section.axes, normal)
-    section = _unbowed(section, start, lean)
+    # points of a bowed sheet are moved along the faces, on which they lie, into the sheet's plane
+    moved = section.flat_mm + math.tan(lean) * section.out_mm[:, None] * start
+    section = replace(section, flat_mm=moved)
     # faces stand further apart within a sheet that leans
     within = height_mm / math.cos(lean)
     faces = find_levels(section.flat_mm, start, within, HEIGHT_TOLERANCE * within)
@@ -320,12 +306,6 @@ def inspect_step(
     if isinstance(chosen, FitFailure):
         return chosen
     return _measured(search, chosen, *_lean(section, chosen.faces.normal @ section.axes, normal))
-
-
-def _unbowed(section: _Section, towards: FloatArray, lean: float) -> _Section:
-    """Points of a bowed sheet moved along the faces, on which they lie, into the sheet's plane."""
-    moved = section.flat_mm + math.tan(lean) * section.out_mm[:, None] * towards
-    return replace(section, flat_mm=moved)
 
 
 def _explained(failure: FitFailure, section: _Section, normal: FloatArray | None) -> FitFailure:

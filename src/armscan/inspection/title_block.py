@@ -21,8 +21,6 @@ class TitleBlock:
 
     Parameters
     ----------
-    part, serial, order, customer, operator, instrument, temperature, remark
-        Texts; empty where nothing was told.
     calibration_valid_days
         How long a calibration of this instrument holds, as its owner has laid down; NaN where
         nothing is laid down.
@@ -97,16 +95,9 @@ class CalibrationState:
 def calibration_state(
     block: TitleBlock, marks: Sequence[CalibrationMark], now: datetime
 ) -> CalibrationState:
-    """How the calibrations of a cloud stand at a time.
+    """How the calibrations ``marks`` that a cloud names stand at a time.
 
-    Parameters
-    ----------
-    block
-        Tells how long a calibration holds, and which the instrument has.
-    marks
-        Calibrations that the cloud names.
-    now
-        Time of the inspection, with its time zone.
+    ``now`` has its time zone.
     """
     own = None if block.scanner is None else block.scanner.document_id
     used = tuple(marks) or (() if block.scanner is None else (block.scanner,))

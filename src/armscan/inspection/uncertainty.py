@@ -70,16 +70,7 @@ def measured_length(
 ) -> MeasuredLength:
     """A length with both of its standard deviations.
 
-    Parameters
-    ----------
-    value_mm
-        The length.
-    fit
-        What it follows from.
-    cloud
-        Source of covariances and exposures.
-    rows
-        (N,) rows in the cloud of the points of the fit.
+    ``rows`` (N,) are those in the cloud of the points of the fit.
     """
     numbers = cloud.exposure[rows]
     n = len(np.unique(numbers))

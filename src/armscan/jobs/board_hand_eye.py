@@ -35,7 +35,7 @@ from armscan.records.exposure import Exposure
 from armscan.report.board_hand_eye import board_hand_eye_page, board_quantities, look_table
 from armscan.report.hand_eye import TITLE, hand_eye_quantities
 from armscan.report.photographs import refused_page, tried_targets
-from armscan.report.quantity import Quantity, Summary, sentences, without_source
+from armscan.report.quantity import Quantity, Summary, plural, sentences, without_source
 from armscan.storage.arm import read_arm_model
 from armscan.storage.documents import (
     read_camera_calibration,
@@ -57,29 +57,19 @@ MOST_ROWS = 2 * MAX_LOOKS
 
 @dataclass(frozen=True, slots=True)
 class LookSource:
-    """Where the views of the target and the arm's poses are.
+    """Where the views of the target and the arm's poses are; `OptionError` if they do not go
+    together.
 
     Parameters
     ----------
-    images
-        Photographs: files, folders or patterns, in the order of the poses.
     poses
         Table of the robot's poses, one a photograph.
     euler
         What angles in ``poses`` mean; None for ``extrinsic-xyz``.
-    scan
-        Recording with an arm, instead of photographs.
     arm
         ``arm.toml`` for a recording of joint angles; None to look for it in the recording.
     camera, sensor
         The camera's calibration, by itself or as a part of ``sensor.json``.
-    leave_out
-        Images that are not used: names or patterns.
-
-    Raises
-    ------
-    OptionError
-        If these do not go together.
     """
 
     images: tuple[str, ...] = ()
@@ -144,25 +134,7 @@ def calibrate_hand_eye_on_board(
     options: HandEyeOptions | None = None,
     image_options: ImageOptions | None = None,
 ) -> Summary:
-    """Read, calibrate, write ``scanner.json``, ``.npz`` and ``.html``, and say what came out.
-
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json``.
-    source
-        What to calibrate from.
-    target
-        Specification of the target, which stays where it is.
-    options, image_options
-        The arm's scatter, where it is known, and how pixels are read.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the postures do not determine the
-        hand-eye; no document is written then. Where it is the postures, a page shows them.
-    """
+    """Read, calibrate, write ``scanner.json``, ``.npz`` and ``.html``, and say what came out."""
     options, image_options = options or HandEyeOptions(), image_options or ImageOptions()
     places = job.places(".json", beside=(".npz", ".html"))
     plate = parse_target(target)
@@ -267,7 +239,7 @@ def _scan_views(source: LookSource) -> _Views:
     n_used = min(len(posed), MOST_ROWS)
     chosen = [posed[k] for k in np.linspace(0, len(posed) - 1, n_used).round().astype(int)]
     n_other = sum(row.camera != 0 for row in recording.rows)
-    note = f"{n_other} exposures of other cameras than camera 0, which gives the hand-eye, not used"
+    note = f"{plural(n_other, 'exposure')} of other cameras not used: camera 0 gives the hand-eye"
     without = [(names[k], "the arm gave no pose for it") for k in dark or left if k not in posed]
     return _Views(
         exposures=tuple(recording.exposure(k) for k in chosen),
@@ -327,7 +299,8 @@ def _not_used_warnings(not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:
         return ()
     named = ", ".join(f"{source} ({without_source(source, why)})" for source, why in not_used[:4])
     more = f" and {len(not_used) - 4} more" if len(not_used) > 4 else ""
-    return (f"{len(not_used)} views were not used: {named}{more}",)
+    verb = "was" if len(not_used) == 1 else "were"
+    return (f"{plural(len(not_used), 'view')} {verb} not used: {named}{more}",)
 
 
 def _explained(failure: FitFailure, found: FoundTargets) -> FitFailure:

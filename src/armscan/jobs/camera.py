@@ -73,26 +73,7 @@ def calibrate_camera(
 ) -> Summary:
     """Read, calibrate, write ``camera.json``, ``.npz`` and ``.html``, and say what came out.
 
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json``.
-    target
-        Specification of the target.
-    images
-        Files, folders or patterns.
-    scan
-        Folder recording of the target, instead of images.
-    options, image_options
-        Of the calibration, and how pixels are read.
-    is_beside_thesis
-        Tell what the printed way to find circle centres gives of the same images.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the images do not determine the camera;
-        no document is written then. Where it is the images, a page shows them.
+    ``is_beside_thesis``: tell what the printed way to find circle centres gives of the same images.
     """
     options, image_options = options or CameraOptions(), image_options or ImageOptions()
     plate = parse_target(target)
@@ -167,20 +148,7 @@ def calibrate_camera_from_file(
 ) -> Summary:
     """Solve the camera of a document again from the observations beside it, and write it anew.
 
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json``.
-    camera_file
-        ``camera.json`` with its file of observations.
-    changes
-        Fields of `CameraOptions` that are not to be as the document records them.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable or keeps too little, or the observations do not determine the
-        camera.
+    ``changes``: fields of `CameraOptions` that are not to be as the document records them.
     """
     places = job.places(".json", beside=(".npz", ".html"))
     observations_file = observations_of(camera_file)

@@ -35,23 +35,7 @@ NOT_KNOWN = (
 
 
 def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
-    """Put clouds of one frame together, one point a voxel.
-
-    Parameters
-    ----------
-    job
-        Where to write the cloud ``NAME.ply`` or ``NAME.xyz``; ``NAME.html`` is written beside it.
-    paths
-        Clouds, as `armscan.storage.clouds.read_cloud` reads them.
-    size_mm
-        Edge of a voxel.
-
-    Raises
-    ------
-    ArmscanError
-        If a file cannot be read or is given twice, clouds do not fuse, or there is no point;
-        nothing is written then.
-    """
+    """Put clouds of one frame together, one point a voxel of edge ``size_mm``."""
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",), reads=paths)
     _refuse_twice(paths)
     with scratch_folder(places[0]) as scratch:

@@ -86,6 +86,8 @@ from armscan.vision.stripe.image import StripeOptions
 class StripeSource:
     """Where the stripes are: recordings, or profiles of a sensor that delivers points.
 
+    `OptionError` if these do not go together.
+
     Parameters
     ----------
     scans
@@ -96,15 +98,6 @@ class StripeSource:
         ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
     profiles
         Profiles of points: files, folders or patterns, one a posture.
-    poses
-        Table of the robot's poses, one a profile, in the profiles' order.
-    euler
-        What the angles in ``poses`` mean.
-
-    Raises
-    ------
-    OptionError
-        If these do not go together.
     """
 
     scans: tuple[Path, ...] = ()
@@ -136,7 +129,7 @@ class StripeSource:
 
 @dataclass(frozen=True, slots=True)
 class Artefact:
-    """What the stripes lie on: a plate or a sphere.
+    """What the stripes lie on: a plate or a sphere; `OptionError` if it is not one of them.
 
     Parameters
     ----------
@@ -148,11 +141,6 @@ class Artefact:
         Axis of Base along which the plate's face looks; None to take it from where the arm was.
     sphere_diameter_mm
         Diameter of the sphere in place of a plate; None for a plate.
-
-    Raises
-    ------
-    OptionError
-        If it is not one of them.
     """
 
     plate: Path | None = None
@@ -175,24 +163,9 @@ class Artefact:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandEyeInputs:
-    """What was read.
+    """What was read: ``groups`` are the name and stripes of each recording, or of all profiles.
 
-    Parameters
-    ----------
-    groups
-        Name and stripes of each recording, or of all profiles.
-    sensor
-        The sensor's calibration; None with profiles.
-    plate
-        The plate; None for a sphere.
-    files
-        All files that went in.
-    warnings
-        What is odd about the recordings, in words.
-    is_simulated
-        True if any recording was rendered.
-    recordings
-        One a group; none with profiles.
+    ``sensor`` and ``recordings`` are absent with profiles, ``plate`` for a sphere.
     """
 
     groups: tuple[tuple[str, ObservedStripes], ...]
@@ -241,22 +214,7 @@ def calibrate_hand_eye(
 ) -> Summary:
     """Read, calibrate, write ``scanner.json``, ``.npz`` and ``.html``, and say what came out.
 
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json``.
-    source, artefact
-        What to calibrate from.
-    options, stripe_options
-        Of the calibration, and of stripe extraction.
-    is_beside_thesis
-        Tell what the printed equations give of the same stripes.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the postures do not determine the
-        hand-eye; no document is written then. Where it is the postures, a page shows them.
+    ``is_beside_thesis``: tell what the printed equations give of the same stripes.
     """
     options, stripe_options = options or HandEyeOptions(), stripe_options or StripeOptions()
     _check_solved_along(artefact, options)
@@ -366,28 +324,11 @@ def calibrate_latency(
     arm: Path | None = None,
     stripe_options: StripeOptions | None = None,
 ) -> Summary:
-    """Find the time between camera and arm, and write the scanner's document with it.
+    """Find the time between camera and arm over a flat plate, and write the scanner's document with
+    it.
 
     Clocks that are not shared have a time of their own in every recording: it is told, and no
     document is written.
-
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json`` and its page.
-    scan
-        Recording of a flat plate, the head moved nearer and away.
-    scanner
-        The document ``scanner.json`` so far.
-    arm
-        ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
-    stripe_options
-        Of stripe extraction.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, or the motion does not tell the time; nothing is written then.
     """
     stripe_options = stripe_options or StripeOptions()
     places = job.places(".json", beside=(".npz", ".html"))
@@ -491,13 +432,7 @@ def read_hand_eye_inputs(
     stripe_options: StripeOptions,
     progress: Progress,
 ) -> HandEyeInputs:
-    """Read all that is named, and find the stripes.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable or does not fit the others.
-    """
+    """Read all that is named, and find the stripes."""
     if source.poses is not None:
         return _from_profiles(source, artefact)
     if source.sensor is None:

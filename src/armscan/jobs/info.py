@@ -25,7 +25,7 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.reconstruction.sync import exposure_poses, largest_gap_ns
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import PointCloud, largest_eigenvalue
 from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
 from armscan.report.quantity import Summary, fact, plural, with_sigma
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
@@ -47,7 +47,8 @@ from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import image_format, read_exposure
 from armscan.storage.observations import read_observations
 from armscan.storage.parts.meshes import read_part
-from armscan.storage.points import read_probed_points
+from armscan.storage.points import COVARIANCES as MARKER_COVARIANCES
+from armscan.storage.points import read_marker_list, read_probed_points
 from armscan.storage.recording import FolderRecording, is_recording, read_arm_track, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 
@@ -59,7 +60,7 @@ def describe_registration(path: Path) -> dict[str, Any]:
         "what": f"registration by markers ({document.kind}), {len(document.transforms)} scans in "
         f"the {document.common_frame} frame of {document.common_frame_of}",
         "scans": [one.name for one in document.transforms],
-        "markers": sum(one.n_markers for one in document.transforms),
+        "shared_markers": [one.n_markers for one in document.transforms],
         "rms_mm": [one.rms_mm for one in document.transforms],
         "moved_markers": [one.id for one in document.moved],
         "not_joined": [one.name for one in document.not_joined],
@@ -119,7 +120,8 @@ def describe_recording(folder: Path) -> dict[str, Any]:
         "kind": scan.session.kind,
         "simulated": scan.is_simulated,
         "exposures": len(scan.rows),
-        "views": _n_views(scan),
+        # a row without a view is an arrangement of its own
+        "views": len({row if row.view is None else row.view for row in scan.rows}),
         "seconds": round((max(times) - min(times)) / NS_PER_S, 3),
         **_steps("exposure", np.unique(np.array(times, dtype=np.int64))),
         **({"lasers": lasers} if lasers else {}),
@@ -228,6 +230,19 @@ def describe_points(path: Path) -> dict[str, Any]:
     }
 
 
+def describe_markers(path: Path) -> dict[str, Any]:
+    """Count, frame, certainty and extent of markers."""
+    found = read_marker_list(path, frame="not named")
+    markers = found.markers
+    return {
+        "what": plural(len(markers), "marker"),
+        "frame": markers.frame,
+        "simulated": found.is_simulated,
+        "median_sigma_mm": float(np.sqrt(np.median(largest_eigenvalue(markers.covariance_mm2)))),
+        **_ranges(markers.points_mm.T),
+    }
+
+
 def _ranges(axes: Iterable[NDArray[Any]]) -> dict[str, list[float]]:
     """Least and greatest of values (N,) along x, y and z; nothing of none."""
     return {
@@ -241,12 +256,6 @@ def _camera_line(setup: CameraSetup) -> str:
     window = setup.window
     place = f" at {window.x_px}, {window.y_px}" if window.x_px or window.y_px else ""
     return f"{setup.width_px} x {setup.height_px} px{place}, {setup.bits_used} bits, {setup.colour}"
-
-
-def _n_views(scan: FolderRecording) -> int:
-    """Arrangements that were seen: a row without a view is one of its own."""
-    named = {row.view for row in scan.rows if row.view is not None}
-    return len(named) + sum(row.view is None for row in scan.rows)
 
 
 def _track(track: ArmTrack) -> dict[str, Any]:
@@ -375,15 +384,27 @@ def _facts_of(path: Path, found: dict[str, Any] | ArmscanError | OSError) -> dic
     return {"failed": str(reason or found).removeprefix(f"{path}: ")}
 
 
+MOST_LISTED = 20
+"""Names that are listed for a reader; --json lists all."""
+
+
 def _line(key: str, value: Any) -> str:
     if key == "what":
         return str(value)
+    if isinstance(value, list) and len(value) > MOST_LISTED and isinstance(value[0], str):
+        return f"{key.replace('_', ' ')}: {len(value)}, {value[0]} to {value[-1]}"
+    if value == []:
+        return f"{key.replace('_', ' ')}: none"
     if isinstance(value, list):
         unit = " mm" if key.endswith("_range") else ""
         return f"{key.replace('_', ' ')}: " + ", ".join(str(item) for item in value) + unit
     if value is None:
         return f"{key.replace('_', ' ')}: not known"
-    return f"{key.replace('_', ' ')}: {f'{value:.6g}' if isinstance(value, float) else value}"
+    return f"{key.replace('_', ' ')}: {_number(value)}"
+
+
+def _number(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 CLOUDS = tuple(suffix for suffix in BY_SUFFIX if suffix not in (".ply", ".csv", ".txt"))
@@ -416,6 +437,13 @@ def _is_own_table(data: bytes) -> bool:
     return not COVARIANCE.keys().isdisjoint(heading.split(","))
 
 
+def _are_markers(data: bytes) -> bool:
+    """Whether this is a list of markers that armscan wrote: numbered, of a frame, with sigmas."""
+    lines = data[:1000].decode("utf-8", "replace").splitlines()
+    heading = next((line for line in lines if line[:1] not in ("#", "")), "")
+    return heading.startswith("id,") and not set(MARKER_COVARIANCES).isdisjoint(heading.split(","))
+
+
 OWN_PAGE = b'<meta name="generator" content="armscan">'
 
 
@@ -429,7 +457,7 @@ def _text(path: Path, data: bytes) -> dict[str, Any]:
     if path.name in DESCRIBE_NAMED:
         return DESCRIBE_NAMED[path.name](path)
     if path.suffix.lower() == ".csv":
-        return describe_points(path)
+        return describe_markers(path) if _are_markers(data) else describe_points(path)
     if path.suffix.lower() in (".json", ".yaml", ".yml", ".xml"):
         return _camera(read_camera_calibration(path), "camera calibration of another program")
     if path.suffix.lower() == ".txt":

@@ -4,6 +4,9 @@
 A job reads, computes, lays out a page and writes. A run that ends without a document writes
 ``NAME.refused.html`` in its place: it replaces the page of an earlier refusal, never that of a
 document, and the next run that writes a document removes it.
+
+Every job raises `ArmscanError` if a file is unreadable, an option is wrong, or its input does not
+determine the result, and then leaves no document.
 """
 
 from __future__ import annotations
@@ -56,20 +59,12 @@ class Job:
     ----------
     output
         The document; other files are written beside it. None to write nothing.
-    is_overwriting
-        Replace results that exist.
     is_forced
         Write a result that makes no sense, marked as such.
     is_caching
         Keep the points found in images beside the document, and take those kept there.
     pdf
         Where the page goes as PDF too; None for nowhere.
-    title_block
-        At the head of an inspection's page.
-    command
-        The command line, for the record.
-    progress
-        Is told of every step.
     """
 
     output: Path | None = None
@@ -97,16 +92,8 @@ class Job:
     ) -> list[Path]:
         """Check where files go before anything is read; none if there is no output.
 
-        Parameters
-        ----------
-        suffixes
-            Those that the document's name may end in.
-        beside
-            Suffixes of the files beside it.
-        hint
-            Behind the remedy of a wrong suffix.
-        reads
-            Files that the job reads, and so must not replace.
+        ``beside``: suffixes of the files beside it. ``hint``: behind the remedy of a wrong suffix.
+        ``reads``: files that the job reads, and so must not replace.
 
         Raises
         ------
@@ -183,13 +170,7 @@ class Job:
         return tuple(files)
 
     def refuse(self, page: Page, failure: FitFailure) -> NoReturn:
-        """Write the page of a run without a result, and raise the failure, which names it.
-
-        Raises
-        ------
-        EstimationError
-            Always.
-        """
+        """Write the page of a run without a result, and raise the failure, which names it."""
         remedy = failure.remedy
         if self.output is not None:
             place = self.output.with_suffix(".refused.html")
@@ -214,18 +195,9 @@ LedgerEntry = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class BatchItem:
-    """One of many results in one folder.
+    """One of many results in one folder; ``name`` has no suffix, ``n_steps`` are its exposures.
 
-    Parameters
-    ----------
-    name
-        Of the result, without suffix.
-    mark
-        Hash of all that the result follows from.
-    n_steps
-        Exposures that it is made of.
-    work
-        Makes it, as a job of its own.
+    ``mark`` is a hash of all that the result follows from.
     """
 
     name: str
@@ -242,17 +214,8 @@ class Batch:
 
     Parameters
     ----------
-    job
-        Its output is the folder.
-    suffix
-        Of each document.
     tell
         Told a line when a result is there or failed.
-
-    Attributes
-    ----------
-    folder
-        Where the results are.
     """
 
     def __init__(self, job: Job, suffix: str, tell: Callable[[str], None]) -> None:
@@ -392,13 +355,7 @@ def _is_entry(entry: object) -> bool:
 
 
 def solved(result: T | FitFailure, where: object = "") -> T:
-    """The result of an estimation.
-
-    Raises
-    ------
-    EstimationError
-        If it failed.
-    """
+    """The result of an estimation; `EstimationError` if it failed."""
     if isinstance(result, FitFailure):
         raise EstimationError(result.reason, where=str(where), remedy=result.remedy)
     return result

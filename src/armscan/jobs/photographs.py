@@ -70,22 +70,9 @@ def find_stripes(
     Colour images are all looked at in the colour of the strongest lines of a sample of them, or
     in its difference from the other colours where that shows more of the sample's lines.
 
-    Parameters
-    ----------
-    job
-        Where to write the table ``NAME.csv``, with a page beside it; ``stripes.csv`` in the current
-        folder if nowhere.
-    images
-        Files, folders or patterns.
-    background
-        The same views without laser, one for each image or one for all; None for none.
-    stripes, image_options
-        How lines are found, and how pixels are read.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable or an option is wrong; nothing is written then.
+    ``job``: where to write the table ``NAME.csv``, with a page beside it; ``stripes.csv`` in the
+    current folder if nowhere. ``background``: the same views without laser, one for each image or
+    one for all; None for none.
     """
     stripes, image_options = stripes or StripeOptions(), image_options or ImageOptions()
     job = job if job.output else replace(job, output=Path("stripes.csv"))
@@ -312,21 +299,8 @@ def find_markers(
 ) -> Summary:
     """Find rings in images, and lines of four among them that bear a code.
 
-    Parameters
-    ----------
-    job
-        Where to write the page; ``markers.html`` in the current folder if nowhere.
-    images
-        Files, folders or patterns.
-    rings, image_options
-        What is a ring, and how pixels are read.
-    codes
-        Codes as `parse_code` reads them; images must be free of distortion then.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable or an option is wrong; nothing is written then.
+    ``job``: where to write the page; ``markers.html`` in the current folder if nowhere. ``codes``:
+    codes as `parse_code` reads them; images must be free of distortion then.
     """
     rings, image_options = rings or RingOptions(), image_options or ImageOptions()
     job = job if job.output else replace(job, output=Path("markers.html"))
@@ -402,25 +376,9 @@ def measure_markers(
 ) -> Summary:
     """Find rings in the images of two cameras, match and triangulate them.
 
-    Parameters
-    ----------
-    job
-        Where to write the table ``NAME.csv``, with a page beside it; ``markers.csv`` in the
-        current folder if nowhere.
-    images
-        The left and the right image of one instant.
-    stereo_file
-        Calibration of the two cameras.
-    rings, matching
-        Options. A known diameter and depth range set the limits of eq. 4.19.
-    image_options
-        How pixels are read.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or no marker could be matched; nothing is
-        written then.
+    ``job``: where to write the table ``NAME.csv``, with a page beside it; ``markers.csv`` in the
+    current folder if nowhere. ``rings``, ``matching``: options. A known diameter and depth range
+    set the limits of eq. 4.19.
     """
     rings, image_options = rings or RingOptions(), image_options or ImageOptions()
     matching = matching or RingMatchOptions()

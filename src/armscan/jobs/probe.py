@@ -36,22 +36,8 @@ def probe(
 ) -> Summary:
     """Read the touches, fit the plane, write the points on the surface.
 
-    Parameters
-    ----------
-    job
-        Where to write the table of the points, ``plate.csv``, if anywhere.
-    source
-        A folder with ``arm.csv``, a sample a touch, and ``probe.toml``; or a table of points.
-    tip
-        The tip's file if it is not ``probe.toml`` of the folder.
-    options
-        Side, outliers, feature.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the touches determine no plate; nothing is
-        written then.
+    ``source``: a folder with ``arm.csv``, a sample a touch, and ``probe.toml``; or a table of
+    points. ``tip``: the tip's file if it is not ``probe.toml`` of the folder.
     """
     job.places(".csv", reads=(source,))
     touches = read_touches(source, tip)
@@ -79,13 +65,7 @@ def probe(
 
 
 def read_touches(source: Path, tip: Path | None = None) -> Touches:
-    """Read the touches of a folder, or of a table of points; arguments as `probe`.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is missing or damaged, the arm gave no pose, or a tip is given for a table.
-    """
+    """Read the touches of a folder, or of a table of points; arguments as `probe`."""
     if not holds_files(source):
         if tip is not None:
             raise OptionError(

@@ -83,14 +83,8 @@ LISTED = 4
 
 @dataclass(frozen=True, slots=True)
 class StillPaths:
-    """Files, folders or patterns of images, or the folder of one recording.
-
-    Parameters
-    ----------
-    images, background
-        With the laser on and off.
-    right, right_background
-        The same of the right camera, for a sensor of two cameras.
+    """Files, folders or patterns of images with the laser on and off, or the folder of one
+    recording.
     """
 
     images: tuple[str, ...]
@@ -101,15 +95,7 @@ class StillPaths:
 
 @dataclass(frozen=True, slots=True)
 class PoseTable:
-    """A robot's poses, one a profile of a sensor that delivers points.
-
-    Parameters
-    ----------
-    path
-        The table.
-    euler
-        Which angles it holds.
-    """
+    """A robot's poses, one a profile of a sensor that delivers points."""
 
     path: Path
     euler: EulerConvention = "extrinsic-xyz"
@@ -128,16 +114,9 @@ class CameraImages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StillImages:
-    """Images of one camera or two, and the files that they came from.
+    """Images of one camera or two, and the files that they came from: with laser, then without.
 
-    Parameters
-    ----------
-    paths
-        Files with laser, then those without.
-    left, right
-        Exposures; of the right camera none where there is one only.
-    warnings
-        What was left out, in words.
+    ``right`` is empty where there is one camera only.
     """
 
     paths: tuple[Path, ...]
@@ -173,37 +152,12 @@ def reconstruct(
 
     With a table of poses the files are profiles that a sensor delivered, to be placed in Base.
 
-    Parameters
-    ----------
-    job
-        Where to write the cloud, ``NAME.ply`` or another of `CLOUD_SUFFIXES`; ``NAME.html`` is
-        written beside it.
-    calibration
-        The sensor's calibration ``sensor.json``, or a ``scanner.json``.
-    paths
-        What to read.
-    volume
-        Part of Base to measure in a recording, ``xmin,xmax,ymin,ymax,zmin,zmax``; empty for all.
-    arm
-        ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
-    poses
-        Of profiles; None for images.
-    options, image_options
-        Of stripes, depths and sheet, and how pixels are read.
-    is_profiled
-        Say what each stage of a scan took.
-    cluster
-        Whose workers extract the stripes of a scan; None to do so here.
-    voxel_mm
-        Edge of the voxels of which each gives one point of the cloud in Base; None for all points.
-    tell
-        Told a line when one of several recordings is done or failed.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong or does not fit, no exposure has a pose, or
-        nothing was measured; nothing is written then.
+    ``job``: where to write the cloud, ``NAME.ply`` or another of `CLOUD_SUFFIXES`; ``NAME.html`` is
+    written beside it. ``volume``: part of Base to measure in a recording,
+    ``xmin,xmax,ymin,ymax,zmin,zmax``; empty for all. ``arm``: ``arm.toml`` for recordings of joint
+    angles; None to look for it in the recording. ``cluster``: whose workers extract the stripes of
+    a scan; None to do so here. ``voxel_mm``: edge of the voxels of which each gives one point of
+    the cloud in Base; None for all points.
     """
     options, image_options = options or MeasureOptions(), image_options or ImageOptions()
     box = Box.parse(volume, "--volume") if volume else None
@@ -242,7 +196,7 @@ def reconstruct(
             return measure(recordings[0], job)
         files = [path for path in (calibration, arm) if path is not None]
         asked = f"{chosen!r} {voxel_mm}"
-        return _scans(Batch(job, ".ply", tell or _unheard), several, files, asked, measure)
+        return _scans(Batch(job, ".ply", tell or (lambda _: None)), several, files, asked, measure)
     of_scans = {
         "--volume": volume,
         "--arm": arm,
@@ -258,10 +212,6 @@ def reconstruct(
                 remedy="give a folder with exposures.csv and --scanner scanner.json",
             )
     return _stills(job, calibration, paths, options, image_options)
-
-
-def _unheard(line: str) -> None:
-    """Nobody listens."""
 
 
 def _scans(
@@ -635,14 +585,7 @@ def _check_own_images(paths: StillPaths) -> None:
 
 
 def read_stills(paths: StillPaths, options: ImageOptions, n_cameras: int) -> StillImages:
-    """Read images of files and folders, or the exposures of one recording.
-
-    Raises
-    ------
-    ArmscanError
-        If an image cannot be read, or a recording has not that many cameras, or not one instant of
-        which all have an image.
-    """
+    """Read images of files and folders, or the exposures of one recording."""
     folder = Path(paths.images[0]) if len(paths.images) == 1 else None
     if folder is not None and is_recording(folder) and not (paths.background or paths.right):
         return _stills_of_recording(folder, n_cameras)

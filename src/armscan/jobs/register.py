@@ -86,21 +86,7 @@ class _NamedCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Joined:
-    """What goes into the folder.
-
-    Parameters
-    ----------
-    frame
-        Name of the common frame.
-    report
-        For page and terminal.
-    lists
-        What was read; the first one defines the common frame.
-    carried, markers
-        Clouds and markers in the common frame.
-    transforms, residuals, moved, not_joined, chi2, degrees_of_freedom
-        Of the document.
-    """
+    """What goes into the folder; the first of ``lists`` defines the common frame."""
 
     frame: str
     report: RegisterReport
@@ -125,24 +111,9 @@ def register(
 ) -> Summary:
     """Read the lists, join them, carry the clouds, write the folder and say what came out.
 
-    Parameters
-    ----------
-    job
-        Which new folder to write.
-    lists
-        Lists of markers: one for each view, or the old one of an arm that moved.
-    moved
-        List of the markers that the arm measured at its new place; None for views.
-    clouds
-        Clouds of the new place; empty to take those beside the lists.
-    options
-        How to match.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the markers do not join the scans; nothing
-        is written then.
+    ``lists``: lists of markers: one for each view, or the old one of an arm that moved. ``moved``:
+    list of the markers that the arm measured at its new place; None for views. ``clouds``: clouds
+    of the new place; empty to take those beside the lists. ``options``: how to match.
     """
     options = options or RegisterOptions()
     folder = job.output or Path("registered")

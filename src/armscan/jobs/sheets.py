@@ -18,8 +18,7 @@ from armscan.calibration.sheets.result import (
 from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.jobs.job import Job, solved, was_simulated, with_old_layout
-from armscan.models.calibration import CameraCalibration, Provenance
-from armscan.models.two_views import StereoCalibration
+from armscan.models.calibration import Provenance
 from armscan.pipeline.instants import ExposurePair, pair_by_view, pair_exposures
 from armscan.pipeline.laser import (
     LaserOptions,
@@ -102,31 +101,15 @@ def calibrate_sheets(
 ) -> Summary:
     """Read, calibrate, write ``sensor.json``, ``.npz`` and ``.html``, and say what came out.
 
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json``.
-    camera_file
-        The camera's calibration: ``camera.json``, or one that OpenCV or ROS wrote; or
-        ``stereo.json`` of a head with two cameras.
-    target
-        Specification of the board's target.
-    images
-        What to read.
-    options, image_options
-        Of target, stripes and sheets, and how pixels are read.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the images do not determine the sheets;
-        no document is written then. Where it is the images, a page shows them.
+    ``camera_file``: the camera's calibration: ``camera.json``, or one that OpenCV or ROS wrote; or
+    ``stereo.json`` of a head with two cameras.
     """
     options, image_options = options or LaserOptions(), image_options or ImageOptions()
     board = parse_target(target)
     places = job.places(".json", beside=(".npz", ".html"))
-    camera = read_cameras(camera_file)
-    read = _read(images, image_options, is_stereo=isinstance(camera, StereoCalibration))
+    is_stereo = document_schema(camera_file) == STEREO_SCHEMA
+    camera = (read_stereo_calibration if is_stereo else read_camera_calibration)(camera_file)
+    read = _read(images, image_options, is_stereo=is_stereo)
     cache = job.cache
     board = settle_target(read.exposures, board)
     fit = calibrate_sheets_from_pairs(
@@ -177,20 +160,7 @@ def calibrate_sheets_from_file(
 ) -> Summary:
     """Solve the sheets of a document again from the observations beside it, and write them anew.
 
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json``.
-    sensor_file
-        ``sensor.json`` with its file of observations.
-    changes
-        Fields of `SheetOptions` that are not to be as the document records them.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable or keeps too little, or the observations do not determine the
-        sheets.
+    ``changes``: fields of `SheetOptions` that are not to be as the document records them.
     """
     places = job.places(".json", beside=(".npz", ".html"))
     sensor, observations_file = read_sensor_calibration(sensor_file), observations_of(sensor_file)
@@ -220,35 +190,10 @@ def calibrate_sheets_from_file(
     return replace(summary, forced=provenance.forced)
 
 
-def read_cameras(path: Path) -> CameraCalibration | StereoCalibration:
-    """Read the calibration of one camera, or of the two of a stereo head.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged or is neither.
-    """
-    if document_schema(path) == STEREO_SCHEMA:
-        return read_stereo_calibration(path)
-    return read_camera_calibration(path)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Images:
-    """What was read.
-
-    Parameters
-    ----------
-    exposures, paths
-        All images.
-    pairs
-        Each image with a laser on and its partner.
-    tables
-        Other files that went in.
-    warnings
-        What is odd about a recording.
-    left_out
-        Images with a laser on that take no part by request.
+    """What was read: ``pairs`` are each image with a laser on and its partner, ``tables`` other
+    files.
     """
 
     exposures: tuple[Exposure, ...]
@@ -317,13 +262,20 @@ def _read_scan(folder: Path, leave_out: Sequence[str], *, is_stereo: bool) -> _I
     # without its image without laser a view is no pair any more
     named |= {one.view for one in exposures if one.view and not one.lasers and one.source in named}
     gone = {one.source for one in exposures if one.view in named or one.source in named}
+    alone: tuple[str, ...] = ()
+    if is_stereo and len({recording.rows[k].camera for k in rows}) == 1:
+        alone = (
+            f"{folder} holds images of camera {recording.rows[rows[0]].camera} alone, the "
+            "calibration is of two: the other camera told nothing of the sheets; is it the right "
+            "recording?",
+        )
     return _Images(
         exposures,
         tuple(folder / recording.rows[k].source for k in rows),
         pair_by_view([one for one in exposures if one.source not in gone]),
         _skipped([one for one in exposures if one.lasers], gone),
         recording_tables(folder),
-        (*recording.warnings, *recording.session.assumed),
+        (*recording.warnings, *recording.session.assumed, *alone),
     )
 
 

@@ -69,26 +69,9 @@ def calibrate_stereo(
 ) -> Summary:
     """Read, calibrate, write ``stereo.json``, ``.npz`` and ``.html``, and say what came out.
 
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json``.
-    target
-        Specification of the target.
-    left, right
-        Image file, folder or pattern of each camera; empty if a recording is given.
-    scan
-        Folder recording of a head with two cameras, instead of images.
-    cameras
-        Calibrations of the single cameras, left and right, or None.
-    options, image_options
-        Of the calibration, and how pixels are read.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the images do not determine the cameras;
-        no document is written then. Where it is the images, a page shows them.
+    ``left``, ``right``: image file, folder or pattern of each camera; empty if a recording is
+    given. ``scan``: folder recording of a head with two cameras, instead of images. ``cameras``:
+    calibrations of the single cameras, left and right, or None.
     """
     options, image_options = options or StereoOptions(), image_options or ImageOptions()
     plate = parse_target(target)
@@ -209,7 +192,7 @@ def _stereo_summary(run: StereoRun, written: Sequence[Path], *, is_simulated: bo
         tables=tuple(table for table in tables if table.rows),
         warnings=sentences(fit.warnings),
         written=tuple(written),
-        next_step=f"open {written[-1]}, then `armscan calibrate laser -h`",
+        next_step=f"open {written[-1]}, then `armscan calibrate laser --camera {written[0]} -h`",
         extra={
             "kind": "stereo calibration",
             "simulated": is_simulated,

@@ -66,7 +66,7 @@ ADVICE: dict[Verdict, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Standard:
-    """What was scanned to verify a scanner.
+    """What was scanned to verify a scanner; `OptionError` if it is not one of them.
 
     Parameters
     ----------
@@ -78,11 +78,6 @@ class Standard:
         Side of the plate that was touched; None to take it from where the tool was.
     plane
         ``A,B,C,D`` of the plate in Base, D in mm; empty for none.
-
-    Raises
-    ------
-    OptionError
-        If it is not one of them.
     """
 
     ball_mm: float | None = None
@@ -117,28 +112,10 @@ def verify(
 ) -> Summary:
     """Measure, compare with what the calibration predicts, and judge.
 
-    Parameters
-    ----------
-    job
-        Where to write the page, if anywhere.
-    scan
-        A recording's folder, or a cloud in Base.
-    scanner
-        ``scanner.json``; may be None for a cloud only, which must have been measured with it.
-    standard
-        What was scanned.
-    arm
-        ``arm.toml`` for a recording of joint angles; None to look for it in the recording.
-    region
-        ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm; empty for all.
-    options, inspection
-        How it is judged, and what belongs to ball or plate.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the standard is not found; nothing is
-        written then.
+    ``scan``: a recording's folder, or a cloud in Base. ``scanner``: ``scanner.json``; may be None
+    for a cloud only, which must have been measured with it. ``arm``: ``arm.toml`` for a recording
+    of joint angles; None to look for it in the recording. ``region``: ``xmin, xmax, ymin, ymax,
+    zmin, zmax`` in mm; empty for all.
     """
     options, inspection = options or VerifyOptions(), inspection or InspectionOptions()
     box = region_of(region)
@@ -168,7 +145,14 @@ def verify(
     return Summary(
         title=report.title + (" (simulated data)." if is_simulated else "."),
         quantities=(
-            *(_check_quantity(check) for check in result.checks),
+            *(
+                fact(
+                    check.name,
+                    f"E {_value(check, check.error)}, limit {_value(check, check.limit)} "
+                    f"({check.limit_rule}), U {_value(check, check.uncertainty)}: {check.verdict}",
+                )
+                for check in result.checks
+            ),
             Quantity("", "advice", ADVICE[result.verdict]),
             Quantity("rule", "rule", RULE),
             *for_people(report.quantities),
@@ -211,15 +195,7 @@ def _measured(
 
 
 def _of_scanner(cloud: PointCloud, path: Path, scanner: Path | None) -> tuple[str, ...]:
-    """What is not known of whether a cloud was measured with the scanner that is given, in words.
-
-    Raises
-    ------
-    FileFormatError
-        If the document cannot be read.
-    InputError
-        If the cloud names other calibrations.
-    """
+    """What is not known of whether a cloud was measured with the scanner given, in words."""
     if scanner is None:
         return ()
     own = read_scanner_calibration(scanner).provenance.document_id
@@ -298,14 +274,6 @@ def _report(name: str, result: Verification, measured: Measured) -> InspectionRe
         subtitle=f"{name}: {base.subtitle}",
         cards=(verdict, *cards, *only(base.quantities, "points.n_feature")),
         warnings=(*result.warnings, *of_scan, *base.warnings),
-    )
-
-
-def _check_quantity(check: Check) -> Quantity:
-    return fact(
-        check.name,
-        f"E {_value(check, check.error)}, limit {_value(check, check.limit)} "
-        f"({check.limit_rule}), U {_value(check, check.uncertainty)}: {check.verdict}",
     )
 
 

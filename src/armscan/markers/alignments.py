@@ -62,12 +62,8 @@ class MarkerMatchOptions:
 class Alignment(RowRecord):
     """A rigid motion that carries markers of the second set onto markers of the first.
 
-    Parameters
-    ----------
-    pairs
-        (K, 2) indices into the first and the second set, each index once, ordered by the first.
-    first_from_second
-        The motion, unweighted; `armscan.geometry.registration` gives the weighted one.
+    ``pairs`` (K, 2) are indices into both sets, each once, ordered by the first; the motion is
+    unweighted (`armscan.geometry.registration` gives the weighted one).
     """
 
     pairs: IntArray = ints("N", 2)
@@ -80,15 +76,7 @@ class Alignment(RowRecord):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matched:
-    """The one alignment that explains the markers.
-
-    Parameters
-    ----------
-    alignment
-        Pairs and motion.
-    n_rival
-        Markers that the best other alignment explains.
-    """
+    """The one alignment that explains the markers, and how many the best other one explains."""
 
     alignment: Alignment
     n_rival: int
@@ -109,15 +97,7 @@ class NotUnique:
 
 @dataclass(frozen=True, slots=True)
 class NoMatch:
-    """No alignment explains enough markers. Falsy.
-
-    Parameters
-    ----------
-    reason, remedy
-        What and what to do.
-    n_best
-        Markers that the best alignment explains.
-    """
+    """No alignment explains enough markers; ``n_best`` at most. Falsy."""
 
     reason: str
     remedy: str
@@ -505,14 +485,8 @@ def find_alignments(
 ) -> list[Alignment]:
     """Different alignments, the best first; at least the two best are complete.
 
-    Parameters
-    ----------
-    placing, votes
-        The two sets, and how their labels agree.
-    are_seen
-        Both sets are in the frame of a sensor that saw them from its origin.
-    known
-        Alignments that are not to be looked for.
+    With ``are_seen`` both sets are in the frame of a sensor that saw them from its origin; those
+    ``known`` are not looked for.
     """
     a, b = placing.first, placing.second
     # among few markers three that agree are looked for too: they may be a rival of four

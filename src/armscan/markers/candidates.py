@@ -85,22 +85,11 @@ def parse_depth(text: str) -> tuple[float, float]:
 def diameters_mm(
     rings: RingImages, rows: IntArray, camera: CameraModel, points_camera_mm: FloatArray
 ) -> FloatArray:
-    """Outer diameters of rings at given places.
+    """Outer diameters of rings ``rows`` (K,) of an image at places (K, 3) in its camera's frame.
 
     The longer half axis of a circle's image, as an angle at the camera, is radius over distance
     whatever the tilt, to second order in that angle (0.0004 for 6 mm at 140 mm). As an angle,
     because the image itself stretches what lies off its axis.
-
-    Parameters
-    ----------
-    rings
-        Rings of one image.
-    rows
-        (K,) which of them.
-    camera
-        The camera that took it.
-    points_camera_mm
-        (K, 3) where each would be, in that camera's frame.
     """
     angle, half = rings.direction_rad[rows], rings.outer_half_px[rows]
     along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -164,16 +153,8 @@ def find_candidates(
     pixels, its absolute value is compared, and the threshold follows from its own standard
     deviation.
 
-    Parameters
-    ----------
-    left, right
-        Rings in the two images.
-    views
-        The cameras.
-    calibration_covariance
-        (24, 24) in the order of `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
-    options
-        Thresholds.
+    ``calibration_covariance`` is (24, 24) in the order of
+    `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
     """
     rows, columns = (grid.ravel() for grid in np.indices((len(left), len(right))))
     rough = sampson_distances_px(

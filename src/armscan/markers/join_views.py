@@ -27,15 +27,7 @@ Node = tuple[int, int]
 
 
 class Link(RowRecord):
-    """Markers that two views share.
-
-    Parameters
-    ----------
-    first, second
-        Indices of the views.
-    pairs
-        (K, 2) indices of markers in either.
-    """
+    """Markers that two views share: ``pairs`` (K, 2) of their indices."""
 
     first: int
     second: int
@@ -66,16 +58,9 @@ def link_views(
     options: MarkerMatchOptions | None = None,
     advance: Callable[[int, int], None] | None = None,
 ) -> ViewLinks:
-    """Match every view with every other.
+    """Match every view, in its own frame, with every other.
 
-    Parameters
-    ----------
-    views
-        Markers of each view in its own frame.
-    options
-        How to match.
-    advance
-        Called with how many pairs are done, and of how many.
+    ``advance`` is called with how many pairs are done, and of how many.
     """
     links: list[Link] = []
     not_unique: dict[int, str] = {}
@@ -97,16 +82,9 @@ def link_views(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Markers of the part, each with its sightings.
+    """Markers of the part: (N,) number of each of a view's markers.
 
-    Parameters
-    ----------
-    of_view
-        For each view, (N,) number of the part's marker that each of its markers is.
-    n_markers
-        Count of different markers.
-    n_contradictions
-        Pairs that were dropped because they would make two markers of one view the same.
+    Pairs that would make two markers of one view the same are dropped and counted.
     """
 
     of_view: tuple[IntArray, ...]
@@ -175,8 +153,6 @@ class JoinedViews:
         For each placed view, (N,) number of the map's marker that each of its markers is.
     sightings
         What was adjusted; ``view`` counts in ``placed``.
-    left
-        Views that could not be joined.
     chain
         Poses of the placed views by the chain alone, before all was solved together.
     n_links
@@ -232,14 +208,7 @@ def join_views(
     are placed one after the other where they share most, then all poses and markers are solved
     together.
 
-    Parameters
-    ----------
-    views
-        Markers of each view, two views at least.
-    options
-        How to match.
-    advance
-        Called with how many pairs of views are matched, and of how many.
+    ``advance`` is called with how many pairs of views are matched, and of how many.
     """
     if len(views) < 2:
         return FitFailure("one view cannot be joined to anything", "give two or more views")

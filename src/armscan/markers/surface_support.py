@@ -15,6 +15,7 @@ from armscan.geometry.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
+    apply_homography,
     bools,
     floats,
     homogeneous,
@@ -54,19 +55,10 @@ class HomographyConsensus(ArrayRecord):
 
 
 def fit_homography(left_px: FloatArray, right_px: FloatArray) -> FloatArray | FitFailure:
-    """Least-squares homography (eqs. 4.29 and 4.30, the denominators multiplied out).
+    """Least-squares homography (3, 3) of norm 1 (eqs. 4.29 and 4.30, denominators multiplied out).
 
-    Both images are shifted to their mean and scaled to unit spread first, without which the
-    equations are badly conditioned.
-
-    Parameters
-    ----------
-    left_px, right_px
-        (N, 2) points, row by row of one marker; N >= 4.
-
-    Returns
-    -------
-    (3, 3) H, norm 1; or why there is none.
+    From four (N, 2) points or more, row by row of one marker. Both images are shifted to their mean
+    and scaled to unit spread first, without which the equations are badly conditioned.
     """
     if len(left_px) < SAMPLE:
         return FitFailure(
@@ -74,7 +66,7 @@ def fit_homography(left_px: FloatArray, right_px: FloatArray) -> FloatArray | Fi
             "show more markers to both cameras",
         )
     to_left, to_right = _normaliser(left_px), _normaliser(right_px)
-    equations = _equations(_mapped(to_left, left_px), _mapped(to_right, right_px))
+    equations = _equations(apply_homography(to_left, left_px), apply_homography(to_right, right_px))
     _, singular, rows = np.linalg.svd(equations)
     if singular[7] < 1e-9 * singular[0]:
         return FitFailure(
@@ -84,38 +76,25 @@ def fit_homography(left_px: FloatArray, right_px: FloatArray) -> FloatArray | Fi
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
-def transfer_px(matrix: FloatArray, left_px: FloatArray) -> FloatArray:
-    """Where H maps (N, 2) left points in the right image (eqs. 4.29 and 4.30)."""
-    return _mapped(matrix, left_px)
-
-
 def find_homography(
     left_px: FloatArray,
     right_px: FloatArray,
     threshold_px: float,
     *,
     min_inliers: int = SAMPLE + 1,
-    seed: int = 0,
 ) -> HomographyConsensus | FitFailure:
     """Find the homography with which most pairs agree: the six steps of section 4.3.1.
 
-    Parameters
-    ----------
-    left_px, right_px
-        (N, 2) points, row by row of what may be one marker.
-    threshold_px
-        T: largest distance of a right point from where H maps its left one.
-    min_inliers
-        Fewest pairs that must agree; four always do.
-    seed
-        Of the random samples; all samples are tried where they are few.
+    Points (N, 2) are row by row of what may be one marker. ``threshold_px`` is T: the largest
+    distance of a right point from where H maps its left one; four pairs always agree. All samples
+    are tried where they are few.
     """
     n = len(left_px)
     if n < max(min_inliers, SAMPLE):
         return FitFailure(
             f"{n} pairs, {max(min_inliers, SAMPLE)} are needed", "show more markers to both cameras"
         )
-    samples = _samples(n, seed)
+    samples = _samples(n)
     samples = samples[_is_spread(left_px, samples) & _is_spread(right_px, samples)]
     if not len(samples):
         return FitFailure("the pairs lie on one line", "place markers off that line too")
@@ -138,7 +117,7 @@ def _refined(
         if isinstance(fitted, FitFailure):
             return fitted
         matrix = fitted
-        distance = np.linalg.norm(transfer_px(matrix, left_px) - right_px, axis=1)
+        distance = np.linalg.norm(apply_homography(matrix, left_px) - right_px, axis=1)
         before, inlier = inlier, np.asarray(distance <= threshold_px)
         count = int(inlier.sum())
         if count < max(min_inliers, SAMPLE):
@@ -152,11 +131,11 @@ def _refined(
     return HomographyConsensus(matrix=matrix, is_inlier=inlier, rms_px=rms)
 
 
-def _samples(n: int, seed: int) -> IntArray:
+def _samples(n: int) -> IntArray:
     """Rows (S, 4) of pairs: all combinations where they are few, random ones otherwise."""
     if comb(n, SAMPLE) <= MAX_SAMPLES:
         return np.array(list(combinations(range(n), SAMPLE)), dtype=np.int64)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     return np.asarray(rng.random((MAX_SAMPLES, n)).argsort(axis=1)[:, :SAMPLE])
 
 
@@ -176,7 +155,7 @@ def _count_inliers(
     left_px: FloatArray, right_px: FloatArray, samples: IntArray, threshold_px: float
 ) -> IntArray:
     to_left, to_right = _normaliser(left_px), _normaliser(right_px)
-    left, right = _mapped(to_left, left_px), _mapped(to_right, right_px)
+    left, right = apply_homography(to_left, left_px), apply_homography(to_right, right_px)
     threshold = threshold_px * to_right[0, 0]
     equations = _equations(left[samples], right[samples])
     # The last row of V' spans the null space of the eight equations.
@@ -204,11 +183,6 @@ def _normaliser(points_px: FloatArray) -> FloatArray:
     mean = points_px.mean(axis=0)
     scale = 1.0 / max(float(np.sqrt(points_px.var(axis=0).sum())), 1e-12)
     return np.array([[scale, 0.0, -scale * mean[0]], [0.0, scale, -scale * mean[1]], [0, 0, 1.0]])
-
-
-def _mapped(matrix: FloatArray, points: FloatArray) -> FloatArray:
-    mapped = homogeneous(points) @ matrix.T
-    return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
 PLANE_PX = 2.0
@@ -239,26 +213,10 @@ def on_planes(
     left: RingImages,
     right: RingImages,
 ) -> tuple[BoolArray, int]:
-    """Which pairs agree with a homography on which many seeds agree (eqs. 4.28 to 4.30).
+    """Which pairs (K,) agree with a homography on which many seeds agree, and how many there are.
 
-    The homography with the most seeds is found, its seeds are set aside, and so on, since a part
-    may have several flat faces.
-
-    Parameters
-    ----------
-    pairs
-        K candidates.
-    seeds
-        Pairs that are the only candidates of both their rings.
-    left, right
-        Rings in the two images.
-
-    Returns
-    -------
-    is_on_plane
-        (K,).
-    n_planes
-        Count of homographies found.
+    The homography with the most seeds is found (eqs. 4.28 to 4.30), its seeds are set aside, and so
+    on, since a part may have several flat faces.
     """
     from_px, to_px = left.centres_px[pairs.left], right.centres_px[pairs.right]
     seed_from, seed_to = left.centres_px[seeds.left], right.centres_px[seeds.right]
@@ -270,32 +228,20 @@ def on_planes(
         if isinstance(fit, FitFailure):
             return found, n_planes
         n_planes += 1
-        distance = np.linalg.norm(transfer_px(fit.matrix, from_px) - to_px, axis=1)
+        distance = np.linalg.norm(apply_homography(fit.matrix, from_px) - to_px, axis=1)
         found |= distance <= PLANE_PX
         free[np.flatnonzero(free)[fit.is_inlier]] = False
 
 
 def depth_misfits(pairs: CandidatePairs, seeds: CandidatePairs, left: RingImages) -> FloatArray:
-    """How far pairs lie from the plane through their nearest seeds, where a part is curved.
+    """How far (K,) pairs lie from the plane through their nearest seeds, where a part is curved.
 
-    With calibrated cameras the homography of a plane has three unknowns instead of the eight of
-    eq. 4.28: the inverse depth is linear in the ideal image coordinates. So few can be had from the
-    nearest neighbours, and continued to the marker, where eight cannot. The plane is the one
-    through three neighbours with the least median distance in depth of the others.
-
-    Parameters
-    ----------
-    pairs
-        K candidates.
-    seeds
-        Pairs to take neighbours from; those that share a ring with the candidate are left out.
-    left
-        Rings in the left image.
-
-    Returns
-    -------
-    (K,) difference in depth over the median distance to the neighbours; infinite where there are
-    too few neighbours.
+    With calibrated cameras the homography of a plane has three unknowns instead of the eight of eq.
+    4.28: the inverse depth is linear in the ideal image coordinates. So few can be had from the
+    nearest neighbours, those that share a ring left out, and continued to the marker, where eight
+    cannot. The plane is the one through three neighbours with the least median distance in depth of
+    the others; the misfit is the difference in depth over that, infinite where neighbours are too
+    few.
     """
     found = np.full(len(pairs), np.inf)
     places = left.centres_px[seeds.left]
@@ -342,13 +288,8 @@ def ranks(
 ) -> tuple[IntArray, int]:
     """How well each pair is supported, and the count of planes.
 
-    Returns
-    -------
-    rank
-        (K,) 3 on a plane of many seeds; 2 near its neighbours' plane, or as large as most markers;
-        1 not far from its neighbours' plane; 0 else.
-    n_planes
-        Count of homographies found.
+    Rank 3 on a plane of many seeds; 2 near its neighbours' plane, or as large as most markers; 1
+    not far from its neighbours' plane; 0 else.
     """
     is_on_plane, n_planes = on_planes(pairs, seeds, left, right)
     misfit = depth_misfits(pairs, seeds, left)
@@ -382,12 +323,7 @@ def only_supported(pairs: CandidatePairs, rank: IntArray, best: IntArray) -> Int
     A rival is another pair with one of the two rings whose rank is lower by one at most, or was
     with other seeds.
 
-    Parameters
-    ----------
-    pairs
-        K candidates.
-    rank, best
-        (K,) ranks, and the highest that each pair had with any seeds so far.
+    ``best`` (K,) is the highest rank that each pair had with any seeds so far.
     """
     rows = []
     for k in np.flatnonzero(rank >= 2):

@@ -49,8 +49,6 @@ class ArmModel(ArrayRecord):
         Fixed pose of Tool in the frame of the last axis.
     joint_min_rad, joint_max_rad
         (n,) limits of the joint angles as the encoders give them; infinite where there is none.
-    name
-        What reports call it.
 
     Raises
     ------
@@ -111,18 +109,9 @@ def thesis_arm(
 ) -> ArmModel:
     """The nominal seven-axis arm of Table 2 (eqs. 2.7 and 2.8).
 
-    Parameters
-    ----------
-    d_mm
-        (d_1, d_3, d_5, d_7).
-    l_mm
-        (l_2, l_4, l_6) as Table 2 names them: the chain holds their negatives.
-    theta_offset_rad
-        (7,) encoder offsets theta_i0.
-    flange
-        Pose of Tool after axis 7; that of the axis itself if None.
-    name
-        What reports call it.
+    ``d_mm`` are (d_1, d_3, d_5, d_7), ``l_mm`` (l_2, l_4, l_6) as Table 2 names them, of which the
+    chain holds the negatives; ``theta_offset_rad`` (7,) the encoder offsets theta_i0. Without
+    ``flange`` Tool is the frame of axis 7.
 
     Raises
     ------
@@ -147,12 +136,8 @@ def thesis_arm(
 class AxisFrames(ArrayRecord):
     """Where the axes of an arm stand, for N joint vectors.
 
-    Parameters
-    ----------
-    rotations
-        (N, n + 1, 3, 3) frames 0 (Base) to n (last axis) of fig. 2.4, seen in Base.
-    origins_mm
-        (N, n + 1, 3) their origins in Base.
+    ``rotations`` (N, n + 1, 3, 3) and ``origins_mm`` (N, n + 1, 3) are those of frames 0 (Base) to
+    n (last axis) of fig. 2.4, seen in Base.
     """
 
     rotations: FloatArray = floats("N", "frames", 3, 3)
@@ -202,21 +187,9 @@ def axis_frames(arm: ArmModel, joints_rad: FloatArray) -> AxisFrames:
 
 
 def forward(arm: ArmModel, joints_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pose of the tool for many joint vectors (eq. 2.9, then the flange).
+    """Pose of the tool (N, 3, 3), (N, 3) for many joint vectors (eq. 2.9, then the flange).
 
-    Parameters
-    ----------
-    arm
-        Geometry.
-    joints_rad
-        (N, n) angles as the encoders give them; the arm's offsets are added here.
-
-    Returns
-    -------
-    rotations
-        (N, 3, 3) of ``base_from_tool``.
-    translations_mm
-        (N, 3).
+    ``joints_rad`` (N, n) are as the encoders give them; the arm's offsets are added here.
 
     Raises
     ------
@@ -235,24 +208,13 @@ def _after_flange(arm: ArmModel, frames: AxisFrames) -> tuple[FloatArray, FloatA
 def parameter_jacobian(
     arm: ArmModel, joints_rad: FloatArray, point_tool_mm: FloatArray | None = None
 ) -> FloatArray:
-    """Derivative of the pose by all the numbers of the chain.
+    """Derivative (N, 6, 4 n) of the pose by all the numbers of the chain.
 
     An error of theta_i turns all that follows about z of frame i - 1, one of alpha_i about x of
-    frame i; d_i and l_i shift it along these axes.
-
-    Parameters
-    ----------
-    arm, joints_rad
-        As for `forward`.
-    point_tool_mm
-        (3,) point in Tool whose motion is asked for; Tool's origin if None.
-
-    Returns
-    -------
-    FloatArray
-        (N, 6, 4 n): rows 0 to 2 rotation vector in Base, multiplied from the left
-        (``R <- exp(dr) R``), rows 3 to 5 motion of the point in Base, mm; columns in the order of
-        ``arm.parameters``, so that every fourth is the derivative by a joint angle.
+    frame i; d_i and l_i shift it along these axes. Rows are the rotation vector in Base, multiplied
+    from the left (``R <- exp(dr) R``), and the motion in mm of a point (3,) given in Tool, its
+    origin if None; columns are in the order of ``arm.parameters``, so that every fourth is the
+    derivative by a joint angle.
     """
     frames = axis_frames(arm, joints_rad)
     rotation, point = _after_flange(arm, frames)
@@ -297,21 +259,10 @@ def tip_centres(arm: ArmTrack, tool_from_probe: Pose[Tool, Probe]) -> FloatArray
 def compensate_tip(
     centres_mm: FloatArray, outward_normals: FloatArray, tip_diameter_mm: float
 ) -> FloatArray:
-    """Points on the surface from the centres of the tip that touched it.
+    """Points (N, 3) on the surface from the centres of the tip that touched it.
 
-    Parameters
-    ----------
-    centres_mm
-        (N, 3) centres of the tip.
-    outward_normals
-        (3,) or (N, 3) normals of the surface towards the tip; any length but zero.
-    tip_diameter_mm
-        Calibrated diameter; 0 leaves the points as they are.
-
-    Returns
-    -------
-    FloatArray
-        (N, 3) centres, half a diameter against the normals.
+    Normals (3,) or (N, 3) point towards the tip, of any length but zero; a diameter of 0 leaves the
+    points as they are.
 
     Raises
     ------

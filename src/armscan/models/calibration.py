@@ -39,16 +39,9 @@ class FTest:
 
 @dataclass(frozen=True, slots=True)
 class WarpedBoard:
-    """The bow of the target that was solved with the camera.
+    """The bow of the target that was solved with the camera, along x and along y, of its middle.
 
-    Parameters
-    ----------
-    bow_mm
-        Along x and along y: the height of the middle over the edges, positive away from the camera.
-    sigma_mm
-        Standard deviations of the two.
-    test
-        Of a flat board.
+    It is the height over the edges, positive away from the camera.
     """
 
     bow_mm: tuple[float, float]
@@ -62,10 +55,6 @@ class CameraDiagnostics:
 
     Parameters
     ----------
-    free_parameters
-        Names of the parameters that were solved.
-    model_reason
-        Why these were free.
     hold_out_rms_px
         Residual on views not used to solve, as ``rms_px``; None if there was no hold-out test.
     n_folds
@@ -100,8 +89,6 @@ class SheetDiagnostics:
         Of the residuals across the stripe in the image.
     plane_test, final_test
         Lack of fit of a plane, and of the model in use.
-    bow_decision
-        Why there is a bow, or none.
     coplanarity_mm, coplanarity_sigma_mm
         Distance by which the stripes miss a common plane, and its standard deviation.
     board_angle_deg
@@ -121,14 +108,8 @@ class SheetDiagnostics:
 class SensorDiagnostics:
     """Evidence of all light sheets together.
 
-    Parameters
-    ----------
-    noise_factor
-        Scatter of the stripe points over what their sigmas claim.
-    correlation_points
-        Points along a stripe that count as one independent point.
-    naming
-        How the stripes were given to sheets.
+    ``noise_factor`` is the scatter of the stripe points over what their sigmas claim,
+    ``correlation_points`` the points along a stripe that count as one independent point.
     """
 
     noise_factor: float
@@ -172,22 +153,12 @@ class Provenance:
 
     Parameters
     ----------
-    document_id
-        Unique id of this document.
     created_utc
         ISO 8601 time.
-    armscan_version
-        Version that wrote it.
-    command
-        The command line, one word an entry.
-    inputs
-        Files with their hashes.
     parent_ids
         Documents on which this one rests.
     options
         (name, value as text) of the options in force.
-    warnings
-        What the program warned of.
     forced
         Why it was refused, where it was written all the same on request (``--force-bad``), with
         the reasons of the documents on which it rests; empty for a document that was not refused.
@@ -217,8 +188,6 @@ class CameraCalibration(ArrayRecord):
 
     Parameters
     ----------
-    camera
-        The model.
     covariance
         (9, 9) in the order of `armscan.models.camera.PARAMETER_NAMES`; rows of parameters that
         were held fixed, or of a calibration that came without covariance, are zero.
@@ -229,12 +198,8 @@ class CameraCalibration(ArrayRecord):
         definition of OpenCV).
     sigma_point_px
         Standard deviation of one detected coordinate, per axis, told of the residuals.
-    n_views, n_points
-        What was used.
     covered_px
         (4,) smallest x, smallest y, largest x, largest y of the points used: validity in the image.
-    provenance
-        How it came to be.
     diagnostics
         Evidence for a reader; None where there is none, as in a foreign calibration.
     """
@@ -262,20 +227,14 @@ class SheetCalibration:
 
     Parameters
     ----------
-    name
-        Name of the sheet, for example ``A``.
     sheet
         The model in the Sensor frame.
     rms_mm
         Root mean square distance of the points used from the sheet.
-    n_boards, n_points
-        What was used.
     depth_range_mm
         Smallest and largest Z of the points used: the sheet is valid there.
     is_redundant
         False when two boards only just determine the plane, so that no residual checks it.
-    diagnostics
-        Evidence for a reader; None where there is none.
     shape_mm
         Standard deviation by which the sheet leaves its model (a plane or its bow), smooth over
         the sheet, estimated from what the boards' stripes show alike; None in a document that is
@@ -295,15 +254,7 @@ class SheetCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SecondCamera:
-    """The right camera of a stereo head (eqs. 4.15 and 4.16).
-
-    Parameters
-    ----------
-    camera
-        Its calibration.
-    right_from_sensor
-        Where the Sensor frame, that of the left camera, lies in the right camera's.
-    """
+    """The right camera of a stereo head (eqs. 4.15 and 4.16)."""
 
     camera: CameraCalibration
     right_from_sensor: Pose[CameraRight, Sensor]
@@ -314,18 +265,10 @@ class SensorCalibration(ArrayRecord):
 
     Parameters
     ----------
-    camera
-        The camera's calibration.
-    sheets
-        One entry a light sheet.
     covariance
         (P, P) joint covariance in the order of ``parameter_names``: the camera's 9 parameters, each
         sheet's 8 (`SHEET_PARAMETER_NAMES`), then the 15 of a second camera
         (`SECOND_PARAMETER_NAMES`), if there is one.
-    provenance
-        How it came to be.
-    diagnostics
-        Evidence for a reader; None where there is none.
     second
         The right camera of a stereo head; None for a head of one camera.
     laser_colour
@@ -475,8 +418,6 @@ class HandEyeDiagnostics:
 
     Parameters
     ----------
-    method
-        What was looked at.
     rank, condition
         Of the whitened and scaled system of the hand-eye's six parameters.
     weakest
@@ -515,8 +456,6 @@ class HandEyeCalibration(ArrayRecord):
 
     Parameters
     ----------
-    tool_from_sensor
-        The hand-eye.
     covariance
         (6, 6) in the order of `HAND_EYE_PARAMETER_NAMES`: arm, plate and stripe noise, the sensor
         being held fixed.
@@ -528,12 +467,8 @@ class HandEyeCalibration(ArrayRecord):
         Of the arm during the calibration; scans are given the same.
     rms_mm
         Root mean square distance of the points from the reference.
-    n_postures, n_exposures, n_points
-        What was used.
     plate
         The plate in Base: frame "Base"; None after a sphere or a target.
-    diagnostics
-        Evidence for a reader; None where there is none.
     """
 
     tool_from_sensor: Pose[Tool, Sensor]
@@ -556,10 +491,6 @@ class ScannerCalibration:
     ----------
     sensor
         Camera and sheets; None for a sensor that delivers points itself.
-    hand_eye
-        Its place on the arm.
-    provenance
-        How it came to be.
     latency_ns
         Added to an exposure's time before the arm's pose is looked up by time.
     latency_sigma_ns

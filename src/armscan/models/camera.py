@@ -31,6 +31,8 @@ Lens = Literal["pinhole", "fisheye"]
 ``r (1 + k1 r^2 + k2 r^4 + k3 r^6)`` by a pinhole with distortion, and at
 ``theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6)`` by a fisheye, which has no p1, p2: the first
 three terms of Kannala and Brandt (2006), as OpenCV's fisheye model with k4 = 0."""
+BORDER_PIXELS = 24
+"""Tested along each side of the image for a distortion that folds over."""
 WIDEST_RAD = np.deg2rad(88.0)
 """Angle from the axis beyond which a ray has no use as X/Z, Y/Z."""
 TANGENTIAL = ("p1", "p2")
@@ -141,21 +143,10 @@ def fold_radius(coefficients: FloatArray, lens: Lens = "pinhole") -> float:
 def undistort(
     distorted: FloatArray, coefficients: FloatArray, lens: Lens = "pinhole"
 ) -> tuple[FloatArray, BoolArray]:
-    """Invert eq. 2.17 by Newton's method.
+    """Invert eq. 2.17 by Newton's method for (N, 2) distorted normalised coordinates.
 
-    Parameters
-    ----------
-    distorted
-        (N, 2) distorted normalised coordinates.
-    coefficients, lens
-        As for `distort`.
-
-    Returns
-    -------
-    xy
-        (N, 2) ideal coordinates; where not valid, of no meaning but finite.
-    is_valid
-        (N,) False where the model folds over, so that no inverse exists on the inner branch.
+    The second value (N,) is False where the model folds over, so that no inverse exists on the
+    inner branch; the first is finite there, and of no meaning.
     """
     u, v = distorted[:, 0], distorted[:, 1]
     x, y = u.copy(), v.copy()
@@ -276,11 +267,6 @@ class CameraModel(ArrayRecord):
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Project points, with derivatives (eqs. 2.14 to 2.18).
 
-        Parameters
-        ----------
-        points_sensor_mm
-            (N, 3) points in the camera's frame.
-
         Returns
         -------
         q_px
@@ -308,46 +294,26 @@ class CameraModel(ArrayRecord):
         return q, dq_dpoint, dq_dparameters
 
     def undistort(self, q_px: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Map pixels to ideal normalised coordinates ``X/Z, Y/Z``.
+        """Map pixels (N, 2) to ideal normalised coordinates ``X/Z, Y/Z`` (eq. 2.14).
 
-        Parameters
-        ----------
-        q_px
-            (N, 2) full-sensor pixels.
-
-        Returns
-        -------
-        xy
-            (N, 2) normalised coordinates (eq. 2.14).
-        is_valid
-            (N,) False where the distortion model has no inverse.
+        The second value (N,) is False where the distortion model has no inverse.
         """
         q = np.asarray(q_px, dtype=np.float64)
         distorted = (q - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
         return undistort(distorted, self.distortion, self.lens)
 
-    def folded_border(self, n_steps: int = 24) -> FloatArray:
+    def folded_border(self) -> FloatArray:
         """(K, 2) pixels on the image's border for which the distortion has no inverse.
 
         None of a fisheye whose terms grow up to `WIDEST_RAD`: it sees nothing beyond.
-
-        Parameters
-        ----------
-        n_steps
-            Pixels tested along each side.
         """
         if fold_radius(self.distortion, self.lens) == np.tan(WIDEST_RAD):
             return np.zeros((0, 2))
         right, bottom = self.width_px - 1.0, self.height_px - 1.0
-        u, v = np.linspace(0.0, right, n_steps), np.linspace(0.0, bottom, n_steps)
-        border = np.concatenate(
-            [
-                np.column_stack([u, np.zeros(n_steps)]),
-                np.column_stack([u, np.full(n_steps, bottom)]),
-                np.column_stack([np.zeros(n_steps), v]),
-                np.column_stack([np.full(n_steps, right), v]),
-            ]
-        )
+        u, v = (np.linspace(0.0, end, BORDER_PIXELS) for end in (right, bottom))
+        none = np.zeros(BORDER_PIXELS)
+        sides = ((u, none), (u, none + bottom), (none, v), (none + right, v))
+        border = np.concatenate([np.column_stack(side) for side in sides])
         return np.asarray(border[~self.undistort(border)[1]])
 
     def undistort_with_jacobian(

@@ -91,11 +91,6 @@ class LightSheet(ArrayRecord):
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Signed distance from the sheet along its normal, with derivatives.
 
-        Parameters
-        ----------
-        points_mm
-            (N, 3) points in the Sensor frame.
-
         Returns
         -------
         height_mm
@@ -143,21 +138,11 @@ class LightSheet(ArrayRecord):
         return terms, by_u, by_v
 
     def intersect(self, xy: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Points where the rays ``(x, y, 1)`` through the camera's centre meet the sheet.
+        """Points (N, 3) where the rays ``(x, y, 1)`` through the camera's centre meet the sheet.
 
-        Parameters
-        ----------
-        xy
-            (N, 2) ideal normalised image coordinates.
-
-        Returns
-        -------
-        points_mm
-            (N, 3) in the Sensor frame (eq. 2.21, then Newton steps along the ray for the bow);
-            zero where there is none.
-        is_valid
-            (N,) False where the ray is parallel to the sheet, meets it behind the camera, or passes
-            by its bow without meeting it.
+        By eq. 2.21, then Newton steps along the ray for the bow. The second value (N,) is False
+        where the ray is parallel to the sheet, meets it behind the camera, or passes by its bow
+        without meeting it; the point is zero then.
         """
         rays = homogeneous(xy)
         plane = self.plane
@@ -182,14 +167,8 @@ class LightSheet(ArrayRecord):
     ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
         """As `intersect`, with derivatives from the implicit function theorem.
 
-        Returns
-        -------
-        points_mm, is_valid
-            As from `intersect`.
-        dpoint_dxy
-            (N, 3, 2) by the normalised image coordinates.
-        dpoint_dparameters
-            (N, 3, 8) by the sheet's parameters (tilts, offset, bow).
+        These are (N, 3, 2) by the normalised image coordinates and (N, 3, 8) by the sheet's
+        parameters (tilts, offset, bow).
         """
         points, is_valid = self.intersect(xy)
         rays = homogeneous(xy)

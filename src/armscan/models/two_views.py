@@ -28,16 +28,7 @@ N_SECOND = len(SECOND_PARAMETER_NAMES)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoViews:
-    """A left and a right camera.
-
-    Parameters
-    ----------
-    left, right
-        The cameras.
-    right_from_left
-        Pose of the left camera, which is the Sensor frame, in the right camera's (eqs. 4.3 to 4.5;
-        ``R_LR``, ``T_LR`` of eqs. 4.15 and 4.16).
-    """
+    """A left and a right camera, and the left one's frame, Sensor, in the right (eqs. 4.3-4.5)."""
 
     left: CameraModel
     right: CameraModel
@@ -68,11 +59,6 @@ class TwoViews:
         self, points_sensor_mm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Project points into the right image, with derivatives (eqs. 4.17 and 4.18).
-
-        Parameters
-        ----------
-        points_sensor_mm
-            (N, 3) points in the Sensor frame.
 
         Returns
         -------
@@ -105,24 +91,11 @@ def epipolar_distances_px(
 ) -> tuple[FloatArray, FloatArray]:
     """Signed distances of matched points from each other's epipolar lines, in each image's pixels.
 
-    A lens bends the epipolar line of eq. 4.26 to a curve. The distance given is that from the
-    curve in the image as taken: the value of ``x_r' E x_l`` over the length of its gradient by the
-    point's own pixel, correct to first order in the distance.
-
-    Parameters
-    ----------
-    views
-        The cameras.
-    left_px, right_px
-        (N, 2) pixels as taken, row by row of one point.
-
-    Returns
-    -------
-    in_left_px, in_right_px
-        (N,) distance of the left point from the right point's curve in the left image, and of the
-        right point from the left point's curve in the right image. Both have the sign of
-        ``x_r' E x_l``, which swapping the cameras leaves as it is. NaN where a pixel lies beyond
-        the part of the image that the distortion model can invert, and in an epipole.
+    A lens bends the epipolar line of eq. 4.26 to a curve. The distance given is that from the curve
+    in the image as taken: the value of ``x_r' E x_l``, whose sign it has, over the length of its
+    gradient by the point's own pixel, correct to first order in the distance. Pixels (N, 2) are as
+    taken, row by row of one point. NaN where a pixel lies beyond what the distortion model can
+    invert, and in an epipole.
     """
     left, left_ok, left_dxy_dq, _ = views.left.undistort_with_jacobian(left_px)
     right, right_ok, right_dxy_dq, _ = views.right.undistort_with_jacobian(right_px)
@@ -143,11 +116,6 @@ def sampson_distances_px(in_left_px: FloatArray, in_right_px: FloatArray) -> Flo
     It is the least length by which the two points together, in the four-dimensional space of both
     pixels, have to move until their rays meet (Sampson's distance); with noise of sigma an axis in
     both images its standard deviation is sigma.
-
-    Parameters
-    ----------
-    in_left_px, in_right_px
-        From `epipolar_distances_px`.
     """
     sign = np.where(in_left_px < 0.0, -1.0, 1.0)
     product = np.abs(in_left_px * in_right_px)
@@ -211,14 +179,8 @@ def triangulate_points(
 
     Gauss-Newton from the point midway between the two rays.
 
-    Parameters
-    ----------
-    views
-        The cameras.
-    left_px, right_px
-        (N, 2) pixels as taken, row by row of one point.
-    left_covariance_px2, right_covariance_px2
-        (N, 2, 2) covariances of the pixels, or (2, 2) for all: ``sigma_px**2 * np.eye(2)``.
+    Pixels (N, 2) are as taken, row by row of one point; their covariances are (N, 2, 2), or (2, 2)
+    for all: ``sigma_px**2 * np.eye(2)``.
     """
     n = len(left_px)
     observed = np.concatenate([left_px, right_px], axis=1)
@@ -358,10 +320,6 @@ class StereoCalibration(ArrayRecord):
         Root mean square over all points of both cameras of the residual vector's length.
     n_pairs, n_points
         What was used; a point that both cameras see counts once.
-    provenance
-        How it came to be.
-    diagnostics
-        Evidence for a reader; None where there is none.
     """
 
     left: CameraCalibration

@@ -622,10 +622,11 @@ def measurement_warnings(
         warnings.append(f"{len(empty)} images gave no point: {', '.join(empty[:LISTED])}")
     doubtful = [image.source for image, n in both if 0 < n < CLEAN_SHARE * len(image)]
     if doubtful:
+        other = " (another --laser-colour may show more of it)"
         warnings.append(
             f"less than half of what looked like a stripe could be measured in "
-            f"{', '.join(doubtful[:LISTED])}: see in the pictures whether it is a laser line "
-            "(of colour images another --laser-colour may show more of it)"
+            f"{', '.join(doubtful[:LISTED])}: see in the pictures whether it is a laser line"
+            f"{other if sensor.laser_colour != 'auto' else ''}"
         )
     assumed = [image.source for image, n in both if n and image.flags & StripeFlag.NOISE_ASSUMED]
     if assumed:

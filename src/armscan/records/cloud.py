@@ -30,15 +30,7 @@ probed to place a scanner or carries markers, and a plate in metres is not large
 
 @dataclass(frozen=True, slots=True)
 class CalibrationMark:
-    """The calibration that points were measured with: its document's id, and when it was made.
-
-    Parameters
-    ----------
-    document_id
-        Of the scanner's or sensor's document.
-    created_utc
-        ISO 8601 time as in the document; empty where it has none.
-    """
+    """The calibration that points were measured with: its document's id, and when it was made."""
 
     document_id: str
     created_utc: str = ""
@@ -92,15 +84,7 @@ class CalibrationErrors(ArrayRecord):
     def moves_mm(
         self, points_mm: FloatArray, seen_from_mm: FloatArray, exposure: IntArray, sheet: IntArray
     ) -> Iterator[FloatArray]:
-        """(N, 3) moves of points by each error, in the cloud's frame, one error after the other.
-
-        Parameters
-        ----------
-        points_mm, seen_from_mm
-            (N, 3) points, and where the sensor stood at each.
-        exposure, sheet
-            (N,) of each point.
-        """
+        """(N, 3) moves of points by each error, in the cloud's frame, one error after the other."""
         turn = self.turns[exposure]
         seen = np.einsum("nji,nj->ni", turn, points_mm - seen_from_mm)
         powers = direction_powers(seen, self.middle[sheet], self.half_width[sheet])
@@ -127,8 +111,6 @@ class PointCloud(RowRecord):
 
     Parameters
     ----------
-    frame
-        Name of the coordinate frame.
     points_mm
         (N, 3) positions.
     covariance_mm2
@@ -143,12 +125,8 @@ class PointCloud(RowRecord):
         along a stripe share it as far as ``noise_length`` says.
     sheet
         (N,) index into ``sheet_names``.
-    sheet_names
-        Names of the light sheets.
     exposure
         (N,) index into ``exposure_sources``.
-    exposure_sources
-        Source names of the exposures.
     segment
         (N,) stripe segment within the exposure.
     intensity

@@ -69,8 +69,6 @@ class Exposure:
         Significant bits, low aligned: full scale is ``2**bits_used - 1``.
     window
         The part of the full sensor that the image shows.
-    lasers
-        Names of the laser sources that were on.
     t_ns
         Mid-exposure time, or None if unknown.
     camera

@@ -16,8 +16,6 @@ class RingImages(RowRecord):
 
     Parameters
     ----------
-    source
-        The exposure's source name.
     centres_px
         (N, 2) images of the rings' centres, full-sensor pixels; these are not the centres of the
         ellipses.
@@ -62,10 +60,6 @@ class MarkerSet(RowRecord):
     covariance_mm2
         (N, 3, 3) covariance of each centre, independent between markers: that of measuring its
         images. What a calibration adds is common to all markers and not in here.
-    frame
-        Name of the coordinate frame, for example ``Sensor`` or ``Base``.
-    source
-        Where they came from, for messages.
     """
 
     ids: IntArray = ints("N")
@@ -98,8 +92,6 @@ class ProbedPoints:
         Diameter of the tip that touched; 0 where not known, for points on the surface.
     features
         (N,) name of the feature that each point belongs to; empty where nobody said.
-    source
-        Where they came from, for messages.
     is_compensated
         True if the tip's radius was taken off already: the points are on the surface.
     rows

@@ -53,8 +53,6 @@ class Profile(RowRecord):
 
     Parameters
     ----------
-    source
-        The exposure's source name.
     points_px
         (N, 2) stripe centres, full-sensor pixels (x, y).
     normals_px

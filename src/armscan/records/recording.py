@@ -98,8 +98,6 @@ class ExposureRow:
         Number of the camera, counted from 0.
     source
         Name of the image, a path relative to the recording.
-    lasers
-        Names of the laser sources that were on.
     trigger_id
         Number of the trigger, or None.
     view

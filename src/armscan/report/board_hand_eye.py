@@ -127,21 +127,7 @@ def board_hand_eye_page(
     *,
     is_simulated: bool,
 ) -> Page:
-    """Lay out the report.
-
-    Parameters
-    ----------
-    fit
-        The calibration.
-    scanner
-        The document that holds it.
-    target
-        What was looked at.
-    exposures
-        The photographs by source name; those that are missing are not shown.
-    is_simulated
-        True if they were rendered.
-    """
+    """Lay out the report; ``exposures`` by source name, those that are missing are not shown."""
     told = hand_eye_quantities(scanner)
     people, of_target = for_people(told), for_people(board_quantities(fit))
     facts = (fact("Target", describe_target(target)), *of_target)

@@ -167,20 +167,9 @@ def camera_page(
     *,
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the report.
+    """Lay out the report; ``exposures`` by source name, those that are missing are not shown.
 
-    Parameters
-    ----------
-    fit
-        The calibration.
-    not_found
-        Source and reason of each image without a usable target.
-    exposures
-        The photographs by source name; those that are missing are not shown.
-    provenance
-        How the calibration came to be.
-    is_simulated
-        True if the photographs were rendered.
+    ``not_found`` are source and reason of images without a usable target.
     """
     n_images = len(fit.views) + len(not_found)
     told = camera_quantities(fit, n_images)
@@ -276,7 +265,8 @@ def target_text(target_error_mm: float, what: str) -> str:
 
 
 def _views_section(fit: CameraFit, exposures: Mapping[str, Exposure]) -> Section:
-    held_out = _held_out_px(fit)
+    left = fit.cross_validation
+    held_out = {} if left is None else dict(zip(left.sources, left.view_rms_px, strict=True))
     rows = tuple(
         (
             view.source,
@@ -301,12 +291,6 @@ def _views_section(fit: CameraFit, exposures: Mapping[str, Exposure]) -> Section
     return Section(
         "The images", (Gallery((_view_bars(fit, held_out),)), table, text, Gallery(pictures, 300))
     )
-
-
-def _held_out_px(fit: CameraFit) -> dict[str, float]:
-    """Hold-out residual of each view that has one."""
-    found = fit.cross_validation
-    return {} if found is None else dict(zip(found.sources, found.view_rms_px, strict=True))
 
 
 def _view_picture(fit: CameraFit, view: ViewFit, exposure: Exposure) -> Picture:
@@ -422,8 +406,8 @@ def _residual_histogram(fit: CameraFit) -> Picture:
     tail = f" Beyond the picture: {beyond}." if beyond else ""
     return histogram_chart(
         [
-            Bars(residuals[:, 0], ACCENT, "x", alpha=0.75),
-            Bars(residuals[:, 1], ACCENT_LIGHT, "y", alpha=0.75),
+            Bars(residuals[:, 0], ACCENT_LIGHT, "x"),
+            Bars(residuals[:, 1], ACCENT, "y", is_outline=True),
         ],
         edges,
         "residual, px",

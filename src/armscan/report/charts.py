@@ -34,7 +34,6 @@ class Bars:
     colour: str
     label: str | None = None
     is_outline: bool = False
-    alpha: float = 1.0
     counts: IntArray | None = None
 
 
@@ -50,20 +49,9 @@ def histogram_chart(
 ) -> Picture:
     """Counts of points.
 
-    Parameters
-    ----------
-    series
-        What to count; the first lies below the others.
-    edges
-        (B + 1,) of the bins.
-    axis_label
-        Of the horizontal axis.
-    title, caption
-        Of the picture.
-    curve
-        x, y and label of a line over the bars; None for none.
-    size
-        Width and height in inches.
+    ``series``: what to count; the first lies below the others. ``edges``: (B + 1,) of the bins.
+    ``curve``: x, y and label of a line over the bars; None for none. ``size``: width and height in
+    inches.
     """
     bins = edges.tolist()
     with styled():
@@ -77,7 +65,7 @@ def histogram_chart(
                 )  # fmt: skip
             else:
                 axes.hist(
-                    item.values, bins, histtype="stepfilled", color=item.colour, alpha=item.alpha,
+                    item.values, bins, histtype="stepfilled", color=item.colour,
                     label=item.label, weights=item.counts,
                 )  # fmt: skip
         if curve is not None:
@@ -95,17 +83,7 @@ def histogram_chart(
 def correlation_chart(
     covariance: FloatArray, names: Sequence[str], *, title: str, caption: str
 ) -> Picture:
-    """Correlations of parameters as a table of colours.
-
-    Parameters
-    ----------
-    covariance
-        (N, N), positive on its diagonal.
-    names
-        N short names.
-    title, caption
-        Of the picture.
-    """
+    """Correlations of N parameters as a table of colours; ``covariance`` is (N, N)."""
     sigma = np.sqrt(np.diag(covariance))
     with styled():
         figure = new_figure(4.6, 4.2)
@@ -125,17 +103,7 @@ def correlation_chart(
 def residual_field(
     camera: CameraModel, points_px: FloatArray, arrows_px: FloatArray, *, title: str, caption: str
 ) -> Picture:
-    """Residual arrows over a camera's image.
-
-    Parameters
-    ----------
-    camera
-        Whose image.
-    points_px, arrows_px
-        (N, 2) where, and the enlarged residuals.
-    title, caption
-        Of the picture.
-    """
+    """Residual arrows over a camera's image; ``arrows_px`` (N, 2) are the enlarged residuals."""
     with styled():
         figure, axes = image_axes(camera)
         axes.quiver(

@@ -199,25 +199,7 @@ def scan_page(
     profile: ChainProfile | None = None,
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the report.
-
-    Parameters
-    ----------
-    scan
-        The scan.
-    digest
-        Of its points.
-    exposures
-        Images by source name; those that are missing are not shown.
-    provenance
-        How the cloud came to be.
-    warnings
-        What is odd about the recording and the scan.
-    profile
-        What the stages took; None to say nothing of it.
-    is_simulated
-        True if the images were rendered.
-    """
+    """Lay out the report; ``exposures`` by source name, those that are missing are not shown."""
     size = " × ".join(f"{value:.0f}" for value in digest.high_mm - digest.low_mm)
     without = f"{len(scan.without_pose)} had no pose of the arm" if scan.without_pose else ""
     n_placed = scan.count(ExposureStatus.PLACED)
@@ -407,20 +389,10 @@ SIGMA_TEXT = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedCloud:
-    """What fusing came to.
+    """What fusing ``n_measured`` points came to, with voxels of edge ``size_mm``.
 
-    Parameters
-    ----------
-    size_mm
-        Edge of a voxel.
-    n_measured
-        Points that went in.
-    digest
-        Of the fused points.
-    private_mm
-        Median standard deviation of what is left of the noise.
-    has_covariance
-        False if the points told none; no standard deviation is known then.
+    ``private_mm`` is the median standard deviation of what is left of the noise; not known without
+    ``has_covariance``.
     """
 
     size_mm: float

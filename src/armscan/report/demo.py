@@ -342,12 +342,6 @@ def naming_table(naming: Mapping[Any, NamingErrors]) -> Table:
     return Table(columns, tuple(rows), "", (1, 2, 3, 4, 5, 6))
 
 
-def _seconds_table(seconds: Mapping[str, float]) -> Table:
-    rows = [(stage.replace("_", " "), f"{value:.1f}") for stage, value in seconds.items()]
-    rows.append(("together", f"{sum(seconds.values()):.1f}"))
-    return Table(("stage", "seconds"), tuple(rows))
-
-
 def head_demo_page(
     demo: HeadDemo,
     name: str,
@@ -360,26 +354,16 @@ def head_demo_page(
 ) -> Page:
     """Lay out the page of one head.
 
-    Parameters
-    ----------
-    demo
-        What was found.
-    name, head
-        Name of the head, and the same figures as `head_data` gives them.
-    photographs
-        One exposure of each scene, by the scene's name.
-    warnings
-        Of the hand-eye.
-    commands
-        How to repeat each step.
-    footer
-        One line about origin.
+    ``name``, ``head``: name of the head, and the same figures as `head_data` gives them.
+    ``photographs``: one exposure of each scene, by the scene's name.
     """
     rule = Text(
         f"Of plate, ball and part, {FRACTION_RULE}. Of a step's faces the margins are left out. "
         "The thesis's figures were measured on a real instrument; ours are simulated, with an arm "
         "and optics made to be like it."
     )
+    seconds = {**head["seconds"], "together": sum(head["seconds"].values())}
+    took = tuple((stage.replace("_", " "), f"{value:.1f}") for stage, value in seconds.items())
     names = (
         Text(
             "Which light sheet drew each stripe, against the truth, over all instants of each "
@@ -409,7 +393,7 @@ def head_demo_page(
             Section("The part", (Text("These points are cloud.ply."), _part_pictures(demo))),
             *((Section("The names of the stripes", names),) if demo.naming else ()),
             Section("Against the truth", (truth_table(demo, head),)),
-            Section("Step by step", (commands, _seconds_table(head["seconds"]))),
+            Section("Step by step", (commands, Table(("stage", "seconds"), took))),
         ),
         is_simulated=True,
         footer=footer,
@@ -515,15 +499,7 @@ def _part_pictures(demo: HeadDemo) -> Gallery:
 
 
 def heads_page(heads: Mapping[str, Figures], demos: Mapping[str, HeadDemo], footer: str) -> Page:
-    """Lay out the comparison of several heads, as figures 5.25 and 5.40 to 5.42 do.
-
-    Parameters
-    ----------
-    heads, demos
-        Figures of each head, and what was found, by its name.
-    footer
-        One line about origin.
-    """
+    """Lay out the comparison of several heads, as figures 5.25 and 5.40 to 5.42 do."""
     reading = Text(
         "In brackets: the thesis's own figures, measured on real heads, whose lines and windows "
         "differ from these. The single line lies along the long side of the camera's window, the "

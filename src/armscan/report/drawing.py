@@ -72,8 +72,6 @@ class Marks:
     ----------
     points_px
         (N, 2) positions; of lines, two rows a line.
-    colour
-        CSS colour.
     kind
         ``dot``, ``ring``, or ``line`` between each two rows.
     size
@@ -88,18 +86,9 @@ class Marks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Labels:
-    """Words on a photograph.
+    """Words on a photograph, (N, 2) the middle of each one's lower edge, in pixels of its exposure.
 
-    Parameters
-    ----------
-    points_px
-        (N, 2) middle of each word's lower edge, in pixels of its exposure.
-    texts
-        N words.
-    colour
-        CSS colour.
-    size
-        Height of a letter as a share of the picture's longer side, in thousandths.
+    ``size`` is a letter's height as a share of the picture's longer side, in thousandths.
     """
 
     points_px: FloatArray
@@ -171,14 +160,7 @@ def display_levels(
 ) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """8-bit picture for the eye: dark photographs are stretched, never the other way.
 
-    Parameters
-    ----------
-    exposure
-        The photograph.
-    longest_px
-        Reduce it so that its longer side has this many pixels; None keeps its size.
-    is_grey
-        Take the colours out.
+    Its longer side has at most ``longest_px`` pixels; None keeps its size.
     """
     image: NDArray[Any] = exposure.image
     scale = 1.0 if longest_px is None else min(1.0, longest_px / max(image.shape[:2]))
@@ -214,8 +196,9 @@ def _quantile(values: FloatArray, counts: IntArray, share: float) -> float:
 def _stretched(
     levels: FloatArray, bright: float, middle: float
 ) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    scale = max(bright, 0.02) if bright < 0.7 else 1.0
-    gamma = 0.7 if middle / scale < 0.2 else 1.0
+    # both change steadily: photographs of one light look alike, and white paper is not burnt out
+    scale = min(1.0, max(bright, 0.02) / 0.9)
+    gamma = float(np.interp(middle / scale, [0.1, 0.3], [0.7, 1.0]))
     return np.asarray(255.0 * np.clip(levels / scale, 0.0, 1.0) ** gamma, dtype=np.uint8)
 
 
@@ -307,14 +290,8 @@ class SceneLines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneValues:
-    """What a click on a dot tells.
-
-    Parameters
-    ----------
-    numbers
-        (N,) numbers by name; NaN is told as not known.
-    names
-        (N,) index and the list that it points into, by name.
+    """What a click on a dot tells: (N,) numbers, NaN for not known, and (N,) index and list of
+    names.
     """
 
     numbers: Mapping[str, FloatArray]
@@ -388,18 +365,9 @@ def scene_markup(
 ) -> str:
     """``<canvas>`` with its data; positions are in the Sensor frame, or in one with Z up.
 
-    Parameters
-    ----------
-    dots, lines
-        What to draw; lines lie below dots.
-    labels
-        Texts with their positions in mm.
-    alt
-        What it shows, in words.
-    is_z_up
-        True for frames like Base, whose Z points up; in Sensor Y points down and Z away.
-    values
-        What a click on one of all dots tells; None for nothing.
+    ``labels``: texts with their positions in mm. ``is_z_up``: true for frames like Base, whose Z
+    points up; in Sensor Y points down and Z away. ``values``: what a click on one of all dots
+    tells; None for nothing.
     """
     points = np.concatenate([item.points_mm for item in dots])
     segments = np.concatenate([item.points_mm for item in lines] or [np.zeros((0, 3))])

@@ -232,24 +232,9 @@ def hand_eye_page(
     repeats: Sequence[Block] = (),
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the report.
+    """Lay out the report; ``exposures`` by source name, those that are missing are not shown.
 
-    Parameters
-    ----------
-    fit
-        The calibration.
-    scanner
-        The document that holds it.
-    stripes
-        What was placed, with the poses of the arm.
-    images
-        Stripe points of each exposure; none where a sensor delivered points.
-    exposures
-        The images by source name; those that are missing are not shown.
-    repeats
-        A repeat study, shown after the result.
-    is_simulated
-        True if the images were rendered.
+    ``images`` are none where a sensor delivered points; ``repeats`` is a repeat study.
     """
     sections = [_result_section(fit, scanner)]
     if repeats:
@@ -407,14 +392,7 @@ def repeat_blocks(
 
     As the thesis's Table 4.
 
-    Parameters
-    ----------
-    names
-        One a calibration.
-    fits
-        The calibrations, two or more, of one sensor.
-    sensor_covariance
-        (P, P) of its parameters; None where it is taken as exact.
+    ``sensor_covariance``: (P, P) of its parameters; None where it is taken as exact.
     """
     columns = ("calibration", "θ °", "γ °", "φ °", "tx mm", "ty mm", "tz mm")
     study = study_repeats([fit.beside_given_sensor for fit in fits], sensor_covariance)

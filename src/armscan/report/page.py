@@ -17,16 +17,8 @@ from armscan.report.quantity import SIGMA_NOTE, Quantity, Table, fact, sentences
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure.
-
-    Parameters
-    ----------
-    markup
-        Trusted HTML: an ``<img>`` with a data URI, or an ``<svg>``, from this package only.
-    caption
-        How to read it.
-    title
-        Short name; empty for none.
+    """A figure. Its markup is an ``<img>`` with a data URI, or an ``<svg>``, from this package
+    only.
     """
 
     markup: str
@@ -89,18 +81,8 @@ class Page:
 
     Parameters
     ----------
-    title, subtitle
-        What was done, and to what.
-    cards
-        Key figures.
-    warnings
-        Sentences that a person should read first.
-    sections
-        The rest, most asked for first.
     is_simulated
         True marks every number as coming from rendered data.
-    footer
-        One line about origin.
     forced
         Why what is shown, or what it rests on, was refused and made all the same.
     refused
@@ -133,12 +115,7 @@ def page_of(
 ) -> Page:
     """A page that ends with where its content came from.
 
-    Parameters
-    ----------
-    provenance
-        Told in the last section and in the foot; its ``forced`` marks the page.
-    title, subtitle, sections, cards, warnings, is_simulated
-        As of `Page`; warnings become sentences.
+    ``provenance``: told in the last section and in the foot; its ``forced`` marks the page.
     """
     return Page(
         title=title,

@@ -60,10 +60,6 @@ class TriedImage:
 
     Parameters
     ----------
-    source
-        Name of the image.
-    remark
-        What it gave, or why it gave nothing.
     is_used
         False if it gave nothing.
     target_px
@@ -103,23 +99,7 @@ def refused_page(
     warnings: Sequence[str] = (),
     is_simulated: bool,
 ) -> Page:
-    """Lay out the page of a run that found no result.
-
-    Parameters
-    ----------
-    title
-        What was tried.
-    images
-        What each image gave.
-    exposures
-        The photographs by source name.
-    provenance
-        Inputs, options and command.
-    warnings
-        What is odd about the input.
-    is_simulated
-        True if the photographs were rendered.
-    """
+    """Lay out the page of a run that found no result; ``exposures`` by source name."""
     n_used = sum(image.is_used for image in images)
     return page_of(
         replace(provenance, document_id="none was written"),
@@ -196,16 +176,8 @@ def stripe_gallery(
 ) -> tuple[Block, ...]:
     """Text, legend and pictures of every stripe point, coloured by what became of it.
 
-    Parameters
-    ----------
-    images
-        Stripe points of all exposures, or of some.
-    sheet_names
-        Names of the sheets, in the order of their numbers.
-    exposures
-        Images by source name; those that are missing are not shown.
-    counts
-        Of all exposures; empty if ``images`` are all.
+    ``images``: stripe points of all exposures, or of some. ``exposures``: images by source name;
+    those that are missing are not shown. ``counts``: of all exposures; empty if ``images`` are all.
     """
     counts = counts or [image.counts for image in images]
     seen = {status for status in STATUS_COLOURS if any(one.count(status) for one in counts)}
@@ -318,20 +290,10 @@ def stripe_picture(
 ) -> Picture:
     """A photograph with its stripe points.
 
-    Parameters
-    ----------
-    exposure, profile
-        The image and all its stripe points.
-    status
-        (N,) what became of each point: 0 good, 1 flagged, other values as ``status_colours``.
-    sheet
-        (N,) index of the sheet of good points; -1 for none.
-    status_colours
-        Colour of each status above 1.
-    outline_px
-        (M, 2) points of the target, whose outline is drawn; None for no target.
-    caption
-        Text below.
+    ``status``: (N,) what became of each point: 0 good, 1 flagged, other values as
+    ``status_colours``. ``sheet``: (N,) index of the sheet of good points; -1 for none.
+    ``status_colours``: colour of each status above 1. ``outline_px``: (M, 2) points of the target,
+    whose outline is drawn; None for no target.
     """
     points = profile.points_px
     marks = [] if outline_px is None else _outline(outline_px)

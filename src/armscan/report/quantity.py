@@ -100,14 +100,7 @@ def for_people(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
 class Table:
     """A table of ready-made texts.
 
-    Parameters
-    ----------
-    columns, rows
-        Heads and cells.
-    title
-        Above the table; empty for none.
-    word_columns
-        Columns of words, flush left as the first always is; numbers stand flush right.
+    ``word_columns`` are flush left as the first always is; numbers stand flush right.
     """
 
     columns: tuple[str, ...]
@@ -133,16 +126,6 @@ class Summary:
 
     Parameters
     ----------
-    title
-        One line.
-    quantities
-        The result, in the order to show.
-    tables
-        Tables below them.
-    warnings
-        Sentences that a person should read.
-    written
-        Files that now exist.
     next_step
         A command that comes next; empty for none.
     extra

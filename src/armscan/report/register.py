@@ -18,7 +18,6 @@ from armscan.report.drawing import (
     ALERT,
     MUTED,
     PALETTE,
-    SceneDots,
     SceneLines,
     chart_markup,
     new_figure,
@@ -57,8 +56,6 @@ class MarkerScene:
         (L, 3) markers without partner.
     stations
         Labels with (3,) positions: where views were taken from, or the bases of the arm.
-    clouds
-        Clouds in the common frame, drawn pale.
     is_z_up
         True for Base.
     """
@@ -76,22 +73,7 @@ class MarkerScene:
 class RegisterReport:
     """One registration, ready for a page and a terminal.
 
-    Parameters
-    ----------
-    title, subtitle
-        What was joined.
-    quantities, cards
-        All that is told of it, and the key figures.
-    scans
-        Table of what was carried.
-    residuals, residuals_are
-        Of the markers, and what minus what they are.
-    scene
-        What to draw in space.
-    drift
-        Chart of the uncertainty along a chain of views; None for one step.
-    warnings
-        Sentences that a person should read first.
+    ``residuals_are`` says what minus what; ``drift`` is the uncertainty along a chain of views.
     """
 
     title: str
@@ -197,7 +179,11 @@ def _marker_view(scene: MarkerScene) -> Picture:
     extent = float(np.linalg.norm(np.ptp(scene.points_mm, axis=0)))
     longest = float(np.linalg.norm(scene.residual_mm, axis=1).max(initial=0.0))
     factor = round_below(SHOWN_SHARE * extent / longest) if longest > 0.0 else 1.0
-    dots = [_pale(scene.clouds)] if scene.clouds else []
+    dots = []
+    if scene.clouds:
+        step = max(1, -(-sum(map(len, scene.clouds)) // MAX_CLOUD_DOTS))
+        shown = np.concatenate([cloud.points_mm[::step] for cloud in scene.clouds])
+        dots.append(uniform_dots(shown, CLOUD_GREY))
     lines = []
     for chosen, colour in ((scene.is_used, ACCENT), (~scene.is_used, ALERT)):
         if chosen.any():
@@ -224,12 +210,6 @@ def _marker_view(scene: MarkerScene) -> Picture:
         "Orange: markers that moved. Grey: markers without partner, and the clouds. Violet: "
         "where the measurements were made from.",
     )
-
-
-def _pale(clouds: Sequence[PointCloud]) -> SceneDots:
-    n = sum(len(cloud) for cloud in clouds)
-    step = max(1, -(-n // MAX_CLOUD_DOTS))
-    return uniform_dots(np.concatenate([cloud.points_mm[::step] for cloud in clouds]), CLOUD_GREY)
 
 
 def _rings(centres_mm: FloatArray, radius_mm: float, colour: str) -> SceneLines:

@@ -95,7 +95,7 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
     low, high = stored.depth_range_mm
     sigmas = np.sqrt(fit.covariance.diagonal()[:3]).tolist()
     bow = ", ".join(
-        f"{significant(float(value), 'mm')} {_term(i, j)}"
+        f"{significant(float(value), 'mm')} {('', 'u', 'u²', 'u³')[i]}{('', 'v', 'v²', 'v³')[j]}"
         for value, (i, j) in zip(sheet.bow_mm, BOW_TERMS, strict=True)
     )
     if not sheet.is_bowed:
@@ -233,19 +233,7 @@ def laser_page(
     *,
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the report.
-
-    Parameters
-    ----------
-    fit
-        The calibration.
-    exposures
-        The photographs by source name; those that are missing are not shown.
-    provenance
-        How the calibration came to be.
-    is_simulated
-        True if the photographs were rendered.
-    """
+    """Lay out the report; ``exposures`` by source name, those that are missing are not shown."""
     along = tuple(_residuals_along(fit, index) for index in range(len(fit.sheets)))
     fits = (Gallery(along, 560), Gallery((_residual_histogram(fit),), 420))
     sections = [
@@ -309,12 +297,6 @@ def _points_table(fit: LaserFit) -> Table:
             name = f"{sheet.name}, {board.source}"
             rows.append((name, f"{board.depth_mm:.1f}", str(board.fitted.n_points), *cells))
     return Table(POINT_HEADS, tuple(rows), "Points against their boards", (1, 2, 3, 4, 5, 6))
-
-
-def _term(i: int, j: int) -> str:
-    """Powers of a bow term: ``u²v``."""
-    powers = ("", "{}", "{}²", "{}³")
-    return powers[i].format("u") + powers[j].format("v")
 
 
 def _images_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section:
@@ -416,6 +398,8 @@ def _residuals_along(fit: LaserFit, index: int) -> Picture:
             axes.set_ylim(-reach, reach)
         for axes in list(grid.flat)[n:]:
             axes.set_axis_off()
+        for axes in list(grid.flat)[n - columns : n]:
+            axes.tick_params(labelbottom=True)
         figure.supxlabel("along the stripe, mm", fontsize=9, color=MUTED)
         figure.supylabel("off the sheet, mm", fontsize=9, color=MUTED)
     more = f" Beyond the pictures: {plural(beyond, 'point')}." if beyond else ""

@@ -59,8 +59,6 @@ class PrintedSheet:
 
     Parameters
     ----------
-    name, source
-        Of the sheet, and of the light source that it is switched with.
     plane
         (4,) of eq. 2.19, in which the fan's middle lies.
     source_mm, aim_mm
@@ -89,19 +87,7 @@ class PrintedSheet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintedHead:
-    """One kind of head before an instrument is drawn.
-
-    Parameters
-    ----------
-    cameras
-        Camera 0 first.
-    right_from_sensor
-        Camera 1's place, if there is one.
-    sheets
-        In order along the head.
-    tool_from_sensor
-        The printed hand-eye.
-    """
+    """One kind of head before an instrument is drawn: camera 0 first, sheets in order along it."""
 
     cameras: tuple[RenderCamera, ...]
     right_from_sensor: Pose[CameraRight, Sensor] | None
@@ -374,16 +360,9 @@ _SCAN_WINDOW = Window(207, 624, 2658, 800)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountedCamera:
-    """One camera of a head.
+    """One camera of a head; camera 0's frame is Sensor.
 
-    Parameters
-    ----------
-    camera
-        Full sensor.
-    camera_from_sensor
-        Where it is; the identity for camera 0, whose frame is Sensor.
-    scan_window
-        What it reads out while scanning.
+    ``scan_window`` is what it reads out while scanning.
     """
 
     camera: RenderCamera
@@ -398,20 +377,8 @@ class MountedCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Head:
-    """One scanner head.
-
-    Parameters
-    ----------
-    name
-        Kind of the head, for example ``thesis-single``.
-    cameras
-        Camera 0 first: the only one, or the left one.
-    lasers
-        Light sheets in the Sensor frame, in order along the head.
-    tool_from_sensor
-        Mounting: the true hand-eye.
-    imaging
-        Noise, gloss, light.
+    """One scanner head: camera 0, the only or the left one, first; sheets in order along it, in
+    Sensor.
     """
 
     name: str
@@ -448,13 +415,7 @@ class Head:
         return "one_line" if len(self.sources) == 1 else "crossed"
 
     def sheets_of(self, sources: tuple[str, ...]) -> tuple[LineLaser, ...]:
-        """All sheets that light up when these sources are switched on.
-
-        Raises
-        ------
-        InputError
-            If a source is not of this head.
-        """
+        """All sheets that light up when these sources of this head are switched on."""
         for source in sources:
             if source not in self.sources:
                 raise InputError(f"head '{self.name}' has no laser '{source}'")
@@ -467,24 +428,7 @@ def build_head(
     seed: int = 1,
     tolerances: Tolerances | None = None,
 ) -> Head:
-    """Draw one instrument of a kind.
-
-    Parameters
-    ----------
-    name
-        One of `HEADS`.
-    preset
-        Which `Imaging` it has.
-    seed
-        Two seeds give two instruments that differ within the tolerances.
-    tolerances
-        How much they differ; zeros give the printed numbers.
-
-    Raises
-    ------
-    InputError
-        If there is no head of that name.
-    """
+    """Draw one instrument of a kind; two seeds give two that differ within the tolerances."""
     if name not in HEADS:
         raise InputError(
             f"no simulated head is called '{name}'", remedy=f"choose one of: {', '.join(HEADS)}"

@@ -107,16 +107,9 @@ class ProbeErrors:
 
 
 class PlateProbing(ArrayRecord):
-    """What a program gets; see `armscan.devices.sources.Probing`.
+    """What a program gets, a sample a touch; see `armscan.devices.sources.Probing`.
 
-    Parameters
-    ----------
-    arm
-        One sample a touch.
-    tool_from_probe_mm
-        (3,) calibrated centre of the tip in Tool.
-    tip_diameter_mm
-        Calibrated diameter of the tip.
+    ``tool_from_probe_mm`` (3,) is the calibrated centre of the tip in Tool.
     """
 
     arm: ArmTrack
@@ -175,14 +168,8 @@ def _tool_at(centre_mm: FloatArray, rng: np.random.Generator) -> Pose[Base, Tool
 class Mechanics:
     """How good the arm and its probe are, and how steady the hand.
 
-    Parameters
-    ----------
-    arm, probe, hand
-        Sizes of their errors.
-    exposure_s
-        Exposure time during scans: what the hand does meanwhile blurs the image.
-    target_mm
-        Standard deviation by which each circle of the target misses its place along x and y.
+    During ``exposure_s`` of scans the hand blurs the image; each circle of the target misses its
+    place along x and y by ``target_mm``, a standard deviation.
     """
 
     arm: ArmErrors
@@ -210,21 +197,7 @@ MECHANICS: dict[Preset, Mechanics] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instrument:
-    """Head, arm, fixtures and calibration target of one twin.
-
-    Parameters
-    ----------
-    head
-        Camera, laser and mounting.
-    arm
-        True and believed.
-    fixtures
-        What stands around.
-    target
-        The print of the calibration target, as it was made.
-    mechanics
-        What they were drawn from.
-    """
+    """Head, arm, fixtures and calibration target of one twin, and what they were drawn from."""
 
     head: Head
     arm: MeasuringArm

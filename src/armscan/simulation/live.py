@@ -120,15 +120,7 @@ def _plan(place: str) -> tuple[_Plan, int]:
 
 
 class TwinRig:
-    """One simulated instrument that runs; see `armscan.devices.protocols.SimulatedRig`.
-
-    Attributes
-    ----------
-    twin
-        The instrument, with its truth.
-    arm_flags
-        What the arm says of itself besides being at rest.
-    """
+    """One simulated instrument that runs; see `armscan.devices.protocols.SimulatedRig`."""
 
     def __init__(self, plan: _Plan) -> None:
         self.twin = build_twin(plan.head, plan.preset, plan.seed)
@@ -433,13 +425,7 @@ def _within(wanted: float | None, now: float | None, least: float, most: float) 
 
 
 class _TwinDevice:
-    """What the twin's devices have in common.
-
-    Attributes
-    ----------
-    rig
-        What stands behind it.
-    """
+    """What the twin's devices have in common; ``rig`` stands behind it."""
 
     is_simulated = True
 

@@ -47,16 +47,7 @@ ROOM = RoomLight(even=0.6, direct=0.4, position_mm=(350.0, -400.0, 900.0), up=(0
 class Target:
     """A printed target in Base, drawn sharply in images under room light.
 
-    Parameters
-    ----------
-    pattern
-        The print.
-    base_from_board
-        Where it is; the board's z axis points away from the viewer, into the board.
-    light, dark
-        Albedo of the two tones.
-    substrate
-        Paper and bow.
+    The board's z axis points away from the viewer, into the board.
     """
 
     pattern: FlatPattern
@@ -70,16 +61,8 @@ class Target:
 class Station:
     """What stands around the arm, in Base.
 
-    Parameters
-    ----------
-    things
-        Surfaces with their finish.
-    target
-        A printed target, or None.
-    room
-        Light of the room; its brightness is scaled by each exposure.
-    markers
-        Ring markers on flat faces of the things, drawn sharply in images under room light.
+    The brightness of ``room`` is scaled by each exposure; ``target`` and ``markers`` are drawn
+    sharply in images under room light.
     """
 
     things: tuple[SceneObject, ...]
@@ -102,15 +85,8 @@ class Station:
 class ExposureSettings:
     """What the camera and the lasers do for one image.
 
-    Parameters
-    ----------
-    window
-        Part of the sensor that is read.
-    lasers
-        Names of the light sources that are on.
-    room_light
-        Brightness of white that faces up under the room's light, as a part of full scale; None for
-        the preset's ambient light.
+    ``room_light``: brightness of white that faces up under the room's light, as a part of full
+    scale; None for the preset's ambient light.
     """
 
     window: Window
@@ -127,8 +103,6 @@ class TrueStripe(ArrayRecord):
 
     Parameters
     ----------
-    sheet
-        Name of the light sheet.
     points_px
         (N, 2) full-sensor pixels of the camera that was asked for.
     points_sensor_mm, points_base_mm
@@ -155,23 +129,8 @@ def render_exposure(
 ) -> ImageArray:
     """Image of one exposure: (H, W), or (H, W, 3) of a colour camera.
 
-    Parameters
-    ----------
-    head, station
-        What looks at what.
-    base_from_sensor
-        Poses over the exposure time, equally long each; one if the head stands still.
-    settings
-        Window, lasers, light.
-    rng
-        Source of speckle and noise.
-    camera
-        Index of the head's camera that looks.
-
-    Raises
-    ------
-    InputError
-        If a laser or camera is not of this head or no pose is given.
+    ``base_from_sensor``: poses over the exposure time, equally long each; one if the head stands
+    still.
     """
     if not base_from_sensor:
         raise InputError("an exposure needs a pose")
@@ -391,20 +350,10 @@ def _corners(window: Window) -> tuple[int, int, int, int]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderRequest:
-    """One exposure before it is rendered.
+    """One exposure before it is rendered; ``row`` is its line in the list of exposures.
 
-    Parameters
-    ----------
-    row
-        Its line in the list of exposures.
-    station
-        What stands before the head.
-    base_from_sensor
-        Where the head is in the middle of the exposure.
-    settings
-        Window, lasers, light.
-    sub_poses
-        The same at evenly weighted times of the exposure; empty if the head stands still.
+    The pose is that of its middle; ``sub_poses`` are evenly weighted over it, empty if the head
+    stands still.
     """
 
     row: ExposureRow
@@ -418,20 +367,7 @@ class RenderRequest:
 class TwinScan:
     """One scene, in the form of any recording; see `armscan.devices.sources.ScanSource`.
 
-    Parameters
-    ----------
-    name
-        What messages and reports call it.
-    kind
-        Scan or calibration.
-    head
-        That looks.
-    shots
-        In order of time.
-    arm
-        What the arm reported, or None.
-    seed
-        (K,) numbers from which, with the row, the noise of an exposure follows.
+    From ``seed`` (K,) and the row the noise of an exposure follows.
     """
 
     name: str
@@ -535,16 +471,9 @@ CAMERA_FOLDERS = ("left", "right")
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What shines during an exposure, and how much of the sensors is read.
+    """What shines during an exposure, by names of sources, and how much of the sensors is read.
 
-    Parameters
-    ----------
-    lasers
-        Names of the sources that are on.
-    room_light
-        As for `ExposureSettings`.
-    is_windowed
-        True for the scanning windows, False for the full sensors.
+    ``room_light`` is as for `ExposureSettings`.
     """
 
     lasers: tuple[str, ...] = ()
@@ -554,16 +483,9 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """When, and what it is called.
+    """When, the middle of an exposure, and what it is called; the rest as for `ExposureRow`.
 
-    Parameters
-    ----------
-    t_ns
-        Middle of the exposure.
-    file
-        Name of the image below ``images``; a head of two cameras keeps a folder for each.
-    trigger_id, view
-        As for `ExposureRow`.
+    ``file`` is below ``images``; a head of two cameras keeps a folder for each.
     """
 
     t_ns: int
@@ -580,20 +502,9 @@ def instant_shots(
     light: Light,
     *poses: Pose[Base, Sensor],
 ) -> list[RenderRequest]:
-    """One shot a camera.
+    """One shot a camera; ``first_index`` is camera 0's row.
 
-    Parameters
-    ----------
-    head, station
-        What looks at what.
-    first_index
-        Of the first camera's row.
-    moment
-        When.
-    light
-        What shines.
-    poses
-        In the middle of the exposure, then those over its time, if the head moves.
+    ``poses`` are in the middle of the exposure, then those over its time, if the head moves.
     """
     shots = []
     for camera, mounted in enumerate(head.cameras):

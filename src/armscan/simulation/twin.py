@@ -45,15 +45,7 @@ from armscan.simulation.targets import TARGET
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentTruth:
-    """See `armscan.devices.sources.TwinTruth`.
-
-    Parameters
-    ----------
-    instrument
-        The twin's.
-    preset, seed
-        What it was drawn from.
-    """
+    """See `armscan.devices.sources.TwinTruth`."""
 
     instrument: Instrument
     preset: Preset
@@ -205,15 +197,7 @@ def latency_ns(seed: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedInstrument:
-    """See `armscan.devices.sources.Twin`.
-
-    Parameters
-    ----------
-    instrument
-        What it is made of.
-    preset, seed
-        What that was drawn from.
-    """
+    """See `armscan.devices.sources.Twin`."""
 
     instrument: Instrument
     preset: Preset
@@ -294,17 +278,7 @@ most, postures are 2 s apart at least."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneStage:
-    """A scene as it is gone through.
-
-    Parameters
-    ----------
-    scene, scan
-        Its name, and its images.
-    instants
-        Rows of each instant, one a camera.
-    way
-        Of the arm.
-    """
+    """A scene as it is gone through; ``instants`` are rows of each, one a camera."""
 
     scene: TwinScene
     scan: TwinScan
@@ -358,23 +332,9 @@ def build_twin(
     seed: int = 1,
     part_mm: FloatArray | None = None,
 ) -> SimulatedInstrument:
-    """Draw one instrument.
+    """Draw one instrument; everything random follows from the seed.
 
-    Parameters
-    ----------
-    head
-        Kind of the head.
-    preset
-        How good it is and how kind the surroundings are.
-    seed
-        Everything random follows from it.
-    part_mm
-        (T, 3, 3) triangles of a part that stands in place of the workpiece; None for the workpiece.
-
-    Raises
-    ------
-    OptionError
-        If there is no such head or preset, or if the seed is negative.
+    ``part_mm`` (T, 3, 3) are triangles of a part in place of the workpiece.
     """
     if head not in HEADS:
         raise OptionError(

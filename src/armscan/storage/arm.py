@@ -68,13 +68,7 @@ class _Arm:
 
 
 def read_arm_model(path: Path) -> ArmModel:
-    """Read ``arm.toml``.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is missing, no TOML, or does not describe an arm.
-    """
+    """Read ``arm.toml``."""
     where = path_text(path)
     content = parse_toml(read_bytes(path), where, AXES_REMEDY)
     with told_of(where, remedy=AXES_REMEDY):
@@ -127,19 +121,7 @@ Columns = Mapping[str, tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmTable:
-    """What ``arm.csv`` says.
-
-    Parameters
-    ----------
-    track
-        The samples.
-    form
-        How the poses are written.
-    extra
-        Columns that are not known.
-    warnings
-        What is odd in it.
-    """
+    """What ``arm.csv`` says."""
 
     track: ArmTrack
     form: PoseForm
@@ -155,16 +137,8 @@ def read_arm_table(
 ) -> ArmTable:
     """Samples of ``arm.csv``; a row is ``base_from_tool``.
 
-    Parameters
-    ----------
-    table
-        The file.
-    form
-        How the poses are written; None lets the columns decide.
-    rotation
-        Convention of Euler angles.
-    arm
-        Turns joint angles into poses; needed for the form ``joints`` only.
+    Without ``form`` the columns decide how poses are written; ``arm`` turns joint angles into poses
+    and is needed for these only.
 
     Raises
     ------
@@ -189,7 +163,13 @@ def read_arm_table(
     else:
         used += (*POSITION, *FORM_COLUMNS[chosen])
         is_known, rotations, positions = _from_poses(table, chosen, rotation)
-    _refuse_metres(rotations[is_known], positions[is_known], table.where)
+    if are_surely_metres(rotations[is_known], positions[is_known]):
+        raise FileFormatError(
+            "the tool turns and moves but stays within 10 mm of Base's origin: positions look "
+            "like metres",
+            where=table.where,
+            remedy=METRES_REMEDY,
+        )
     track = ArmTrack(
         t_ns=times,
         rotations=rotations,
@@ -405,16 +385,6 @@ def _from_joints(
     return is_known, rotations, positions
 
 
-def _refuse_metres(rotations: FloatArray, positions_mm: FloatArray, where: str) -> None:
-    if are_surely_metres(rotations, positions_mm):
-        raise FileFormatError(
-            "the tool turns and moves but stays within 10 mm of Base's origin: positions look "
-            "like metres",
-            where=where,
-            remedy=METRES_REMEDY,
-        )
-
-
 def _warnings(track: ArmTrack, where: str) -> list[str]:
     found = []
     n_gaps = int((~track.is_known).sum())
@@ -438,15 +408,7 @@ TIP_DIAMETERS_MM = (1e-3, 1000.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProbeTip:
-    """A ball at the end of a probe.
-
-    Parameters
-    ----------
-    centre_tool_mm
-        (3,) its centre in Tool.
-    diameter_mm
-        Its diameter.
-    """
+    """A ball at the end of a probe; ``centre_tool_mm`` (3,) is in Tool."""
 
     centre_tool_mm: FloatArray
     diameter_mm: float
@@ -457,13 +419,7 @@ class ProbeTip:
 
 
 def read_probe_tip(path: Path) -> ProbeTip:
-    """Read ``probe.toml``.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is missing, no TOML, or a key is missing, unknown or wrong.
-    """
+    """Read ``probe.toml``."""
     where = path_text(path)
     content = parse_toml(read_bytes(path), where, PROBE_REMEDY)
     with told_of(where, remedy=PROBE_REMEDY):
@@ -493,17 +449,11 @@ def write_probing(
     tip: ProbeTip,
     *,
     is_simulated: bool = False,
-    arm: ArmModel | None = None,
     beside: Mapping[Path, bytes] | None = None,
 ) -> None:
     """Write touches as a folder: ``arm.csv`` with a sample a touch, ``probe.toml``, a session.
 
     Files ``beside`` it appear with it; see `new_folder`.
-
-    Raises
-    ------
-    OutputError
-        If the folder holds something, or cannot be written.
     """
     session = Session(cameras=(), is_simulated=is_simulated)
     columns = arm_columns(track, session.pose_form, session.rotation, {})
@@ -511,5 +461,3 @@ def write_probing(
         (partial / ARM_FILE).write_bytes(csv_bytes(columns))
         (partial / PROBE_FILE).write_bytes(probe_tip_toml(tip))
         (partial / SESSION_FILE).write_bytes(session_toml(session))
-        if arm is not None:
-            (partial / ARM_MODEL_FILE).write_bytes(arm_model_toml(arm))

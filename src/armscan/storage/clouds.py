@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from armscan.errors import FileFormatError, OptionError, OutputError
@@ -72,8 +73,6 @@ class CloudFormat:
 
     Parameters
     ----------
-    name, suffixes
-        As people and file names call it.
     read
         Columns of a file's content and path.
     write
@@ -93,19 +92,12 @@ def _lost(*words: str) -> Callable[[PointCloud], tuple[str, ...]]:
     return lambda _: words
 
 
-def _las(piece: CloudPiece) -> bytes:
-    return las.las_bytes(piece, is_packed=False)
-
-
-def _laz(piece: CloudPiece) -> bytes:
-    return las.las_bytes(piece, is_packed=True)
-
-
+LAZ, LAS = (partial(las.las_bytes, is_packed=is_packed) for is_packed in (True, False))
 FORMATS = (
     CloudFormat("PLY", (".ply",), ply_columns, ply_bytes, _lost()),
     CloudFormat("E57", (".e57",), e57.e57_columns, e57.e57_bytes, _lost()),
-    CloudFormat("LAZ", (".laz",), las.las_columns, _laz, las.las_losses),
-    CloudFormat("LAS", (".las",), las.las_columns, _las, las.las_losses),
+    CloudFormat("LAZ", (".laz",), las.las_columns, LAZ, las.las_losses),
+    CloudFormat("LAS", (".las",), las.las_columns, LAS, las.las_losses),
     CloudFormat("PCD", (".pcd",), pcd.pcd_columns, pcd.pcd_bytes, _lost()),
     CloudFormat("CSV", (".csv",), text.text_columns, text.csv_bytes, _lost(*text.CSV_LOSES)),
     CloudFormat(
@@ -127,8 +119,6 @@ def read_cloud(path: Path) -> PointCloud:
 
     Raises
     ------
-    FileFormatError
-        If the file is cut short, or holds no points in x, y, z.
     OptionError
         If its format needs a package that is not installed.
     """
@@ -137,18 +127,9 @@ def read_cloud(path: Path) -> PointCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudFile:
-    """A cloud as a file held it.
+    """A cloud as a file held it, and columns that it does not carry.
 
-    Parameters
-    ----------
-    cloud
-        The points.
-    remarks
-        What a person should know of how it was read, in words.
-    dropped
-        Names of the file's columns that the cloud does not carry.
-    n_points
-        (N,) measured points that each of a fused cloud stands for; None where the file has none.
+    ``n_points`` (N,) are the measured points that each of a fused cloud stands for, or None.
     """
 
     cloud: PointCloud
@@ -158,13 +139,7 @@ class CloudFile:
 
 
 def read_cloud_file(path: Path) -> CloudFile:
-    """As `read_cloud`, with what a person should know of the reading.
-
-    Raises
-    ------
-    ArmscanError
-        As `read_cloud`.
-    """
+    """As `read_cloud`, with what a person should know of the reading."""
     data = read_bytes(path)
     # a PLY file says so itself, whatever its name
     known = BY_SUFFIX.get(".ply" if data.startswith(b"ply") else path.suffix.lower())
@@ -209,16 +184,9 @@ def cloud_parts(
     *,
     is_fused: bool = False,
 ) -> Iterator[bytes]:
-    """As `cloud_bytes`, of a cloud that comes in pieces.
+    """As `cloud_bytes`, of a cloud that comes in pieces, as `ply_parts` takes them.
 
     PLY and XYZ files are made piece by piece, others in memory.
-
-    Parameters
-    ----------
-    path
-        Where it goes.
-    marks, n_points, pieces, is_fused
-        As of `ply_parts`.
     """
     suffix = path.suffix.lower()
     if suffix == ".ply":
@@ -244,13 +212,7 @@ PIECE_POINTS = 200_000
 
 
 def read_cloud_pieces(path: Path) -> Iterator[PointCloud]:
-    """As `read_cloud`, a binary PLY file piece by piece.
-
-    Raises
-    ------
-    ArmscanError
-        As `read_cloud`.
-    """
+    """As `read_cloud`, a binary PLY file piece by piece."""
     pieces = ply_pieces(path, PIECE_POINTS) if is_file(path) else None
     if pieces is None:
         yield read_cloud(path)
@@ -280,8 +242,6 @@ def write_cloud(path: Path, cloud: PointCloud, *, is_overwriting: bool = False) 
     ------
     OptionError
         As `cloud_bytes`.
-    OutputError
-        If the file exists or cannot be written.
     """
     write_files({path: cloud_bytes(cloud, path)}, is_overwriting=is_overwriting)
 
@@ -304,27 +264,17 @@ class Conversion:
 def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) -> Conversion:
     """Write a calibration's camera as ROS ``camera_info``, or a cloud or mesh in another format.
 
-    Parameters
-    ----------
-    source
-        A cloud in any of `FORMATS`, a model of a part, or any calibration that armscan reads: its
-        own camera or sensor document, OpenCV's YAML, XML or JSON, ROS.
-    output
-        ``.yaml`` for a camera, ``.stl`` for the triangles of a model, one of `CLOUD_SUFFIXES` for a
-        cloud, or for the corners of a mesh.
-    is_overwriting
-        Replace a file that exists.
+    ``source`` is a cloud in any of `FORMATS`, a model of a part, or any calibration that armscan
+    reads: its own camera or sensor document, OpenCV's YAML, XML or JSON, ROS. ``output`` is
+    ``.yaml`` for a camera, ``.stl`` for the triangles of a model, one of `CLOUD_SUFFIXES` for a
+    cloud, or for the corners of a mesh.
 
     Raises
     ------
     OptionError
         If there is no way from the one kind of file to the other.
-    FileFormatError
-        If the source cannot be read.
     InputError
         If a mesh is wanted and the source holds no triangles.
-    OutputError
-        If the output exists or cannot be written.
     """
     suffix = output.suffix.lower()
     if output.exists() and source.exists() and output.samefile(source):
@@ -356,7 +306,7 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         conversion = Conversion(what, losses, (*found.remarks, *without), cloud.forced)
     else:
         camera, forced = _camera(source)
-        content = camera_info_yaml(camera, comments=forced).encode()
+        content = camera_info_yaml(camera, forced).encode()
         conversion = Conversion("camera to ROS camera_info", YAML_LOSES, (), forced)
     write_files({output: content}, is_overwriting=is_overwriting)
     return conversion

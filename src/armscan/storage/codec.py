@@ -4,6 +4,7 @@
 A record is a dataclass and its fields are the keys; where a file says something otherwise, a
 `Layout` tells how. Floats come back to the last bit. What a number may be follows from its name:
 lengths and pixels (``_mm``, ``_px``) are bounded, counts and standard deviations not negative.
+A key that is missing, unknown or holds what its field cannot is a `MismatchError`.
 """
 
 from __future__ import annotations
@@ -116,13 +117,7 @@ def parse_json(data: bytes, where: str) -> dict[str, Any]:
 
 
 def parse_toml(data: bytes, where: str, remedy: str) -> dict[str, Any]:
-    """Parse a TOML file; ``remedy`` says how lines should be.
-
-    Raises
-    ------
-    FileFormatError
-        If it is no TOML, too large or nested too deep.
-    """
+    """Parse a TOML file; ``remedy`` says how lines should be."""
     try:
         n_tables = data.count(b"\n[")
         if len(data) <= MOST_TOML_BYTES and n_tables <= MOST_TOML_TABLES:
@@ -185,15 +180,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class MismatchError(ValueError):
-    """A key does not hold what it should.
-
-    Parameters
-    ----------
-    key
-        The key, after those above it.
-    why
-        What is wrong, after "'KEY'".
-    """
+    """A key does not hold what it should."""
 
     def __init__(self, key: str, why: str) -> None:
         super().__init__(f"'{shown(key, 120)}' {why}" if key else why)
@@ -203,12 +190,7 @@ class MismatchError(ValueError):
 class FieldCodec:
     """How the value of a field stands in a file where its type does not say it.
 
-    Parameters
-    ----------
-    write
-        Tree of a value.
-    read
-        Value of a tree; the second argument is its key, for messages.
+    ``read`` takes the tree and its key, for messages.
     """
 
     write: Callable[[Any], Any]
@@ -285,12 +267,7 @@ class _Slot:
 class RecordCodec:
     """Records to trees of dicts, lists, numbers and text, and back.
 
-    Parameters
-    ----------
-    layouts
-        Of the classes that need one.
-    unknown
-        Takes a sentence for each key that is not known; None refuses them.
+    ``unknown`` takes a sentence for each key that is not known; None refuses them.
     """
 
     layouts: Mapping[type, Layout] = field(default_factory=dict)
@@ -333,23 +310,8 @@ class RecordCodec:
         return None if may_lack and isinstance(value, float) and not math.isfinite(value) else value
 
     def read(self, kind: type[T], tree: Any, key: str = "", **given: Any) -> T:
-        """Record of a tree.
-
-        Parameters
-        ----------
-        kind
-            Class of the record.
-        tree
-            What the file holds under ``key``.
-        key
-            Where the record stands, for messages.
-        given
-            Fields that are not in the tree.
-
-        Raises
-        ------
-        MismatchError
-            If a key is missing, unknown or holds what its field cannot.
+        """Record of a tree that the file holds under ``key``; ``given`` are fields that are not in
+        it.
         """
         if not isinstance(tree, dict):
             raise MismatchError(key, "is no table of keys")
@@ -401,7 +363,8 @@ class RecordCodec:
             return {name: tuple(map(float, rows)) if is_tuple else np.array(rows)}
         own = layout.keys.get(name, name)
         used.add(own)
-        if own not in tree and not _has_no_default(item) and name not in layout.required:
+        has_default = item.default is not MISSING or item.default_factory is not MISSING
+        if own not in tree and has_default and name not in layout.required:
             return {}
         content, place = _taken(tree, own, key), _join(key, own)
         if name in layout.codecs:
@@ -468,13 +431,7 @@ def _scalar(content: Any, slot: _Slot) -> Any:
 
 
 def numbers(content: Any, key: str) -> FloatArray:
-    """Array of nested lists of finite numbers, all of one length.
-
-    Raises
-    ------
-    MismatchError
-        If it holds anything else, or numbers that are damage by their size.
-    """
+    """Array of nested lists of finite numbers, all of one length."""
     for item in _flat(content, key, 3):
         _number(item, key)
     try:
@@ -510,13 +467,7 @@ def matrix_tree(matrix: FloatArray, **names: Sequence[str]) -> dict[str, Any]:
 
 
 def read_matrix(content: Any, key: str, *names: str) -> FloatArray:
-    """Matrix of a tree, whose lists of names have the lengths of its sides.
-
-    Raises
-    ------
-    MismatchError
-        If it is none.
-    """
+    """Matrix of a tree, whose lists of names have the lengths of its sides."""
     if not isinstance(content, dict) or set(content) != {*names, "matrix"}:
         raise MismatchError(key, f"needs the keys {', '.join(names)}, matrix and no others")
     sides = [content[name] for name in names]
@@ -530,13 +481,7 @@ def read_matrix(content: Any, key: str, *names: str) -> FloatArray:
 
 
 def symmetric(matrix: FloatArray, key: str) -> FloatArray:
-    """The matrix, if it can be a covariance.
-
-    Raises
-    ------
-    MismatchError
-        If it is not symmetric, or a variance is negative.
-    """
+    """The matrix, if it can be a covariance."""
     variances = np.diag(matrix)
     scale = np.sqrt(np.outer(np.abs(variances), np.abs(variances)))
     is_even = np.abs(matrix - matrix.T) <= SYMMETRY_TOLERANCE * (scale + np.abs(matrix))
@@ -587,10 +532,6 @@ def _translation_key(hint: Any) -> str:
 
 
 _hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
-
-
-def _has_no_default(item: Field[Any]) -> bool:
-    return item.default is MISSING and item.default_factory is MISSING
 
 
 def _is_default(item: Field[Any], value: Any) -> bool:

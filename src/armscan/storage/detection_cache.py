@@ -56,15 +56,7 @@ KEPT: Mapping[str, type[Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class DetectionCache:
-    """Entries in one folder, made when the first entry is kept.
-
-    Parameters
-    ----------
-    folder
-        Where they lie.
-    reused, made
-        Names of the entries that this object gave, and that it kept.
-    """
+    """Entries in one folder, made when the first is kept; names of those given and kept."""
 
     folder: Path
     reused: set[str] = field(default_factory=set, compare=False, repr=False)
@@ -133,16 +125,9 @@ class DetectionCache:
 def detection_key(
     what: str, exposure: Exposure, options: tuple[Any, ...], background: Exposure | None = None
 ) -> str:
-    """Name of the entry of what is looked for in an image.
+    """Name of the entry of what is looked for in an image, and in the same without laser.
 
-    Parameters
-    ----------
-    what
-        Name of the detection.
-    exposure, background
-        The image, and the same without laser; every pixel counts, and how they are read.
-    options
-        Frozen dataclasses of plain values that the detection is given.
+    Every pixel counts, and how they are read. ``options`` are frozen dataclasses of plain values.
     """
     digest = hashlib.sha256(f"{what}\n{code_version()}\n{options!r}\n".encode())
     for image in (exposure, background):

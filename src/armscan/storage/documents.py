@@ -162,8 +162,6 @@ class Registration:
         Scans that were joined, their markers, markers that moved, and scans that could not be.
     chi2, degrees_of_freedom
         Squared residuals in units of their covariances.
-    provenance
-        How it came to be.
     """
 
     kind: Literal["views", "moved arm"]
@@ -403,26 +401,14 @@ def content_hash(content: Mapping[str, Any]) -> str:
 
 
 def document_schema(path: Path) -> str | None:
-    """Name of the schema that a document says it has; None for a file without one.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is missing, or JSON that is damaged.
-    """
+    """Name of the schema that a document says it has; None for a file without one."""
     data = read_bytes(path)
     found = parse_json(data, path_text(path)).get("schema") if is_json(data) else None
     return found if isinstance(found, str) else None
 
 
 def observations_of(path: Path) -> Path:
-    """The file of observations beside a document, as the document says it was written.
-
-    Raises
-    ------
-    FileFormatError
-        If the document names none, or the file is missing or another one.
-    """
+    """The file of observations beside a document, as the document says it was written."""
     entry = parse_json(read_bytes(path), path_text(path)).get("observations")
     if not isinstance(entry, dict):
         raise FileFormatError(
@@ -441,13 +427,7 @@ def observations_of(path: Path) -> Path:
 
 
 def is_scanner_document(path: Path) -> bool:
-    """True if a file says that it is a scanner's document; it need not be whole.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is missing or no JSON.
-    """
+    """True if a file says that it is a scanner's document; it need not be whole."""
     return bool(parse_json(read_bytes(path), path_text(path)).get("schema") == SCANNER_SCHEMA)
 
 
@@ -465,13 +445,7 @@ def read_calibration(path: Path) -> CameraCalibration | SensorCalibration:
 
 
 def read_camera_calibration(path: Path) -> CameraCalibration:
-    """Read ``camera.json``, or a calibration that OpenCV or ROS wrote.
-
-    Raises
-    ------
-    FileFormatError
-        As `read_calibration`; a sensor's document is refused where a camera's is needed.
-    """
+    """Read ``camera.json``, or a calibration that OpenCV or ROS wrote."""
     data = read_bytes(path)
     if is_json(data) and "schema" in parse_json(data, path_text(path)):
         return _read_camera(path)
@@ -505,13 +479,7 @@ def read_foreign_camera(path: Path) -> CameraCalibration:
 
 
 def read_sensor_calibration(path: Path) -> SensorCalibration:
-    """Read ``sensor.json``.
-
-    Raises
-    ------
-    FileFormatError
-        As `read_calibration`; a camera's document is refused where a sensor's is needed.
-    """
+    """Read ``sensor.json``."""
     return _record(SensorCalibration, SENSOR_SCHEMA, path)
 
 
@@ -627,21 +595,10 @@ def new_provenance(
 ) -> Provenance:
     """Describe a document that is about to be written.
 
-    Parameters
-    ----------
-    inputs
-        Files that went in; each is hashed.
-    command
-        The command line, one word an entry; empty in a program.
-    options
-        Options dataclasses in force; every field is recorded as ``Class.field``, one
-        that is a dataclass itself by its own class and fields.
-    parents
-        Of the documents on which this one rests; their reasons for a refusal go on.
-    warnings
-        What the program warned of.
-    forced
-        Why this document was refused, if it is written all the same.
+    Files that went in are hashed. Of options dataclasses in force every field is recorded as
+    ``Class.field``, one that is a dataclass itself by its own class and fields. Of ``parents``, the
+    documents on which this one rests, the reasons for a refusal go on; ``forced`` is why this one
+    was refused, if it is written all the same.
     """
     return Provenance(
         document_id=str(uuid4()),

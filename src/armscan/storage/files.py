@@ -95,13 +95,7 @@ def holds_files(path: Path) -> bool:
 
 
 def files_in(path: Path) -> tuple[Path, ...]:
-    """What lies in a folder, as `holds_files` says; of a recording in one file only files.
-
-    Raises
-    ------
-    FileFormatError
-        If the recording is unfinished or damaged.
-    """
+    """What lies in a folder, as `holds_files` says; of a recording in one file only files."""
     packed = packed_place(path)
     if packed is None:
         return tuple(path.iterdir())
@@ -121,25 +115,13 @@ def _packed_folder(path: Path) -> McapFolder:
 
 
 def packed_notes(path: Path) -> tuple[str, ...]:
-    """What a recording in one file holds and its tables do not list; nothing of any other path.
-
-    Raises
-    ------
-    FileFormatError
-        If the recording is unfinished or damaged.
-    """
+    """What a recording in one file holds and its tables do not list; nothing of any other path."""
     packed = packed_place(path)
     return () if packed is None else _packed_folder(packed[0]).notes
 
 
 def damaged_images(path: Path) -> tuple[str, ...]:
-    """Images of a recording in one file that cannot be read; nothing of any other path.
-
-    Raises
-    ------
-    FileFormatError
-        If the recording is unfinished, or its tables are damaged.
-    """
+    """Images of a recording in one file that cannot be read; nothing of any other path."""
     packed = packed_place(path)
     return () if packed is None else _packed_folder(packed[0]).damaged_images
 
@@ -153,13 +135,7 @@ def is_folder(path: Path) -> bool:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Content of a file that must exist and hold something.
-
-    Raises
-    ------
-    FileFormatError
-        If there is no such file, it is a folder or a pipe, it is empty or it may not be read.
-    """
+    """Content of a file that must exist and hold something."""
     where = path_text(path)
     packed = packed_place(path)
     if packed is not None and packed[1]:
@@ -201,17 +177,7 @@ def told_of(where: str, *, remedy: str = "") -> Iterator[None]:
 def check_outputs(paths: Iterable[Path], *, is_overwriting: bool = False) -> None:
     """Raise before long work if a result could not be written afterwards.
 
-    Parameters
-    ----------
-    paths
-        Files that will be written.
-    is_overwriting
-        Allow files that exist; folders are refused all the same.
-
-    Raises
-    ------
-    OutputError
-        If the folder does not exist or may not be written, or the file exists.
+    ``is_overwriting`` allows files that exist; folders are refused all the same.
     """
     for path in paths:
         folder, where = path.parent, path_text(path)
@@ -233,13 +199,7 @@ Content: TypeAlias = bytes | Iterable[bytes]
 
 
 def make_folder(folder: Path, *, with_parents: bool = False) -> None:
-    """Make a folder where there is none; those above it, too, only where that is asked for.
-
-    Raises
-    ------
-    OutputError
-        If the disk refuses.
-    """
+    """Make a folder where there is none; those above it, too, only where that is asked for."""
     with _refusing("the folder cannot be made", folder, "choose another place"):
         folder.mkdir(parents=with_parents, exist_ok=True)
 
@@ -260,11 +220,6 @@ def sole_writer(folder: Path) -> Iterator[None]:
     """Hold a folder while the block runs; what a killed run held is free again.
 
     Where folders cannot be locked (some file systems of networks), nothing is held.
-
-    Raises
-    ------
-    OutputError
-        If another run holds it.
     """
     if fcntl is None:
         yield
@@ -331,13 +286,7 @@ def write_files(contents: Mapping[Path, Content], *, is_overwriting: bool = Fals
 
 
 def check_new_folder(folder: Path) -> None:
-    """Raise before long work if a folder could not be written afterwards.
-
-    Raises
-    ------
-    OutputError
-        If it holds something, is the current folder or a root, or the one above does not exist.
-    """
+    """Raise before long work if a folder could not be written afterwards."""
     target, where = folder.resolve(), path_text(folder)
     if target in (Path.cwd(), Path(target.anchor)):
         raise OutputError(
@@ -357,18 +306,8 @@ def new_folder(folder: Path, beside: Mapping[Path, bytes] | None = None) -> Iter
     If the block raises or is interrupted, nothing is left of it; what a killed run left of a folder
     of this name is removed.
 
-    Parameters
-    ----------
-    folder
-        Must not exist, or be empty.
-    beside
-        Files outside the folder that belong to it; written when it is complete, just before it
-        gets its name, so that it is never seen without them. They must not exist.
-
-    Raises
-    ------
-    OutputError
-        As `check_new_folder`, or if the disk is full or refuses.
+    Files ``beside`` it must not exist; they are written when it is complete, just before it gets
+    its name, so that it is never seen without them.
     """
     check_new_folder(folder)
     target = folder.resolve()
@@ -400,17 +339,8 @@ def replaced_folder(folder: Path, check: Callable[[], None]) -> Iterator[Path]:
     that a killed run moved away and did not replace comes back, what else it left is removed.
     Documents written meanwhile name files where they will lie.
 
-    Parameters
-    ----------
-    folder
-        Made if need be, with those above it.
-    check
-        Raises if the folder may not be replaced; asked before anything is written and at the end.
-
-    Raises
-    ------
-    OutputError
-        If the disk is full or refuses, or as ``check``.
+    ``check`` raises if the folder may not be replaced; it is asked before anything is written and
+    at the end.
     """
     target = folder.resolve()
     partial = _part_name(target)
@@ -488,11 +418,6 @@ def scratch_folder(document: Path) -> Iterator[Path]:
     """Give a folder beside a document for what grows while it is made; it goes with the block.
 
     What a killed run left of it is removed by the next one that makes this document.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be made.
     """
     _remove_rests(document)
     folder = _part_name(document)

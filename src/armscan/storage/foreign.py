@@ -48,13 +48,8 @@ N_COEFFICIENTS = 5
 def parse_foreign_camera(data: bytes, where: str) -> tuple[CameraModel, float]:
     """Camera of a file that OpenCV (YAML, XML, JSON) or ROS (``camera_info`` YAML) wrote.
 
-    Returns
-    -------
-    camera
-        Coefficients beyond ``k1 k2 p1 p2 k3``, of a fisheye beyond ``k1 k2 k3``, are accepted when
-        they are zero.
-    rms_px
-        Reprojection error that the file states; NaN for none.
+    Coefficients beyond ``k1 k2 p1 p2 k3``, of a fisheye beyond ``k1 k2 k3``, are accepted when they
+    are zero. With the reprojection error (px) that the file states; NaN for none.
 
     Raises
     ------
@@ -246,32 +241,14 @@ def _lens(tree: Mapping[str, Any], where: str) -> Lens:
     return "pinhole"
 
 
-def camera_info_yaml(
-    camera: CameraModel, name: str = "camera", *, comments: Iterable[str] = ()
-) -> str:
+def camera_info_yaml(camera: CameraModel, comments: Iterable[str] = ()) -> str:
     """Text of a ``camera_info`` file with the model ``plumb_bob``, of a fisheye ``equidistant``.
 
     Rectification is the identity and the projection matrix repeats the intrinsics: a single
     camera. Numbers are written so that reading them back gives the same floats.
 
-    Parameters
-    ----------
-    camera
-        The camera.
-    name
-        ``camera_name``: letters, digits, ``_``, ``/`` and ``-``.
-    comments
-        Why the calibration was refused, if it was and was written all the same.
-
-    Raises
-    ------
-    InputError
-        If the name holds other characters.
+    ``comments`` are why the calibration was refused, if it was and was written all the same.
     """
-    if not name or not all(letter.isalnum() or letter in "_/-" for letter in name):
-        raise InputError(
-            f"camera name {name!r} cannot be written", remedy="use letters, digits, _ / and -"
-        )
     matrix = camera.matrix
     model, coefficients = "plumb_bob", camera.distortion.tolist()
     if camera.lens == "fisheye":
@@ -280,7 +257,7 @@ def camera_info_yaml(
         *(f"# forced: {' '.join(comment.split())}" for comment in comments),
         f"image_width: {camera.width_px}",
         f"image_height: {camera.height_px}",
-        f"camera_name: {name}",
+        "camera_name: camera",
         *_foreign_ros_matrix("camera_matrix", 3, 3, matrix.ravel().tolist()),
         f"distortion_model: {model}",
         *_foreign_ros_matrix("distortion_coefficients", 1, len(coefficients), coefficients),

@@ -41,16 +41,6 @@ def expand_paths(patterns: Iterable[str | Path]) -> tuple[Path, ...]:
 
     A folder stands for the images in it, a pattern for the files that match; each is sorted in
     natural order, and the order of the arguments is kept. A file that is named twice is taken once.
-
-    Parameters
-    ----------
-    patterns
-        Paths, folders, or patterns with ``*``, ``?``, ``[...]`` and ``**``.
-
-    Raises
-    ------
-    FileFormatError
-        If an argument matches nothing, or a folder holds no image.
     """
     found: dict[Path, None] = {}
     for pattern in patterns:
@@ -144,32 +134,25 @@ def _found(pattern: str) -> list[Path]:
     return sorted(files, key=lambda item: natural_key(item.as_posix()))
 
 
-LEVELS = 3
+LEVELS = 4
 
 
 def are_simulated(paths: Iterable[Path]) -> bool:
-    """True if any file lies, up to three folders deep, beside a mark of the simulator.
+    """True if any file lies, up to four folders deep, beside a mark of the simulator.
 
     The mark is ``simulated = true`` in a recording's ``session.toml``, or ``"simulated": true`` in
     the ``truth.json`` of rendered photographs; the truth itself is never read.
     """
     present = (present_path(path).resolve() for path in paths)
     folders = {folder for path in present for folder in islice(path.parents, LEVELS)}
-    return any(
-        _has_mark(folder / "truth.json") or _says_simulated(folder / "session.toml")
-        for folder in folders
-    )
-
-
-def _has_mark(path: Path) -> bool:
-    try:
-        return parse_json(read_bytes(path), path.name).get("simulated") is True
-    except FileFormatError:
-        return False
+    names = ("truth.json", "session.toml")
+    return any(_says_simulated(folder / name) for folder in folders for name in names)
 
 
 def _says_simulated(path: Path) -> bool:
     try:
-        return parse_toml(read_bytes(path), path.name, "").get("simulated") is True
+        data, is_toml = read_bytes(path), path.suffix == ".toml"
+        said = parse_toml(data, path.name, "") if is_toml else parse_json(data, path.name)
     except FileFormatError:
         return False
+    return said.get("simulated") is True

@@ -32,14 +32,9 @@ Alignment = Literal["low", "high"]
 
 @dataclass(frozen=True, slots=True)
 class ImageOptions:
-    """What a file does not say about its pixels.
+    """What a file does not say: significant bits of a pixel, and where they lie in 16.
 
-    Parameters
-    ----------
-    bits_used
-        Significant bits of a pixel; None takes what the file says (PGM), else all of its bits.
-    align
-        Where the significant bits lie in a 16-bit pixel; high-aligned pixels are shifted down.
+    None takes what the file says (PGM), else all its bits; high-aligned pixels are shifted down.
     """
 
     bits_used: int | None = None
@@ -254,20 +249,7 @@ def image_format(data: bytes) -> str | None:
 
 
 def check_complete(data: bytes, where: str) -> None:
-    """Raise if an image file ends before its picture does, or a PNG's checksums fail.
-
-    Parameters
-    ----------
-    data
-        The whole file.
-    where
-        Its name, for the message.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is cut short or damaged.
-    """
+    """Raise if an image file ends before its picture does, or a PNG's checksums fail."""
     checks = {"PNG": _png_defect, "JPEG": jpeg_defect, "BMP": _bmp_defect, "TIFF": _tiff_defect}
     name = image_format(data)
     if name not in checks:
@@ -354,26 +336,9 @@ HEADER = re.compile(rb"P([2356])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d{1,6})" + rb"\s")
 
 
 def decode_netpbm(data: bytes, where: str) -> tuple[ImageArray, int]:
-    """Decode a PGM (P2, P5) or PPM (P3, P6) file.
+    """Decode a PGM (P2, P5) or PPM (P3, P6) file to its pixels and the bits that they need.
 
-    Parameters
-    ----------
-    data
-        The whole file.
-    where
-        Its name, for messages.
-
-    Returns
-    -------
-    image
-        (H, W) or (H, W, 3) in the order red, green, blue; uint8 or uint16, values as stored.
-    bits_used
-        Bits that the header's greatest value needs.
-
-    Raises
-    ------
-    FileFormatError
-        If the header is not understood or values are missing.
+    (H, W) or (H, W, 3) in the order red, green, blue; uint8 or uint16, values as stored.
     """
     header = HEADER.match(data)
     if header is None:
@@ -429,7 +394,6 @@ def read_exposure(
     options: ImageOptions = DEFAULT_OPTIONS,
     *,
     source: str | None = None,
-    lasers: tuple[str, ...] = (),
 ) -> Exposure:
     """Read an image file of 8 to 16 bits, grey or colour.
 
@@ -444,13 +408,9 @@ def read_exposure(
         What the file does not say about its pixels.
     source
         Name for messages and reports; the file's name if None.
-    lasers
-        Names of the laser sources that were on.
 
     Raises
     ------
-    FileFormatError
-        If the file is missing, empty, cut short, or no such image.
     OptionError
         If pixels exceed the stated bits.
     """
@@ -482,7 +442,7 @@ def read_exposure(
             remedy="state the bits that the camera uses (--bits-used), and --bits-align high where "
             "they are the upper ones of 16",
         )
-    return Exposure(image, name, bits_used=bits, lasers=lasers)
+    return Exposure(image, name, bits_used=bits)
 
 
 def read_exposures(

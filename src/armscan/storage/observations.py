@@ -169,13 +169,7 @@ def _content(arrays: Arrays) -> bytes:
 
 
 def read_observations(path: Path) -> Observations:
-    """Read what `pack_observations` wrote.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is cut short, damaged, too large or is no such file.
-    """
+    """Read what `pack_observations` wrote."""
     try:
         with zipfile.ZipFile(io.BytesIO(read_bytes(path))) as archive:
             if sum(item.file_size for item in archive.infolist()) > MOST_BYTES:

@@ -44,11 +44,6 @@ def read_probed_points(path: Path) -> ProbedPoints:
     A table ``x_mm,y_mm,z_mm[,feature]``. A comment ``# point = tip-centre, tip_diameter_mm = 6``
     says that the points are centres of the tip; without it they are on the surface.
     ``# point = surface, tip_diameter_mm = 6`` keeps the diameter that was compensated for.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is not such a table, holds no point, or is in metres.
     """
     return _probed(read_csv(path))
 
@@ -67,10 +62,7 @@ def probed_points_csv(points: ProbedPoints) -> bytes:
 def parse_plane(text: str, where: str = "") -> FloatArray:
     """Plane (4,) ``A B C D`` with ``A x + B y + C z + D = 0`` from four numbers of any scale.
 
-    Returns
-    -------
-    coefficients
-        (4,) scaled so that the normal has length 1 and D is in mm (eq. 2.55).
+    It is scaled so that the normal has length 1 and D is in mm (eq. 2.55).
 
     Raises
     ------
@@ -100,18 +92,7 @@ def parse_plane(text: str, where: str = "") -> FloatArray:
 
 
 def read_points_or_plane(path: Path) -> ProbedPoints | FloatArray:
-    """Read probed points, or a plane's four numbers with or without the header ``A,B,C,D``.
-
-    Returns
-    -------
-    points or coefficients
-        As `read_probed_points` or `parse_plane` give them.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is neither.
-    """
+    """Read probed points, or a plane's four numbers with or without the header ``A,B,C,D``."""
     data = read_bytes(path)
     words = _plane_words(data)
     if words is None:
@@ -197,8 +178,6 @@ class MarkerList:
     ----------
     markers
         The markers; without a column ``id`` they are numbered from 1 in the order of the rows.
-    path
-        The file.
     has_ids
         True if the list numbers its markers itself.
     is_sigma_assumed
@@ -260,14 +239,8 @@ def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_
     A comment ``# frame = Base`` names the frame, ``# simulated`` marks rendered images. Tables of
     probed points are such lists; points are taken as they stand, centres of a tip included.
 
-    Parameters
-    ----------
-    path
-        The file.
-    frame
-        Frame of the markers where the list names none.
-    sigma_mm
-        Standard deviation an axis where the list gives no covariance.
+    ``frame`` is that of the markers where the list names none, ``sigma_mm`` the standard deviation
+    an axis where it gives no covariance.
 
     Raises
     ------
@@ -330,16 +303,8 @@ def read_profiles(paths: Sequence[Path | str]) -> tuple[PointProfile, ...]:
     plane y = 0. YAML has the list ``scan_line`` of x, y, z one after the other. A place with an
     empty or NaN coordinate is a gap and left out.
 
-    Parameters
-    ----------
-    paths
-        Files or quoted patterns; a folder stands for the profiles in it. Folders and patterns give
-        natural order (p2 before p10).
-
-    Raises
-    ------
-    FileFormatError
-        If a file is missing, cut, no such profile, or holds no point.
+    Files or quoted patterns are given, a folder stands for the profiles in it; folders and patterns
+    give natural order (p2 before p10).
     """
     files = [file for path in paths for file in profile_files(Path(path))]
     names = source_names(files)

@@ -76,14 +76,7 @@ CROWD = 3
 def check_clock(
     rows: Sequence[ExposureRow], arm: ArmTrack, said: SessionFile, folder: Path
 ) -> tuple[list[str], list[str]]:
-    """Refuse a recording whose poses cannot be found.
-
-    Returns
-    -------
-    assumed
-        What is assumed of its clock, in words.
-    warnings
-        What is odd in its times, in words.
+    """Refuse a recording whose poses cannot be found; tell what is assumed, and odd, in words.
 
     Raises
     ------
@@ -202,8 +195,6 @@ def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposur
 
     Raises
     ------
-    FileFormatError
-        If the image is missing or damaged, or its size or layout is not the camera's.
     OptionError
         If pixels exceed the stated bits.
     """
@@ -230,17 +221,7 @@ def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposur
 
 
 def setup_of_image(path: Path, setup: CameraSetup, lacking: Sequence[str]) -> CameraSetup:
-    """Complete what nobody said about a camera by one of its images.
-
-    Parameters
-    ----------
-    path
-        The image.
-    setup
-        What is known, defaults elsewhere.
-    lacking
-        Names of the fields that nobody said.
-    """
+    """Complete by one of its images what is lacking: what nobody said about a camera."""
     bits = None if "bits_used" in lacking else setup.bits_used
     image = read_exposure(path, ImageOptions(bits, setup.align))
     found: dict[str, Any] = {key: getattr(image, key) for key in lacking}
@@ -336,14 +317,8 @@ class FolderRecording:
 
     Parameters
     ----------
-    folder
-        Where it lies.
-    session, rows, arm
-        See `ScanSource`.
     is_simulated
         True if it, or a mark beside it, says that its images were rendered.
-    warnings
-        What is odd in it, in words.
     exposure_columns, arm_columns
         Columns of the tables that are not known, in the order of ``rows`` and of the samples.
     arm_model
@@ -366,13 +341,7 @@ class FolderRecording:
         return recording_name(self.folder)
 
     def exposure(self, row: int) -> Exposure:
-        """Read the exposure of ``rows[row]`` with its pixels.
-
-        Raises
-        ------
-        FileFormatError
-            If the image is missing or damaged, or its size or layout is not the camera's.
-        """
+        """Read the exposure of ``rows[row]`` with its pixels."""
         chosen = self.rows[row]
         return read_recorded(self.folder, chosen, self.session.cameras[chosen.camera])
 
@@ -398,17 +367,7 @@ def recording_tables(folder: Path) -> tuple[Path, ...]:
 def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording:
     """Read a folder recording, or the one in an MCAP file; images are read later, one by one.
 
-    Parameters
-    ----------
-    folder
-        Holds ``exposures.csv``, images, and as a rule ``session.toml`` and ``arm.csv``.
-    arm
-        Turns joint angles into poses; ``arm.toml`` of the recording if None.
-
-    Raises
-    ------
-    FileFormatError
-        If a table is missing, damaged or against a rule of the format.
+    ``arm`` turns joint angles into poses, ``arm.toml`` of the recording if None.
     """
     _check_folder(folder)
     table = read_csv(folder / EXPOSURES_FILE)
@@ -445,27 +404,7 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
 
 
 def read_arm_track(folder: Path, arm: ArmModel | None = None) -> tuple[ArmTrack, tuple[str, ...]]:
-    """Read what the arm reported, from a folder with or without images.
-
-    Parameters
-    ----------
-    folder
-        Holds ``arm.csv``, and as a rule ``session.toml``.
-    arm
-        Turns joint angles into poses; ``arm.toml`` of the folder if None.
-
-    Returns
-    -------
-    track
-        The samples.
-    notes
-        What is odd in the files or was assumed, in words.
-
-    Raises
-    ------
-    FileFormatError
-        If a file is missing, damaged or against a rule of the format.
-    """
+    """Read what the arm reported, from a folder with or without images; and what is odd."""
     said, notes = _said(folder)
     table = read_csv(folder / ARM_FILE)
     found = _arm_table(table, said, arm if arm is not None else _own_arm_model(folder))
@@ -586,34 +525,18 @@ def write_recording(
     arm: ArmModel | None = None,
     beside: Mapping[Path, bytes] | None = None,
 ) -> None:
-    """Write a scan as a folder recording.
+    """Write a scan as a folder recording, into a folder that does not exist or is empty.
 
     Everything is written into a folder of another name, which is renamed when it is complete; an
     interrupt or a full disk leaves nothing. Images of a folder recording are copied byte by byte,
-    those of any other source are written as PNG.
-
-    Parameters
-    ----------
-    folder
-        Must not exist, or be empty.
-    source
-        What to write.
-    progress
-        Called with images written, images in all, and the name of the latest.
-    names
-        (N,) paths of the images inside the recording; if None their own names where those are
-        paths of PNG files, else by index.
-    encoded
-        (N,) the images' PNG files, where they were made already; see `encoded_png`.
-    arm
-        Geometry that turns joint angles into poses.
-    beside
-        Files outside the folder that appear with it; see `new_folder`.
+    those of any other source are written as PNG, or as ``encoded`` (N,), where they were made
+    already; see `encoded_png`. ``names`` (N,) are their paths inside the recording; if None their
+    own names where those are paths of PNG files, else by index. ``progress`` is called with images
+    written, images in all, and the name of the latest; files ``beside`` appear with the folder
+    (`new_folder`).
 
     Raises
     ------
-    OutputError
-        If the folder holds something, or cannot be written.
     InputError
         If an exposure is not what its session says.
     """

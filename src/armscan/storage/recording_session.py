@@ -84,17 +84,7 @@ LAYOUTS: Mapping[type, Layout] = {
 
 @dataclass(frozen=True, slots=True)
 class SessionFile:
-    """What ``session.toml`` says.
-
-    Parameters
-    ----------
-    session
-        Its facts, defaults where it says nothing; no cameras if it names none.
-    stated
-        Keys that it holds, as ``pose.form`` or ``camera.0.colour``.
-    warnings
-        What is odd in it.
-    """
+    """What ``session.toml`` says, defaults elsewhere; its keys, as ``camera.0.colour``."""
 
     session: Session
     stated: frozenset[str] = frozenset()
@@ -102,13 +92,7 @@ class SessionFile:
 
 
 def read_session_file(path: Path) -> SessionFile:
-    """Read ``session.toml``.
-
-    Raises
-    ------
-    FileFormatError
-        If it is no TOML, or a key has a wrong type or value.
-    """
+    """Read ``session.toml``."""
     where = path_text(path)
     content = parse_toml(read_bytes(path), where, 'write lines as kind = "scan"')
     unknown: list[str] = []
@@ -228,13 +212,7 @@ def exposure_columns(rows: Sequence[ExposureRow], extra: Columns) -> dict[str, t
 
 
 def check_files(folder: Path, rows: Sequence[ExposureRow]) -> None:
-    """Raise if an image that is listed does not exist.
-
-    Raises
-    ------
-    FileFormatError
-        Naming the first one and the count.
-    """
+    """Raise if an image that is listed does not exist."""
     missing = [row.source for row in rows if not is_file(folder / row.source)]
     if missing:
         raise FileFormatError(

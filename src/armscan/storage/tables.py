@@ -53,8 +53,6 @@ class CsvTable:
 
     Parameters
     ----------
-    where
-        Name of the file, for messages.
     columns
         Cells of each column, stripped of blanks, in the order of the header.
     lines
@@ -86,13 +84,7 @@ class CsvTable:
     def refuse_repeats(
         self, name: str, values: Sequence[Any], remedy: str = "give each line its own"
     ) -> None:
-        """Raise if a value of a column occurs twice.
-
-        Raises
-        ------
-        FileFormatError
-            Naming both lines.
-        """
+        """Raise if a value of a column occurs twice."""
         first: dict[Any, int] = {}
         for row, value in enumerate(values):
             if first.setdefault(value, row) != row:
@@ -103,13 +95,7 @@ class CsvTable:
                 )
 
     def points(self, noun: str) -> FloatArray:
-        """Coordinates (N, 3) in mm, at least one row.
-
-        Raises
-        ------
-        FileFormatError
-            If columns or rows are missing, a cell is no number, or the points are in another unit.
-        """
+        """Coordinates (N, 3) in mm, at least one row."""
         refuse_other_units(self.columns, self.where)
         self.require(COORDINATES, noun)
         points = self.floats(COORDINATES)
@@ -123,13 +109,7 @@ class CsvTable:
         return points
 
     def require(self, names: Sequence[str], noun: str = "") -> None:
-        """Raise if a column is missing, or rows are; ``noun`` is a row's, where one is needed.
-
-        Raises
-        ------
-        FileFormatError
-            Naming the columns that are missing, and those that there are.
-        """
+        """Raise if a column is missing, or rows are; ``noun`` is a row's, where one is needed."""
         missing = [name for name in names if name not in self.columns]
         if not missing and noun and not len(self):
             raise FileFormatError(
@@ -149,20 +129,7 @@ class CsvTable:
         )
 
     def floats(self, names: Sequence[str], *, may_lack: bool = False) -> FloatArray:
-        """Return columns as numbers (N, len(names)).
-
-        Parameters
-        ----------
-        names
-            Columns.
-        may_lack
-            Take empty cells and ``nan`` as NaN instead of refusing them.
-
-        Raises
-        ------
-        FileFormatError
-            Naming line and column of a cell that is no finite number.
-        """
+        """Columns as numbers (N, len(names)); with ``may_lack`` empty cells and ``nan`` as NaN."""
         columns = [self._column(name, may_lack) for name in names]
         return np.array(columns, dtype=np.float64).reshape(len(names), len(self)).T
 
@@ -195,20 +162,7 @@ class CsvTable:
         return values
 
     def ints(self, name: str, missing: int | None = None) -> IntArray:
-        """Return a column as whole numbers (N,).
-
-        Parameters
-        ----------
-        name
-            The column.
-        missing
-            Stands for an empty cell; None refuses empty cells.
-
-        Raises
-        ------
-        FileFormatError
-            Naming line and column of a cell that is no whole number of 64 bits.
-        """
+        """A column as whole numbers (N,); ``missing`` stands for an empty cell, None refuses it."""
         cells = self.columns[name]
         if PLAIN_INTEGERS.fullmatch("\n".join(cells)):
             return np.array(list(map(int, cells)), dtype=np.int64)
@@ -404,13 +358,7 @@ def _wrong_length(
 
 
 def refuse_other_units(names: Iterable[str], where: str) -> None:
-    """Raise for a heading's columns of coordinates in another unit than mm.
-
-    Raises
-    ------
-    FileFormatError
-        If there are three of them.
-    """
+    """Raise for a heading's columns of coordinates in another unit than mm."""
     for unit, (word, factor) in OTHER_UNITS.items():
         found = [name for name in names if name.lower() in {f"{axis}_{unit}" for axis in "xyz"}]
         if len(found) == len(COORDINATES):
@@ -422,13 +370,7 @@ def refuse_other_units(names: Iterable[str], where: str) -> None:
 
 
 def refuse_beyond_reach(points_mm: FloatArray, where: str) -> None:
-    """Raise for coordinates (N, 3) that no instrument reaches; gaps of NaN pass.
-
-    Raises
-    ------
-    FileFormatError
-        If one lies beyond `LARGEST_MM`.
-    """
+    """Raise for coordinates (N, 3) that no instrument reaches; gaps of NaN pass."""
     beyond = np.abs(points_mm) > LARGEST_MM
     if beyond.any():
         row, column = (int(value) for value in np.argwhere(beyond)[0])

@@ -52,14 +52,8 @@ def plane_in_tool(plane_base: FloatArray, base_from_tool: Pose[Base, Tool]) -> F
 
 
 def design_rows(plane_tool: FloatArray, points_mm: FloatArray) -> FloatArray:
-    """Rows H_ij (N, 12) of eqs. 2.72 and 2.75.
-
-    Parameters
-    ----------
-    plane_tool
-        (4,) the plate in Tool.
-    points_mm
-        (N, 3) in the Sensor frame.
+    """Rows H_ij (N, 12) of eqs. 2.72 and 2.75, of the plate (4,) in Tool and points (N, 3) in
+    Sensor.
     """
     points = homogeneous(points_mm)
     rows = plane_tool[None, :3, None] * points[:, None, :]
@@ -93,16 +87,8 @@ def objective(
 ) -> float:
     """F of eq. 2.76 in mm^2: the sum of squared distances of all points from the plate.
 
-    Parameters
-    ----------
-    plane_base
-        (4,) ``A B C D`` with a unit normal.
-    poses
-        Pose of the arm for each scan.
-    points_mm
-        (N, 3) points of each scan in the Sensor frame.
-    tool_from_sensor
-        Where it is evaluated.
+    ``plane_base``: (4,) ``A B C D`` with a unit normal. ``points_mm``: (N, 3) points of each scan
+    in the Sensor frame.
     """
     unknowns = hand_eye_unknowns(tool_from_sensor)
     total = 0.0
@@ -155,14 +141,7 @@ SAME_ROTATION_DEG = 0.1
 class PrintedHandEye(ArrayRecord):
     """A hand-eye by the printed equations, to set beside ours; it has no covariance.
 
-    Parameters
-    ----------
-    tool_from_sensor
-        The hand-eye.
-    rms_mm
-        Root mean square of what its own equations leave.
-    equations
-        Which those are.
+    ``rms_mm`` is the root mean square of what its own equations leave.
     """
 
     tool_from_sensor: Pose[Tool, Sensor]
@@ -215,8 +194,6 @@ class TwoStepHandEye:
 
     Parameters
     ----------
-    tool_from_sensor
-        The hand-eye.
     centre_mm
         (3,) the sphere's centre in Base.
     side

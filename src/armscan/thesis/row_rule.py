@@ -18,13 +18,7 @@ from armscan.records.profile import Profile
 
 @dataclass(frozen=True, slots=True)
 class LaserSchedule:
-    """Lasers that are on, exposure by exposure, over and over.
-
-    Parameters
-    ----------
-    pattern
-        Names of the sources that are on in each exposure of a period.
-    """
+    """Names of the sources that are on in each exposure of a period, over and over."""
 
     pattern: tuple[tuple[str, ...], ...]
 
@@ -45,15 +39,7 @@ THESIS_SCHEDULE = LaserSchedule((("A",), ("B",), ("A", "B")))
 
 @dataclass(frozen=True, slots=True)
 class RowOptions:
-    """Options of the thesis's rule.
-
-    Parameters
-    ----------
-    threshold_px
-        Largest difference of rows, the T of eqs. 3.6 and 3.7.
-    schedule
-        Which lasers are on when.
-    """
+    """Options of the thesis's rule; ``threshold_px`` is T of eqs. 3.6 and 3.7, in rows."""
 
     threshold_px: float = 10.0
     schedule: LaserSchedule = THESIS_SCHEDULE
@@ -77,18 +63,6 @@ class RowLabeller:
     its row is within T of A's (eq. 3.6), B's if within T of B's (eq. 3.7), and where both hold,
     of the nearer (section 5.2.3). Where a column has several rows of one laser, the nearest
     counts. Points that match neither are without a name.
-
-    Parameters
-    ----------
-    sensor
-        Camera and sheets; each source has one sheet, of its name.
-    options
-        Defaults if None.
-
-    Raises
-    ------
-    InputError
-        If a source of the schedule has no sheet.
     """
 
     def __init__(self, sensor: SensorCalibration, options: RowOptions | None = None) -> None:

@@ -5,12 +5,12 @@
 With A, B, C, D in order along the line the cross ratio of eq. 4.24, ``(AC / BC) / (AD / BD)``, does
 not change when the line is read from its other end, so that it names a code of four points but
 not its direction: some perspective turns every four points round. Only how strong a perspective
-that takes can tell; see `LineCode.max_perspective`.
+that takes can tell; see `MAX_PERSPECTIVE`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -23,6 +23,12 @@ from armscan.models.two_views import PARALLEL_SINE, TwoViews
 from armscan.records.points import MarkerSet
 
 CODE_POINTS = 4
+MAX_PERSPECTIVE = 0.3
+"""Largest ratio of the distances from the camera of a line's two ends, minus 1, that is believed
+when the direction is decided."""
+MAX_SIGMAS = 4.0
+"""Largest distance of a point from the line and of the ratio from a code's, in their standard
+deviations. Two codes within it make the points ambiguous."""
 
 
 def simple_ratio(a: float, b: float, c: float) -> float:
@@ -41,27 +47,10 @@ def cross_ratio(a: float, b: float, c: float, d: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class LineCode:
-    """Four points on a line.
-
-    Parameters
-    ----------
-    name
-        What the code stands for.
-    positions_mm
-        Places of the points along their line, increasing.
-    max_perspective
-        Largest ratio of the distances from the camera of the line's two ends, minus 1, that is
-        believed when the direction is decided.
-
-    Raises
-    ------
-    InputError
-        If there are not four increasing positions.
-    """
+    """Four points on a line, and what they stand for; their places along it increase."""
 
     name: str
     positions_mm: tuple[float, ...]
-    max_perspective: float = 0.3
 
     def __post_init__(self) -> None:
         if len(self.positions_mm) != CODE_POINTS or not (np.diff(self.positions_mm) > 0.0).all():
@@ -80,10 +69,7 @@ class LineCode:
 def parse_code(text: str) -> LineCode:
     """Read ``NAME=A,B,C,D``: a code and the places of its four points along their line, mm.
 
-    Raises
-    ------
-    OptionError
-        If it is not of that form, or the places do not increase.
+    `OptionError` if it is not of that form, or the places do not increase.
     """
     name, _, places = text.partition("=")
     try:
@@ -124,7 +110,6 @@ def decode_line(
     points_px: FloatArray,
     covariance_px2: FloatArray,
     codes: tuple[LineCode, ...],
-    max_sigmas: float = 4.0,
 ) -> DecodedLine | FitFailure:
     """Name four points, given in any order, or say why not.
 
@@ -136,16 +121,13 @@ def decode_line(
         (4, 2, 2) their covariance.
     codes
         The codes that there are.
-    max_sigmas
-        Largest distance of a point from the line and of the ratio from a code's, in their
-        standard deviations. Two codes within it make the points ambiguous.
     """
     middle = points_px.mean(axis=0)
     direction = np.linalg.svd(points_px - middle)[2][0]
     across = np.array([-direction[1], direction[0]])
     off = (points_px - middle) @ across
     sigma_off = np.sqrt(np.einsum("i,nij,j->n", across, covariance_px2, across))
-    if (np.abs(off) > max_sigmas * sigma_off).any():
+    if (np.abs(off) > MAX_SIGMAS * sigma_off).any():
         return FitFailure(
             f"a point lies {np.abs(off).max():.2g} px off the line", "take points on one line"
         )
@@ -153,10 +135,10 @@ def decode_line(
     order = np.argsort(along, kind="stable")
     t = along[order]
     variance = np.einsum("i,nij,j->n", direction, covariance_px2[order], direction)
-    if (np.diff(t) < max_sigmas * np.sqrt(variance[:-1] + variance[1:])).any():
+    if (np.diff(t) < MAX_SIGMAS * np.sqrt(variance[:-1] + variance[1:])).any():
         return FitFailure("two points coincide", "leave one of them out")
     ratio, sigma = _ratio_with_sigma(t, variance)
-    fitting = [code for code in codes if abs(ratio - code.ratio) <= max_sigmas * sigma]
+    fitting = [code for code in codes if abs(ratio - code.ratio) <= MAX_SIGMAS * sigma]
     if not fitting:
         return FitFailure(f"no code has the cross ratio {ratio:.4g} +- {sigma:.2g}")
     if len(fitting) > 1:
@@ -167,7 +149,7 @@ def decode_line(
         )
     code = fitting[0]
     forward, backward = (_perspective(code, way * t[::way]) for way in (1, -1))
-    is_forward, is_backward = (p <= code.max_perspective for p in (forward, backward))
+    is_forward, is_backward = (p <= MAX_PERSPECTIVE for p in (forward, backward))
     if not (is_forward or is_backward):
         return FitFailure(
             f"code {code.name} would need its ends' distances to differ by "
@@ -181,18 +163,10 @@ def find_coded_lines(
     points_px: FloatArray,
     covariance_px2: FloatArray,
     codes: tuple[LineCode, ...],
-    max_sigmas: float = 4.0,
 ) -> tuple[DecodedLine, ...]:
     """Every code among N points; a point that two codes claim makes both void.
 
-    Parameters
-    ----------
-    points_px
-        (N, 2) image points, free of distortion.
-    covariance_px2
-        (N, 2, 2) their covariance.
-    codes, max_sigmas
-        As in `decode_line`.
+    Arguments as of `decode_line`.
     """
     sigma = np.sqrt(np.linalg.eigvalsh(covariance_px2)[:, 1]) if len(points_px) else np.zeros(0)
     found: list[DecodedLine] = []
@@ -202,20 +176,12 @@ def find_coded_lines(
         offset = points_px - points_px[first]
         share = offset @ span / length**2
         off = np.abs(offset[:, 0] * span[1] - offset[:, 1] * span[0]) / length
-        between = np.flatnonzero((share > 0.0) & (share < 1.0) & (off < 2.0 * max_sigmas * sigma))
+        between = np.flatnonzero((share > 0.0) & (share < 1.0) & (off < 2.0 * MAX_SIGMAS * sigma))
         for inner in combinations(between.tolist(), CODE_POINTS - 2):
             rows = np.array([first, *inner, last])
-            line = decode_line(points_px[rows], covariance_px2[rows], codes, max_sigmas)
+            line = decode_line(points_px[rows], covariance_px2[rows], codes)
             if isinstance(line, DecodedLine):
-                found.append(
-                    DecodedLine(
-                        line.name,
-                        rows[line.points],
-                        line.is_direction_known,
-                        line.ratio,
-                        line.sigma,
-                    )
-                )
+                found.append(replace(line, points=rows[line.points]))
     uses = np.bincount(
         np.array([row for line in found for row in line.points], dtype=np.int64),
         minlength=len(points_px),
@@ -260,13 +226,6 @@ def match_after_thesis(first: MarkerSet, second: MarkerSet, limit_mm: float) -> 
     by its distance to that pair alone (steps (6)-(8)), so two markers at equal distances from it
     are confused. Nothing is checked afterwards. Known failures: equal distances, a wrong first
     pair, markers that only one set holds.
-
-    Parameters
-    ----------
-    first, second
-        The sets.
-    limit_mm
-        The threshold T.
 
     Returns
     -------

@@ -8,13 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.stats import chi2, kstest
 
+from armscan.calibration.hand_eye import on_board
 from armscan.calibration.hand_eye.alternatives import other_readings
 from armscan.calibration.hand_eye.board_looks import BoardLook, find_board_start
 from armscan.calibration.hand_eye.board_result import BoardHandEyeFit
 from armscan.calibration.hand_eye.observations import HandEyeOptions
-from armscan.calibration.hand_eye.on_board import _Problem, calibrate_on_board
+from armscan.calibration.hand_eye.on_board import (
+    _chance,
+    _Problem,
+    _solve,
+    calibrate_on_board,
+)
+from armscan.calibration.sheets.board_points import BoardBow
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
@@ -99,6 +106,24 @@ def test_right_postures_are_kept_and_sizes_agree(
     assert sum(len(fit.not_used) for _, fit in drawn) <= 1
     sizes = [(fit.asked.scale - 1.0) / fit.asked.sigma for _, fit in drawn]
     assert 0.7 < np.sqrt(np.mean(np.square(sizes))) < 1.3
+
+
+def test_chances_of_right_postures_are_even() -> None:
+    """What a posture is off the others, as a chance, is uniform, however few the others are."""
+    chances = []
+    for seed in range(20):
+        rig = board_rig(seed, 6, arm_mm=0.2)
+        start = find_board_start(rig.looks)
+        assert not isinstance(start, FitFailure)
+        problem = _Problem.of(rig.looks, start, rig.camera, HandEyeOptions(), None)
+        for name in problem.postures:
+            others = _solve(problem.without([name]))
+            assert not isinstance(others, FitFailure)
+            chances.append(_chance(problem, name, others)[0])
+    assert kstest(chances, "uniform").pvalue > 0.01
+    squares = chi2.isf(chances, 6)
+    assert kstest(chi2.sf(1.5 * squares, 6), "uniform").pvalue < 1e-3
+    assert kstest(chi2.sf(squares / 1.5, 6), "uniform").pvalue < 1e-3
 
 
 def test_the_moved_camera_is_nearer_to_the_true_one(
@@ -237,6 +262,45 @@ def test_a_camera_without_uncertainty_is_taken_as_exact_and_told() -> None:
     assert isinstance(fit, BoardHandEyeFit)
     np.testing.assert_array_equal(fit.camera_step, np.zeros(9))
     assert "taken as exact" in fit.warnings[0]
+
+
+def test_of_many_looks_some_are_taken_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = board_rig(4, 15)
+    monkeypatch.setattr(on_board, "MAX_LOOKS", 8)
+    fit = solved(rig)
+    expected = [rig.looks[k].poses[0].view.source for k in (0, 2, 4, 6, 8, 10, 12, 14)]
+    assert [posture.source for posture in fit.postures] == expected
+    assert any("8 of 15 looks" in text for text in fit.warnings)
+
+
+def test_an_arm_that_scatters_much_is_warned_of() -> None:
+    much, little = (solved(board_rig(5, 14, arm_mm=size, lever_mm=400.0)) for size in (1.5, 0.1))
+    assert any("much even for a robot" in text for text in much.warnings)
+    assert not any("much even for a robot" in text for text in little.warnings)
+
+
+def test_a_bow_is_taken_out_of_the_pose_of_a_view() -> None:
+    """A known bow leaves the poses where a flat target would have put them."""
+    corners = parse_target("chessboard:9x6:25").points_board_mm[:, :2]
+    bow = BoardBow(
+        bow_mm=np.array([2.0, -1.0]),
+        covariance_mm2=np.zeros((2, 2)),
+        by_cameras=np.zeros((2, 9)),
+        low_mm=corners.min(axis=0),
+        high_mm=corners.max(axis=0),
+    )
+    flat = board_rig(6, 5)
+    with_bow = board_rig(6, 5, bow=bow, true_bow_mm=(2.0, -1.0))
+    without = board_rig(6, 5, true_bow_mm=(2.0, -1.0))
+    for one, other, blind in zip(flat.looks, with_bow.looks, without.looks, strict=True):
+        sigma_mm = np.sqrt(np.diag(one.poses[0].covariance)[3:])
+        place = one.poses[0].sensor_from_board.translation_mm
+        step, wrong = (
+            np.abs(look.poses[0].sensor_from_board.translation_mm - place) / sigma_mm
+            for look in (other, blind)
+        )
+        assert step.max() < 0.5
+        assert wrong.max() > 2.0
 
 
 def test_three_postures_are_too_few() -> None:

@@ -63,6 +63,30 @@ def test_exact_features_give_the_printed_plane() -> None:
     assert not sheet.warnings
 
 
+def test_the_sign_of_a_normal_does_not_matter() -> None:
+    """A normal is known but for its sign: one turned in any half of the points changes nothing."""
+    rig, rng = thesis_rig(), np.random.default_rng(3)
+    plain = rig.boards(rig.camera, rng)
+    turned = [
+        replace(
+            board,
+            profile=replace(
+                board.profile,
+                normals_px=board.profile.normals_px * rng.choice([-1.0, 1.0], (120, 1)),
+            ),
+        )
+        for board in plain
+    ]
+    one, other = (calibrate_sheets(b, rig.calibration(rig.camera)) for b in (plain, turned))
+    assert isinstance(one, LaserFit)
+    assert isinstance(other, LaserFit)
+    np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-6, atol=1e-18)
+    assert distance_mm(other.sheets[0].sheet, UNIT_PLANE) == pytest.approx(
+        distance_mm(one.sheets[0].sheet, UNIT_PLANE), rel=1e-6
+    )
+    assert other.diagnostics.noise_factor == pytest.approx(one.diagnostics.noise_factor)
+
+
 def test_document_carries_depths_counts_and_camera() -> None:
     fit = fitted(thesis_rig())
     points = np.concatenate([i.points_mm[i.use == PointUse.USED] for i in fit.images])

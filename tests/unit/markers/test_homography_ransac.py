@@ -7,13 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, apply_homography
 from armscan.geometry.estimate import FitFailure
 from armscan.markers.surface_support import (
     HomographyConsensus,
     find_homography,
     fit_homography,
-    transfer_px,
 )
 
 TRUE = np.array([[0.9, 0.2, 300.0], [-0.1, 1.1, -50.0], [2e-4, -1e-4, 1.0]])
@@ -46,7 +45,7 @@ def test_noisy_pairs_give_what_opencv_gives() -> None:
     assert not isinstance(matrix, FitFailure)
     other, _ = cv2.findHomography(left, right)
     # OpenCV minimises the distance itself: the two differ by less than the noise of the fit.
-    difference = transfer_px(matrix, left) - transfer_px(np.asarray(other), left)
+    difference = apply_homography(matrix, left) - apply_homography(np.asarray(other), left)
     assert np.sqrt(np.mean(difference**2)) < 0.3 * np.sqrt(8.0 / 40.0) / 3.0
 
 

@@ -19,7 +19,7 @@ from armscan.cli.twin import PresetName, Scene
 from armscan.devices.sources import Preset, TwinScene
 from armscan.errors import ArmscanError, InputError, OptionError, OutputError
 from armscan.jobs.twin import simulate as simulate_job_simulate
-from armscan.jobs.twin.simulate import SimulateRequest, run_simulation
+from armscan.jobs.twin.simulate import run_simulation
 from armscan.pipeline import simulate
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.simulate import (
@@ -156,7 +156,7 @@ def test_the_command_knows_all_scenes_and_presets() -> None:
 
 @pytest.mark.parametrize("scene", get_args(TwinScene))
 def test_the_report_says_what_comes_next(tmp_path: Path, scene: TwinScene) -> None:
-    summary = run_simulation(SimulateRequest(HEAD, scene, tmp_path / "scan"))
+    summary = run_simulation(HEAD, scene, tmp_path / "scan", SimulateOptions())
     word = {"camera": "camera", "laser": "laser", "hand-eye": "hand-eye", "probing": "probe"}
     word |= {"markers": "markers", "markers-moved": "markers", "latency": "latency"}
     assert f" {word.get(scene, 'reconstruct')} " in summary.next_step
@@ -177,7 +177,7 @@ def test_two_cameras_are_calibrated_as_a_pair(
 ) -> None:
     found = SimulatedScene(Path("board"), Path("t.json"), 4, 0, "circle-grid:11x9:3.75", 2, ("A",))
     monkeypatch.setattr(simulate_job_simulate, "simulate_scene", lambda *_: found)
-    summary = run_simulation(SimulateRequest("thesis-multi", scene, Path("board")))
+    summary = run_simulation("thesis-multi", scene, Path("board"), SimulateOptions())
     assert step in summary.next_step.replace("\\", "/")
 
 

@@ -261,6 +261,7 @@ def test_a_recording_says_itself_that_it_is_simulated(tmp_path: Path) -> None:
     assert read_recording(folder).is_simulated
     assert are_simulated([folder / "images/0.png"])
     assert are_simulated([folder / "images/on/0.png"])
+    assert are_simulated([folder / "images/left/A/0.png"])
     assert not are_simulated([tmp_path / "other.png"])
     silent = lab_folder(tmp_path / "c")
     assert not read_recording(silent).is_simulated

@@ -95,6 +95,18 @@ def test_circle_is_one_closed_unbiased_segment(radius_px: float) -> None:
     assert all(p.segment[p.is_accepted].max() == 0 for p in noisy.profiles)
 
 
+@pytest.mark.parametrize("angle_deg", [45.0, 135.0, 0.0, 90.0])
+def test_normals_of_a_segment_point_to_one_side(angle_deg: float) -> None:
+    """Also where a line runs as a single normal's sign would turn: residuals keep their side."""
+    straight = score(StripeScene((line(angle_deg),), 320, 240), range(2))
+    ring = SimulatedStripe(CircleCurve(120.3, 120.2, 100.0))
+    for profile in (*straight.profiles, *score(StripeScene((ring,), 240, 240), range(1)).profiles):
+        is_same = profile.segment[1:] == profile.segment[:-1]
+        cosine = np.einsum("ni,ni->n", profile.normals_px[1:], profile.normals_px[:-1])
+        assert is_same.sum() > 200
+        assert cosine[is_same].min() > 0.8
+
+
 def test_waves_are_not_smoothed_away() -> None:
     wave = WaveCurve(0.0, 120.0, 10.0, amplitude_px=10.0, period_px=120.0)
     clean = score(StripeScene((SimulatedStripe(wave),), 320, 240, noise=NO_NOISE), range(1))

@@ -47,10 +47,6 @@ class Observations:
         (N, 2) height of the board per unit of the two bow parameters.
     starts
         (V + 1,) first row of each view, and N.
-    width_px, height_px
-        Size of the image.
-    lens
-        Kind of lens that is supposed.
     """
 
     points_px: FloatArray
@@ -161,14 +157,9 @@ def board_warp_shape(board_mm: FloatArray) -> FloatArray:
 def free_basis(
     model: DistortionModel, options: CameraOptions, *, with_board_warp: bool
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """Directions in the shared unknowns that are solved.
+    """Directions (11, F) in the shared unknowns that are solved, and the free parameters' names.
 
-    Returns
-    -------
-    basis
-        (11, F): a step is ``basis @ free_step``.
-    names
-        Names of the camera's free parameters; with a fixed aspect ``fy_px`` follows ``fx_px``.
+    A step is ``basis @ free_step``; with a fixed aspect ``fy_px`` follows ``fx_px``.
     """
     names = ["fx_px"] + ([] if options.is_aspect_fixed else ["fy_px"])
     if not options.is_principal_point_fixed:
@@ -195,14 +186,8 @@ S = TypeVar("S")
 class NormalEquations:
     """Gauss-Newton normal equations in blocks: F shared unknowns and V poses.
 
-    Parameters
-    ----------
-    chi2
-        Weighted sum of squares.
-    shared, cross, pose
-        (F, F), (V, F, 6) and (V, 6, 6) blocks of ``J' J``.
-    shared_gradient, pose_gradient
-        (F,) and (V, 6) of ``J' r`` with r observed minus predicted.
+    Blocks (F, F), (V, F, 6) and (V, 6, 6) of ``J' J``, (F,) and (V, 6) of ``J' r`` with r observed
+    minus predicted.
     """
 
     chi2: float
@@ -216,19 +201,11 @@ class NormalEquations:
 def predict(
     observations: Observations, state: State
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Predict the image points, with derivatives.
+    """Predict the image points (N, 2), with derivatives; None if the state is impossible.
 
-    Returns
-    -------
-    predicted_px
-        (N, 2).
-    by_shared
-        (N, 2, 11) derivative by the shared unknowns.
-    by_pose
-        (N, 2, 6) derivative by the pose of the point's view: rotation-vector increment (rad,
-        Sensor frame, on the left) and translation (mm).
-
-    None if the state is impossible: a point behind the camera, or a focal length not positive.
+    These are (N, 2, 11) by the shared unknowns and (N, 2, 6) by the pose of the point's view:
+    rotation-vector increment (rad, Sensor frame, on the left) and translation (mm). Impossible is a
+    point behind the camera, or a focal length not positive.
     """
     if not np.isfinite(state.shared).all() or min(state.shared[:2]) <= 0.0:
         return None
@@ -271,16 +248,8 @@ def normal_equations(
 ) -> NormalEquations:
     """Sum up the points' equations in blocks.
 
-    Parameters
-    ----------
-    observations
-        N points of V views; a view may have none.
-    predicted_px
-        (N, 2) prediction.
-    by_shared, by_pose
-        (N, 2, F) and (N, 2, 6) its derivatives by the free shared unknowns and by the view's pose.
-    weights
-        (N,) factors of each point's chi2.
+    A view may have no point. The derivatives are (N, 2, F) by the free shared unknowns and (N, 2,
+    6) by the view's pose, the weights (N,) factors of each point's chi2.
     """
     whitening = observations.whitening * np.sqrt(weights)[:, None, None]
     residual = (whitening @ (observations.points_px - predicted_px)[:, :, None])[:, :, 0]
@@ -301,14 +270,8 @@ def normal_equations(
 
 
 def damped_step(equations: NormalEquations, damping: float) -> tuple[FloatArray, FloatArray] | None:
-    """Solve the damped normal equations by Schur's complement of the poses.
-
-    Returns
-    -------
-    shared_step, pose_steps
-        (F,) and (V, 6), or None if the matrix is singular.
-    """
-    pose = equations.pose + damping * _diagonals(equations.pose)
+    """Solve the damped normal equations by Schur's complement of the poses: (F,) and (V, 6)."""
+    pose = equations.pose + damping * (equations.pose * np.eye(equations.pose.shape[-1]))
     shared = equations.shared + damping * np.diag(np.diag(equations.shared))
     try:
         inverse = np.linalg.inv(pose)
@@ -335,10 +298,6 @@ def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right))
 
 
-def _diagonals(blocks: FloatArray) -> FloatArray:
-    return np.asarray(blocks * np.eye(blocks.shape[-1]))
-
-
 def moved(
     state: State, basis: FloatArray, shared_step: FloatArray, pose_steps: FloatArray
 ) -> State:
@@ -358,23 +317,9 @@ def adjust(
 ) -> Minimum[State, NormalEquations] | FitFailure:
     """Minimise eq. 2.39, weighted by each point's covariance.
 
-    Parameters
-    ----------
-    observations
-        The image points.
-    start
-        Starting values.
-    basis
-        (11, F) from `free_basis`; (11, 0) solves the poses alone.
-    weights
-        (N,) factors of each point's chi2, 0 to leave a point out; all 1 if None.
-    max_steps
-        Most iterations; what is reached by then is returned.
-
-    Returns
-    -------
-    adjustment
-        The minimum, or what was reached by the last step; or why there is none.
+    ``basis`` is (11, F) from `free_basis`; (11, 0) solves the poses alone. ``weights`` (N,) are
+    factors of each point's chi2, 0 to leave a point out; all 1 if None. After ``max_steps`` what is
+    reached by then is returned.
     """
     used = np.ones(len(observations.points_px)) if weights is None else weights
     return descend(
@@ -393,16 +338,8 @@ def descend(
 ) -> Minimum[S, NormalEquations] | FitFailure:
     """Levenberg-Marquardt with the poses eliminated per view, over any such unknowns.
 
-    Parameters
-    ----------
-    start
-        Starting values.
-    equations_at
-        Normal equations at a state, or None where it is impossible.
-    move
-        The state after a step of the (F,) shared unknowns and the (V, 6) poses.
-    max_steps
-        Most iterations; what is reached by then is returned.
+    ``equations_at`` gives None where a state is impossible; ``move`` takes a step of the (F,)
+    shared unknowns and the (V, 6) poses. After ``max_steps`` what is reached is returned.
     """
 
     def evaluate(state: S) -> tuple[float, NormalEquations] | None:
@@ -453,24 +390,10 @@ def condition_number(matrix: FloatArray) -> float:
 def joint_covariance(
     equations: NormalEquations, basis: FloatArray
 ) -> tuple[FloatArray, float] | FitFailure:
-    """Invert the normal equations.
+    """Invert the normal equations: covariance, and condition of the reduced matrix.
 
-    Parameters
-    ----------
-    equations
-        At the minimum.
-    basis
-        (S, F) from `free_basis`.
-
-    Returns
-    -------
-    covariance
-        (S + 6 V, S + 6 V) of the shared unknowns and the poses, for points whose covariance is
-        what the detector says; scale it by sigma0 squared.
-    condition
-        Of the reduced normal matrix, see `condition_number`.
-
-    or why the unknowns are not determined.
+    (S + 6 V, S + 6 V) of the shared unknowns and the poses, for points whose covariance is what the
+    detector says; scale it by sigma0 squared. ``basis`` is (S, F) from `free_basis`.
     """
     reduced = reduced_normal_matrix(equations)
     condition = condition_number(reduced)

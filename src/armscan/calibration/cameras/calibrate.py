@@ -104,15 +104,7 @@ class PreparedViews:
 def prepare_views(
     views: Sequence[TargetView], options: CameraOptions
 ) -> PreparedViews | FitFailure:
-    """Sort the views, and refuse a set that cannot determine a camera.
-
-    Raises
-    ------
-    InputError
-        If the images differ in size, or two views have one name.
-    OptionError
-        If a view to leave out does not exist.
-    """
+    """Sort the views, and refuse a set that cannot determine a camera."""
     gather(views, "pinhole")
     sources = [view.source for view in views]
     twice = sorted({source for source in sources if sources.count(source) > 1})
@@ -431,18 +423,6 @@ def calibrate_camera(
     as it is. A numbering that starts at the opposite corner of a symmetric target leaves it, too,
     but its sigmas are right only where all views are numbered alike; see
     `armscan.calibration.cameras.robust.agreeing_numberings`.
-
-    Parameters
-    ----------
-    views
-        One a photograph, all of one camera.
-    options
-        See `CameraOptions`.
-
-    Returns
-    -------
-    fit
-        The camera with its evidence; or why the views do not determine one.
 
     Raises
     ------

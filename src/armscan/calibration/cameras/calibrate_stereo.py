@@ -374,21 +374,8 @@ def calibrate_stereo(
     that all pairs agree. Pairs that contradict the others are named and taken apart. A bow of the
     board that a camera by itself cannot do without is taken over from there.
 
-    Parameters
-    ----------
-    pairs
-        One an instant.
-    target
-        What they show.
-    options
-        See `StereoOptions`.
-    given
-        Calibrations of the left and of the right camera, unless the intrinsics are ``free``.
-
-    Returns
-    -------
-    fit
-        Both cameras with their evidence; or why the pairs do not determine them.
+    ``given`` are calibrations of the left and of the right camera, unless the intrinsics are
+    ``free``.
 
     Raises
     ------

@@ -54,19 +54,10 @@ def cross_validate(
     Points that the full solution rejected as outliers count neither in the folds' solutions nor
     in the result.
 
-    Parameters
-    ----------
-    solution
-        Of all used views; it also is the folds' starting value.
-    sources
-        Names of the views.
-    n_folds
-        Wanted folds; at most one a view.
+    ``solution``, of all used views, also is the folds' starting value; there is at most one fold a
+    view.
 
-    Returns
-    -------
-    result
-        None if fewer than three views would be left to solve from, or if a fold has no solution.
+    None if fewer than three views would be left to solve from, or if a fold has no solution.
     """
     observations = solution.observations
     n_views = observations.n_views
@@ -152,12 +143,6 @@ class ChosenModel:
 
     Parameters
     ----------
-    model
-        The model.
-    solution
-        Its solution.
-    cross_validation
-        Its hold-out test, None where there was none.
     reason
         Why this model, in words.
     untested
@@ -186,16 +171,9 @@ def choose_model(
     A larger model takes the place of a smaller one if its further coefficients are significant and
     if it predicts unseen views better by more than that gain's own scatter over the views.
 
-    Parameters
-    ----------
-    solve
-        Solves with a given model.
-    validate
-        Tests a solution on held-out views, on the points that the second solution kept.
-    folds
-        Whether a solution's distortion folds over inside the image.
-    chance
-        Probability that coefficients of a solution, which in truth are zero, look as they do.
+    ``validate`` tests a solution on held-out views, on the points that the second solution kept;
+    ``folds`` says whether a solution's distortion folds over inside the image; ``chance`` is the
+    probability that coefficients of a solution, which in truth are zero, look as they do.
     """
     solved = [(model, solve(model)) for model in MODELS]
     tried = [(model, each) for model, each in solved if not isinstance(each, FitFailure)]
@@ -243,12 +221,7 @@ def choose_lens(
 ) -> ChosenModel | FitFailure:
     """The pinhole, or a fisheye where points reach far from the axis and it predicts them better.
 
-    Parameters
-    ----------
-    pinhole
-        The best of its models, or why none has a solution.
-    solve, validate
-        As for `choose_model`.
+    ``pinhole`` is the best of its models; ``solve`` and ``validate`` are as for `choose_model`.
     """
     if not isinstance(pinhole, FitFailure) and not _is_wide(pinhole.solution):
         return pinhole
@@ -347,17 +320,11 @@ def _unfolded(
 
 
 def chance_of_coefficients(solution: Solution, names: tuple[str, ...]) -> float:
-    """Probability that coefficients which are zero come out as far from it as these.
+    """Probability that coefficients, free in the solution, that are zero come out as far from it as
+    these.
 
     Wald's test with the solution's covariance, the target's own errors included, widened by
     `design_effect`.
-
-    Parameters
-    ----------
-    solution
-        With these coefficients free.
-    names
-        Coefficients, as in `armscan.models.camera.PARAMETER_NAMES`.
     """
     determined = joint_covariance(solution.equations, solution.basis)
     if isinstance(determined, FitFailure):
@@ -381,12 +348,7 @@ SIGNIFICANT_SIGMAS = 4.0
 class DesignEffect:
     """By how much the views' pulls on the camera scatter more than points that err on their own.
 
-    Parameters
-    ----------
-    value
-        1 where every point errs on its own.
-    sigma
-        Its standard deviation there.
+    ``value`` is 1, with the standard deviation ``sigma``, where every point errs on its own.
     """
 
     value: float
@@ -481,13 +443,9 @@ def typical_coefficients(solution: Solution, names: tuple[str, ...]) -> FloatArr
 class LeftAtZero:
     """What coefficients that were left at zero, and may not be, do to everything else.
 
-    Parameters
-    ----------
-    unit_covariance
-        (S + 6 V, S + 6 V) as from `joint_covariance`, with these coefficients unknown as well, but
-        of a usual lens.
-    shift
-        (S + 6 V,) by which all unknowns would move if they were solved so.
+    ``unit_covariance`` (S + 6 V, S + 6 V) is as from `joint_covariance`, with these coefficients
+    unknown as well, but of a usual lens; ``shift`` (S + 6 V,) by what all would move if they were
+    solved so.
     """
 
     unit_covariance: FloatArray
@@ -503,14 +461,8 @@ def coefficients_left_at_zero(
     have, or less, and it moves the focal length and the principal point. Taken as a normal variable
     about zero with `typical_coefficients`, the views' own information added (Bayes).
 
-    Parameters
-    ----------
-    solution
-        With the coefficients held at zero.
-    names
-        Which.
-    sigma0_squared
-        Variance of a point of unit weight that the covariance will be scaled with.
+    ``sigma0_squared`` is the variance of a point of unit weight that the covariance will be scaled
+    with.
     """
     added = basis_of(names, is_aspect_fixed=False)
     basis = np.concatenate([solution.basis, added], axis=1)

@@ -51,13 +51,7 @@ _NO_BOW = np.zeros(2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointObservations:
-    """Points of U boards in both cameras.
-
-    Parameters
-    ----------
-    left, right
-        Points of each camera; both have U views, empty where the camera did not see the board.
-    """
+    """Points of U boards in both cameras, empty where a camera did not see the board."""
 
     left: Observations
     right: Observations
@@ -89,17 +83,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoState:
-    """Values of all unknowns.
-
-    Parameters
-    ----------
-    intrinsics
-        (18,) of the left, then of the right camera.
-    right_from_left
-        The relative pose.
-    rotations, translations_mm
-        (U, 3, 3) and (U, 3) of ``sensor_from_board``.
-    """
+    """Values of all unknowns: intrinsics (18,) left, then right; relative pose; U boards' poses."""
 
     intrinsics: FloatArray
     right_from_left: Pose[CameraRight, Sensor]
@@ -183,15 +167,11 @@ class JointProblem:
 
     Parameters
     ----------
-    observations
-        Points of both cameras.
     basis
         (24, F) directions of the shared unknowns that are free: a step is ``basis @ free_step``;
         (24, 0) solves the boards alone.
     weights
         Factors of chi2 of the left and of the right points, 0 to leave a point out.
-    prior
-        What is known of the intrinsics, or None.
     """
 
     observations: JointObservations
@@ -265,17 +245,7 @@ def retract_state(
 def adjust_both(
     problem: JointProblem, start: StereoState, max_steps: int
 ) -> Minimum[StereoState, NormalEquations] | FitFailure:
-    """Minimise both cameras' squared residuals over all unknowns, weighted by covariance.
-
-    Parameters
-    ----------
-    problem
-        What is to be minimised.
-    start
-        Starting values.
-    max_steps
-        Most iterations.
-    """
+    """Minimise both cameras' squared residuals over all unknowns, weighted by covariance."""
     return descend(
         start,
         lambda state: linearise_both(problem, state),
@@ -299,15 +269,9 @@ class JointSolution:
 
     Parameters
     ----------
-    boards
-        What each of the U boards was seen by.
     problem
         What was minimised: each camera's covariances brought to the level of its residuals,
         weights 1 for points kept and 0 for outliers.
-    state
-        The unknowns.
-    equations
-        Normal equations at the minimum.
     noise_scales
         By how much the points of the left and of the right camera scatter more than their
         detector says.
@@ -394,16 +358,7 @@ def solve_both(
 ) -> JointSolution | FitFailure:
     """Solve; find each camera's noise and outliers; solve again until neither changes.
 
-    Parameters
-    ----------
-    boards
-        What each board was seen by.
-    problem
-        Their points, as detected; what is free; points known as outliers; what is known.
-    start
-        Starting values.
-    max_steps
-        Most iterations of each adjustment.
+    The problem's points are as detected; its weights name the outliers known before.
     """
     raw, state = problem.observations, start
     levels = np.ones(2)
@@ -464,14 +419,11 @@ def _judged(observations: JointObservations, state: StereoState) -> PointWeights
         (observations.right, state.in_right()),
     ):
         chi2 = chi2_of_points(seen, camera_state)
-        outlier: BoolArray = judge(_of_views_with_points(seen), chi2)[1]
+        # of views that have points
+        starts = tuple(int(start) for start in np.unique(seen.starts))
+        outlier: BoolArray = judge(replace(seen, starts=starts), chi2)[1]
         weights.append(np.where(outlier, 0.0, 1.0))
     return weights[0], weights[1]
-
-
-def _of_views_with_points(observations: Observations) -> Observations:
-    starts = tuple(int(start) for start in np.unique(observations.starts))
-    return replace(observations, starts=starts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -484,8 +436,6 @@ class StereoCovariance:
         (24 + 6 U, 24 + 6 U) of the shared unknowns and of the boards' poses.
     condition
         Of the reduced normal matrix of the free shared unknowns, scaled to unit diagonal.
-    target_error
-        How far the target's points miss their places.
     """
 
     matrix: FloatArray
@@ -498,15 +448,9 @@ def stereo_covariance(
 ) -> StereoCovariance | FitFailure:
     """Invert the normal equations.
 
-    Parameters
-    ----------
-    solution
-        At the minimum.
-    held
-        (18, 18) covariance of intrinsics that were held at given values, or None: what was solved
-        follows them, so that their uncertainty is carried into it.
-    widening
-        Factor on the variance of the points' noise, for residuals that are alike.
+    ``held`` (18, 18) is the covariance of intrinsics that were held at given values, or None: what
+    was solved follows them, so that their uncertainty is carried into it. ``widening`` is a factor
+    on the variance of the points' noise, for residuals that are alike.
     """
     determined = joint_covariance(solution.equations, solution.problem.basis)
     if isinstance(determined, FitFailure):
@@ -577,20 +521,6 @@ def hold_out_pairs(solution: JointSolution, n_folds: int, max_steps: int) -> Cro
     Each fold's pairs are left out, cameras and relative pose are solved from the rest, and each
     held-out pair gets one board pose, fitted in both images. Views of one camera alone are never
     held out, and outliers count nowhere.
-
-    Parameters
-    ----------
-    solution
-        Of all pairs; it also is the folds' starting value.
-    n_folds
-        Wanted folds; at most one a pair.
-    max_steps
-        Most iterations of each adjustment.
-
-    Returns
-    -------
-    result
-        None if too few pairs would be left to solve from, or if a fold has no solution.
     """
     boards = solution.boards
     both = np.array([k for k, board in enumerate(boards) if board.is_seen_by_both], dtype=np.int64)

@@ -77,13 +77,7 @@ SIDES = ("left", "right")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoPair:
-    """What the two cameras saw of the target at one instant.
-
-    Parameters
-    ----------
-    left, right
-        The views; None where a camera did not find the target.
-    """
+    """What the two cameras saw of the target at one instant; None where one did not find it."""
 
     left: TargetView | None
     right: TargetView | None
@@ -177,8 +171,6 @@ class SingleCamera:
         Reason for each other view, by source.
     fit
         The camera by itself; None if its views do not determine one and it was given.
-    reason
-        Why these parameters are free.
     given_level
         Squared distance of given intrinsics from what the images say by themselves, over both
         covariances and the degrees of freedom; NaN where there is none.
@@ -205,15 +197,6 @@ def prepare_cameras(
 ) -> tuple[SingleCamera, SingleCamera] | FitFailure:
     """Solve each camera by itself, and check given intrinsics against its images.
 
-    Parameters
-    ----------
-    views
-        Of the left and of the right camera.
-    options
-        See `StereoOptions`.
-    given
-        Calibrations of both, for intrinsics that are not ``free``.
-
     Raises
     ------
     InputError
@@ -238,15 +221,7 @@ def prepare_cameras(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownBow:
-    """Bow of the board as both cameras found it, each by itself; see `BoardWarp`.
-
-    Parameters
-    ----------
-    bow_mm
-        (2,) along x and along y.
-    covariance_mm2
-        (2, 2).
-    """
+    """Bow (2,) of the board in mm as each camera by itself found it; see `BoardWarp`."""
 
     bow_mm: FloatArray
     covariance_mm2: FloatArray

@@ -36,15 +36,10 @@ from armscan.vision.targets.target import Target, TargetView
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSeen:
-    """A pose of a board that one view allows.
+    """A pose of a board that one view allows; Sensor stands for that camera's frame.
 
-    Parameters
-    ----------
-    camera_from_board
-        The pose; the Sensor frame stands for that of the camera, left or right.
-    covariance
-        (6, 6) of rotation-vector increment (rad, in the camera's frame, on the left) and
-        translation (mm), due to the points' noise alone.
+    ``covariance`` (6, 6) is of rotation-vector increment (rad, in that frame, on the left) and
+    translation (mm), due to the points' noise alone.
     """
 
     camera_from_board: Pose[Sensor, Board]
@@ -89,12 +84,7 @@ def relative_pose(
 ) -> RelativePose:
     """Eliminate the board (eqs. 4.14 to 4.16) from what both cameras see of it.
 
-    Parameters
-    ----------
-    left, right
-        The board in each camera.
-    new_from_found
-        How the right view's numbers are to be turned first.
+    The right view's numbers are turned by ``new_from_found`` first.
     """
     renumbered = right.camera_from_board @ new_from_found.inverse()
     right_from_board: Pose[CameraRight, Board] = Pose(
@@ -196,17 +186,9 @@ def relative_pose_candidates(
 
 
 def agree(ways: Sequence[Sequence[Way]]) -> Agreement | FitFailure:
-    """Find what most pairs agree on.
+    """Find what most pairs agree on, of each pair's ways to be read, one at least.
 
-    Parameters
-    ----------
-    ways
-        Of each pair, at least one.
-
-    Returns
-    -------
-    agreement
-        Or why there is none: the pairs contradict each other, or two answers fit alike.
+    There is none where pairs contradict each other, or two answers fit alike.
     """
     stacked = _Stacked.of(ways)
     levels = np.array([stacked.typical(stacked.levels(k)) for k in range(len(stacked.pair))])
@@ -338,18 +320,7 @@ def true_order(
 ) -> tuple[int, ...] | None:
     """Which right view goes with each left view, if the lists are in different orders.
 
-    Parameters
-    ----------
-    left, right
-        P boards each, in the order given.
-    numberings
-        Of the target.
-
-    Returns
-    -------
-    partner
-        Index of the right view that fits each left view best, if another order than the given one
-        makes more than half of the pairs agree; else None.
+    None unless another order than the given one makes more than half of the pairs agree.
     """
     n = len(left)
     every = [relative_pose_candidates(a, b, numberings) for a in left for b in right]
@@ -392,14 +363,7 @@ def own_pose(
 ) -> RelativePose:
     """``right_from_left`` by one pair alone (eqs. 4.14 to 4.16), the cameras being known.
 
-    Parameters
-    ----------
-    pair
-        Seen by both cameras.
-    views
-        The cameras; each finds the board by itself near to where both together have it.
-    sensor_from_board
-        That place.
+    Each finds the board by itself near to ``sensor_from_board``, where both together have it.
 
     Raises
     ------
@@ -421,12 +385,7 @@ def own_pose(
 def compare_pairs(relatives: Sequence[RelativePose], near: Pose[CameraRight, Sensor]) -> PairNoise:
     """Set each pair against the weighted mean of the others, misfits not counted among them.
 
-    Parameters
-    ----------
-    relatives
-        ``right_from_left`` of each pair by itself.
-    near
-        That of all together, at which the mean is linearised.
+    The mean is linearised at ``near``, that of all together.
     """
     apart = differences(
         np.array([relative.right_from_left.rotation for relative in relatives]),
@@ -474,8 +433,6 @@ class RelatedPair:
     pair
         Its views, those that cannot be used taken out, numbered as they are used; None if neither
         can be.
-    given
-        Its views as given.
     seen
         Ways in which each view sees the board, by itself; empty for a view not used.
     numbering
@@ -517,17 +474,7 @@ class Relation:
 
 
 def relate(pairs: Sequence[StereoPair], cameras: Cameras, target: Target) -> Relation | FitFailure:
-    """Find where the cameras are to each other, and which pairs do not tell.
-
-    Parameters
-    ----------
-    pairs
-        As given.
-    cameras
-        Each camera by itself.
-    target
-        What they show: it may be numbered in several ways.
-    """
+    """Find where the cameras are to each other, and which pairs do not tell."""
     known = numberings(target)
     usable = [_usable(pair, cameras, known[0]) for pair in pairs]
     both = [k for k, pair in enumerate(usable) if all(pair.seen)]

@@ -101,8 +101,6 @@ class ViewFit(ArrayRecord):
 
     Parameters
     ----------
-    view
-        The view itself: ``view.source``, ``view.points_px``.
     sensor_from_board
         Pose of the board; of a view that was left out, from a fit of the pose alone.
     pose_covariance
@@ -119,8 +117,6 @@ class ViewFit(ArrayRecord):
         Angle between the board's normal and the optical axis.
     distance_mm
         Depth Z of the middle of the points.
-    is_used
-        False if the view did not take part in the solution.
     is_misfit
         True if the view fits so much worse than the others that leaving it out is proposed.
     note
@@ -254,15 +250,11 @@ class CameraFit(ArrayRecord):
 
     Parameters
     ----------
-    camera
-        The solution.
     covariance
         (9, 9) in the order of `armscan.models.camera.PARAMETER_NAMES`; rows of parameters that
         were held by request are zero. Coefficients that ``auto`` left at zero count as unknown, of
         the size that lenses usually have, where the views do not say more; and all is widened if
         residuals of one view are alike (see `armscan.calibration.cameras.distortion`).
-    free_parameters
-        Names of the parameters that were solved.
     joint_covariance
         (9 + 6 V, 9 + 6 V) of the camera and of the poses of the V used views, in the order of
         ``used_views``; pose convention as in `ViewFit`.
@@ -287,24 +279,14 @@ class CameraFit(ArrayRecord):
     condition
         Condition number of the normal matrix of the camera's free parameters, scaled to unit
         diagonal, after the poses are eliminated.
-    coverage
-        Coverage of the image.
-    cross_validation
-        Hold-out test, or None if it was switched off or too few views are left for it.
     warp
         Bow of the board, if it was solved: asked for, or significant.
-    model_reason
-        Why these parameters were free.
     design_effect
         Factor that variances were given because residuals of one view are alike; 1 where they
         are not.
     stretch, stretch_sigma
         Part by which the print seems longer from row to row than is said of it, with the lengths
         from column to column taken for right, and its standard deviation; it is not solved along.
-    warnings
-        Plain sentences that a person should read.
-    options
-        The options in force.
     """
 
     camera: CameraModel
@@ -360,16 +342,9 @@ _COLUMN_NAMES = ("left", "centre", "right")
 def measure_coverage(
     points_px: FloatArray, normals_sensor: FloatArray, width_px: int, height_px: int
 ) -> Coverage:
-    """Count target points over the image.
+    """Count target points (N, 2) of the used views over the image.
 
-    Parameters
-    ----------
-    points_px
-        (N, 2) points of the used views.
-    normals_sensor
-        (V, 3) normals of the boards in the Sensor frame, pointing away from the camera.
-    width_px, height_px
-        Size of the image.
+    ``normals_sensor`` (V, 3) are the boards', in the Sensor frame, pointing away from the camera.
     """
     cell = max(width_px, height_px) / GRID_LONG_SIDE
     shape = max(1, round(height_px / cell)), max(1, round(width_px / cell))
@@ -434,14 +409,7 @@ def advise(
 ) -> CameraFit:
     """Add warnings to a result.
 
-    Parameters
-    ----------
-    fit
-        The result.
-    repeats
-        Pairs (later, earlier) of views that show the board in the same place.
-    is_converged
-        Whether the adjustment reached its minimum.
+    ``repeats`` are pairs (later, earlier) of views that show the board in the same place.
     """
     warnings = [
         *_about_convergence(fit, is_converged=is_converged),
@@ -633,13 +601,7 @@ LARGEST_RMS = 0.003
 
 
 def reasons_to_refuse(fit: CameraFit) -> tuple[str, ...]:
-    """Why a solved camera must not be written as if it were one; empty if nothing speaks against.
-
-    Parameters
-    ----------
-    fit
-        The camera with its evidence.
-    """
+    """Why a solved camera must not be written as if it were one; empty if nothing is against."""
     held_out = fit.cross_validation
     rms_px = fit.rms_px if held_out is None else max(fit.rms_px, held_out.rms_px)
     if abs(fit.stretch) >= max(LARGEST_STRETCH, STRETCH_SIGMAS * fit.stretch_sigma):
@@ -649,14 +611,11 @@ def reasons_to_refuse(fit: CameraFit) -> tuple[str, ...]:
             f"beside its columns: measure the print both ways and "
             f"{as_two_lengths(_board_points(fit), fit.stretch)}; print without fitting to the page",
         )
+    n_misfits = sum(view.is_misfit for view in fit.used_views)
     return (
-        *focal_reasons(fit.camera, float(fit.sigma[0]), float(fit.sigma[1]), _n_misfits(fit)),
+        *focal_reasons(fit.camera, float(fit.sigma[0]), float(fit.sigma[1]), n_misfits),
         *rms_reasons(fit.camera, rms_px),
     )
-
-
-def _n_misfits(fit: CameraFit) -> int:
-    return sum(view.is_misfit for view in fit.used_views)
 
 
 def focal_reasons(

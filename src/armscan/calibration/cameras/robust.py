@@ -34,23 +34,10 @@ SIGNIFICANT_SIGMAS = 4.0
 def excess_variance_px2(
     residuals: FloatArray, covariances: FloatArray, chi2: float, degrees_of_freedom: int
 ) -> float:
-    """Variance per axis to be added to the detector's covariances.
+    """Variance per axis, in px^2, to be added to covariances (N, 2, 2) that the detector claims.
 
-    Parameters
-    ----------
-    residuals
-        (N, 2) of the points used, in px.
-    covariances
-        (N, 2, 2) that the detector claims for them.
-    chi2
-        Squared residuals over these covariances.
-    degrees_of_freedom
-        Coordinates minus unknowns.
-
-    Returns
-    -------
-    variance
-        In px^2; 0 unless chi2 is larger than its expectation by four of its standard deviations.
+    It is 0 unless chi2, of residuals (N, 2) in px over these covariances, is larger than its
+    expectation by four of its standard deviations.
     """
     if degrees_of_freedom < 1:
         return 0.0
@@ -112,20 +99,14 @@ class Solution:
     ----------
     observations
         What was adjusted, with the weights that were in force.
-    state
-        The unknowns.
     basis
         Which of them were free, see `free_basis`.
-    equations
-        Normal equations at the minimum, points kept only.
     weights
         (N,) 1 for points kept and 0 for outliers.
     view_levels
         (V,) robust chi2 per coordinate of each view over that of the typical view.
     outlier_shares
         (V,) share of each view's points that lie too far out for the typical view's noise.
-    is_converged
-        False if the adjustment was stopped before the minimum.
     """
 
     observations: Observations
@@ -172,19 +153,7 @@ def solve_robustly(
     trusted: BoolArray,
     max_steps: int,
 ) -> Solution | FitFailure:
-    """Solve, look for outliers, and solve again without them where there are any.
-
-    Parameters
-    ----------
-    observations
-        The image points.
-    start, trusted
-        From `armscan.calibration.cameras.start.starting_state`.
-    basis
-        From `free_basis`.
-    max_steps
-        Most iterations of each adjustment.
-    """
+    """Solve, look for outliers, and solve again without them where there are any."""
     if trusted.all():
         result = adjust(observations, start, basis, max_steps=max_steps)
         if isinstance(result, FitFailure):
@@ -289,12 +258,8 @@ SAME_POINT_MM = 1e-6
 class TargetError:
     """How far the target's points miss their places.
 
-    Parameters
-    ----------
-    sigma_mm
-        Standard deviation along each axis of the board; 0 where views show none.
-    independent_share
-        Part of the residuals' variance that is new in every view.
+    ``sigma_mm`` is along each axis of the board, 0 where views show none; ``independent_share`` the
+    part of the residuals' variance that is new in every view.
     """
 
     sigma_mm: float
@@ -412,19 +377,10 @@ def agreeing_numberings(
     Errors of its print turn with it: where views are numbered alike, points miss their places
     alike. It is told by all views together, and must be clearer than chance can make it.
 
-    Parameters
-    ----------
-    places_mm, missed_mm
-        (M, 3) places on the board of the points of each of V views as found numbered, and (M, 2)
-        what each misses its place by.
-    known
-        Numberings that no single view can tell apart, the one as found first.
-
-    Returns
-    -------
-    chosen
-        (V,) places among ``known``; the first view keeps its own. None where the views tell
-        nothing, or all are numbered alike.
+    ``places_mm`` (M, 3) are the points of each of V views as found numbered, ``missed_mm`` (M, 2)
+    what each misses its place by; ``known`` are numberings that no single view can tell apart, the
+    one as found first. The numbers (V,) among these leave the first view its own. None where the
+    views tell nothing, or all are numbered alike.
     """
     if len(known) < 2 or len(places_mm) < FEWEST_VIEWS:
         return None
@@ -481,16 +437,8 @@ def covariance_with_target_error(
 ) -> FloatArray:
     """Covariance (S + 6 V, S + 6 V) of shared unknowns and poses with the target's own errors.
 
-    Parameters
-    ----------
-    unit_covariance
-        From `armscan.calibration.cameras.adjustment.joint_covariance`.
-    variance_factor
-        sigma0 squared of the solution.
-    error
-        Of the target.
-    found
-        The residuals that showed it.
+    ``unit_covariance`` is that of `armscan.calibration.cameras.adjustment.joint_covariance`,
+    ``variance_factor`` the solution's sigma0 squared.
     """
     covariance = error.independent_share * variance_factor * unit_covariance
     if error.sigma_mm == 0.0 or found is None:
@@ -563,11 +511,7 @@ def with_significant_bow(
 ) -> tuple[Solution, BowTest | None] | FitFailure:
     """Free the bow of the board and keep it so where it is wanted, or significant.
 
-    Returns
-    -------
-    solution, test
-        With the bow's test, or the flat one and None; a failure if a bow that is wanted has no
-        solution.
+    With the bow's test, or the flat solution and None; a failure if a bow that is wanted has none.
     """
     bowed = with_board_warp(flat, max_steps)
     if isinstance(bowed, FitFailure):
@@ -579,14 +523,7 @@ def with_significant_bow(
 def board_warp(bowed: Solution, test: BowTest, covariance: FloatArray) -> BoardWarp:
     """The bow of a solution in which it was free.
 
-    Parameters
-    ----------
-    bowed
-        The solution with bow.
-    test
-        Of its bow.
-    covariance
-        (11 + 6 V, 11 + 6 V) scaled joint covariance of the bowed solution.
+    ``covariance`` (11 + 6 V, 11 + 6 V) is its scaled joint covariance.
     """
     return BoardWarp(
         bow_mm=bowed.state.shared[WARP_ROWS],

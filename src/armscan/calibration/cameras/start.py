@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.calibration.cameras.adjustment import (
-    NormalEquations,
     Observations,
     State,
     adjust,
@@ -44,26 +43,16 @@ REFINEMENT_STEPS = 6
 def estimate_homography(board_xy: FloatArray, image_xy: FloatArray) -> FloatArray | FitFailure:
     """Fit ``s m' = H M'`` (eq. 2.29): normalised linear solution, then least squares in the image.
 
-    Parameters
-    ----------
-    board_xy
-        (M, 2) points on the board, in any unit.
-    image_xy
-        (M, 2) image points, in pixels or normalised coordinates.
-
-    Returns
-    -------
-    homography
-        (3, 3), scaled to unit Frobenius norm, that maps the points to positive third coordinates;
-        or why there is none.
+    (3, 3), of unit Frobenius norm and positive third coordinates, from (M, 2) points on the board,
+    in any unit, to (M, 2) in the image, in pixels or normalised.
     """
     if len(board_xy) < MIN_POINTS:
         return FitFailure(f"{len(board_xy)} points, a homography needs {MIN_POINTS}")
     if flatness(board_xy) < COLLINEAR_RATIO or flatness(image_xy) < COLLINEAR_RATIO:
         return FitFailure("the points lie on one line", "turn the board towards the camera")
     board_norm, image_norm = _normaliser(board_xy), _normaliser(image_xy)
-    board = _apply(board_norm, board_xy)
-    image = _apply(image_norm, image_xy)
+    board = map_points(board_norm, board_xy)
+    image = map_points(image_norm, image_xy)
     inner = _refine(_linear(board, image), board, image)
     homography = np.linalg.inv(image_norm) @ inner @ board_norm
     depth = homography[2, :2] @ board_xy.mean(axis=0) + homography[2, 2]
@@ -75,7 +64,8 @@ def estimate_homography(board_xy: FloatArray, image_xy: FloatArray) -> FloatArra
 
 def map_points(homography: FloatArray, xy: FloatArray) -> FloatArray:
     """Map (M, 2) points by a (3, 3) homography."""
-    return _apply(homography, xy)
+    mapped = xy @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
 def flatness(xy: FloatArray) -> float:
@@ -90,11 +80,6 @@ def _normaliser(xy: FloatArray) -> FloatArray:
     matrix = np.diag([scale, scale, 1.0])
     matrix[:2, 2] = -scale * centre
     return matrix
-
-
-def _apply(homography: FloatArray, xy: FloatArray) -> FloatArray:
-    mapped = xy @ homography[:, :2].T + homography[:, 2]
-    return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
 def _linear(board: FloatArray, image: FloatArray) -> FloatArray:
@@ -115,7 +100,7 @@ def _refine(homography: FloatArray, board: FloatArray, image: FloatArray) -> Flo
     h = homography / homography[2, 2]
     rows = homogeneous(board)
     best: FloatArray = h
-    best_cost = float(np.sum((_apply(h, board) - image) ** 2))
+    best_cost = float(np.sum((map_points(h, board) - image) ** 2))
     for _ in range(REFINEMENT_STEPS):
         mapped = rows @ h.T
         w = mapped[:, 2:]
@@ -127,7 +112,7 @@ def _refine(homography: FloatArray, board: FloatArray, image: FloatArray) -> Flo
         error = (image - predicted).reshape(-1)
         step = np.linalg.lstsq(jacobian, error, rcond=None)[0]
         h = h + np.append(step, 0.0).reshape(3, 3)
-        cost = float(np.sum((_apply(h, board) - image) ** 2))
+        cost = float(np.sum((map_points(h, board) - image) ** 2))
         if not cost < best_cost:
             break
         converged = best_cost - cost < 1e-12 * best_cost
@@ -143,22 +128,11 @@ _FIXED_CENTRE = (_B11, _B22, _B33)
 
 
 def constraint_rows(homography: FloatArray) -> FloatArray:
-    """Two equations of one view (eq. 2.34) for ``b = (B11, B12, B22, B13, B23, B33)``.
+    """Two equations (2, 6) of one view (eq. 2.34) for ``b = (B11, B12, B22, B13, B23, B33)``.
 
-    Parameters
-    ----------
-    homography
-        (3, 3) from board to image.
-
-    Returns
-    -------
-    rows
-        (2, 6) rows ``v12`` and ``v11 - v22``.
-
-    Notes
-    -----
-    The thesis prints ``v12 - v22`` in the second row, which is wrong, and lists b as ``B11 B12 B13
-    B22 B23 B33``, which does not go with its own ``v_ij`` of eq. 2.33; both are corrected here.
+    These are ``v12`` and ``v11 - v22``. The thesis prints ``v12 - v22`` in the second row, which is
+    wrong, and lists b as ``B11 B12 B13 B22 B23 B33``, which does not go with its own ``v_ij`` of
+    eq. 2.33; both are corrected here.
     """
 
     def v(i: int, j: int) -> FloatArray:
@@ -180,22 +154,11 @@ def constraint_rows(homography: FloatArray) -> FloatArray:
 def intrinsics_from_homographies(
     homographies: Sequence[FloatArray], width_px: int, height_px: int
 ) -> FloatArray | FitFailure:
-    """Solve eq. 2.34 for the intrinsic matrix without skew.
+    """Solve eq. 2.34 for the intrinsic matrix (3, 3) of eq. 2.18, without skew.
 
-    First with all five unknowns of B; if noise leaves no positive definite B (eq. 2.32), with the
-    principal point in the middle of the image; and then with one focal length.
-
-    Parameters
-    ----------
-    homographies
-        (3, 3) matrices from board to pixels.
-    width_px, height_px
-        Size of the image.
-
-    Returns
-    -------
-    matrix
-        (3, 3) intrinsic matrix of eq. 2.18, or why there is none.
+    From (3, 3) homographies from board to pixels: first with all five unknowns of B; if noise
+    leaves no positive definite B (eq. 2.32), with the principal point in the middle of the image;
+    and then with one focal length.
     """
     centre = np.array([0.5 * (width_px - 1), 0.5 * (height_px - 1)])
     scale = 0.5 * (width_px + height_px)
@@ -281,15 +244,7 @@ def _matrix_from_b(b: FloatArray) -> FloatArray | None:
 
 
 def pose_from_homography(homography: FloatArray, matrix: FloatArray) -> Pose[Sensor, Board]:
-    """Pose of a flat board from its homography (eq. 2.35), made a proper rotation.
-
-    Parameters
-    ----------
-    homography
-        (3, 3) from board mm to pixels.
-    matrix
-        (3, 3) intrinsic matrix.
-    """
+    """Pose of a flat board from its homography (3, 3), mm to pixels (eq. 2.35), made a rotation."""
     columns = np.linalg.solve(matrix, homography)
     scale = 0.5 * (np.linalg.norm(columns[:, 0]) + np.linalg.norm(columns[:, 1]))
     columns = columns / scale * (1.0 if columns[2, 2] > 0.0 else -1.0)
@@ -301,21 +256,10 @@ def pose_from_homography(homography: FloatArray, matrix: FloatArray) -> Pose[Sen
 def linear_distortion(
     ideal_xy: FloatArray, observed_xy: FloatArray, free: Sequence[int]
 ) -> FloatArray:
-    """Distortion by linear least squares, ``K = (L'L)^-1 L'F`` (eqs. 2.36 to 2.38).
+    """Distortion (5,) by linear least squares, ``K = (L'L)^-1 L'F`` (eqs. 2.36 to 2.38).
 
-    Parameters
-    ----------
-    ideal_xy
-        (N, 2) normalised coordinates predicted without distortion.
-    observed_xy
-        (N, 2) normalised coordinates observed.
-    free
-        Indices into ``k1 k2 p1 p2 k3`` of the coefficients to solve; the thesis has the first four.
-
-    Returns
-    -------
-    coefficients
-        (5,) with zeros where not free.
+    From normalised coordinates (N, 2) without distortion and as observed. ``free`` are indices into
+    ``k1 k2 p1 p2 k3``, of which the thesis has the first four; the others are zero.
     """
     coefficients = np.zeros(5)
     if not len(free):
@@ -355,18 +299,7 @@ def starting_state(
     model: DistortionModel,
     options: CameraOptions,
 ) -> tuple[State, BoolArray] | FitFailure:
-    """Closed-form camera and poses.
-
-    Parameters
-    ----------
-    views
-        The views.
-    observations
-        The same views from `gather`.
-    homographies
-        One (3, 3) a view, from board mm to pixels.
-    model, options
-        Which parameters are free.
+    """Closed-form camera and poses, from one homography (3, 3) a view, from board mm to pixels.
 
     Returns
     -------
@@ -374,7 +307,6 @@ def starting_state(
         Starting values with those parameters at rest that are not free.
     trusted
         (V,) False for views that fit a plane so badly that they had no say.
-
     or why there are none.
     """
     if model == "fisheye":
@@ -477,15 +409,7 @@ _CAMERA = np.eye(11, 9)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseCandidate:
-    """A local minimum of the reprojection error of a flat board.
-
-    Parameters
-    ----------
-    sensor_from_board
-        The pose.
-    chi2
-        Squared residuals over the detector's covariances.
-    """
+    """A local minimum of a flat board's reprojection error; ``chi2`` by the detector's sigmas."""
 
     sensor_from_board: Pose[Sensor, Board]
     chi2: float
@@ -500,14 +424,7 @@ def board_pose_candidates(
     fits almost as well when its normal is mirrored at the line of sight: that pose starts the
     second.
 
-    Parameters
-    ----------
-    view
-        Target points.
-    camera
-        The camera, held fixed.
-    bow_mm
-        (2,) bow of the board as in `BoardWarp`; flat if None.
+    ``bow_mm`` (2,) is the bow of the board as in `BoardWarp`; flat if None.
 
     Raises
     ------
@@ -553,37 +470,20 @@ def mirrored_pose(pose: Pose[Sensor, Board], centre_board_mm: FloatArray) -> Pos
 def estimate_board_pose(
     view: TargetView,
     camera: CameraModel,
-    camera_covariance: FloatArray | None = None,
     bow_mm: FloatArray | None = None,
     *,
     allow_ambiguous: bool = False,
 ) -> Estimate[Pose[Sensor, Board]] | FitFailure:
-    """Pose of a board in one view.
+    """``sensor_from_board`` in one view.
 
-    Parameters
-    ----------
-    view
-        Target points with covariances.
-    camera
-        The camera.
-    camera_covariance
-        (9, 9); if given, the camera's uncertainty is carried into the pose.
-    bow_mm
-        (2,) bow of the board as in `BoardWarp`; flat if None.
-    allow_ambiguous
-        Return the better of two poses even if they fit alike, instead of refusing.
-
-    Returns
-    -------
-    estimate
-        ``sensor_from_board``; covariance (6, 6) of (rotation-vector increment in rad in the Sensor
-        frame, applied on the left; translation in mm); residuals (M, 2) in px. The points'
-        covariances give the weights (see `armscan.calibration.cameras.robust`), the residuals the
-        level: the covariance is scaled by chi2
-        over the degrees of freedom (with fewer than ten of them never below 1). Or why there is
-        no pose: too few points, points on a line, or two poses that fit alike.
+    Covariance (6, 6) of (rotation-vector increment in rad in the Sensor frame, applied on the left;
+    translation in mm), residuals (M, 2) in px. The points' covariances give the weights (see
+    `armscan.calibration.cameras.robust`), the residuals the level: the covariance is scaled by chi2
+    over the degrees of freedom (with fewer than ten of them never below 1). ``bow_mm`` (2,) is the
+    board's, as in `BoardWarp`; flat if None. There is no pose of too few points, points on a line,
+    or of two poses that fit alike, of which ``allow_ambiguous`` takes the better.
     """
-    found = estimate_board_poses(view, camera, camera_covariance, bow_mm)
+    found = estimate_board_poses(view, camera, bow_mm)
     if isinstance(found, FitFailure):
         return found
     if len(found) > 1 and not allow_ambiguous:
@@ -597,7 +497,6 @@ def estimate_board_pose(
 def estimate_board_poses(
     view: TargetView,
     camera: CameraModel,
-    camera_covariance: FloatArray | None = None,
     bow_mm: FloatArray | None = None,
 ) -> tuple[Estimate[Pose[Sensor, Board]], ...] | FitFailure:
     """All poses of a board that one view does not refute, the best first.
@@ -625,11 +524,12 @@ def estimate_board_poses(
         equations = linearise(observations, state, _CAMERA, np.ones(len(view)))
         if equations is None or not condition_number(equations.pose[0]) < 1e13:
             return FitFailure("the points do not determine a pose", "show more of the board")
+        covariance = factor * np.linalg.inv(equations.pose[0])
         found.append(
             Estimate(
                 value=candidate.sensor_from_board,
                 parameter_names=POSE_PARAMETER_NAMES,
-                covariance=_pose_covariance(equations, factor, camera_covariance),
+                covariance=0.5 * (covariance + covariance.T),
                 residuals=residuals_px(observations, state),
                 degrees_of_freedom=degrees,
                 chi2=candidate.chi2,
@@ -652,18 +552,6 @@ def _with_excess(
     if excess <= 0.0:
         return view
     return replace(view, covariance_px2=view.covariance_px2 + excess * np.eye(2))
-
-
-def _pose_covariance(
-    equations: NormalEquations, factor: float, camera_covariance: FloatArray | None
-) -> FloatArray:
-    inverse = np.linalg.inv(equations.pose[0])
-    covariance = factor * inverse
-    if camera_covariance is not None:
-        # The pose follows the camera by -V^-1 W' (implicit function).
-        by_camera = -inverse @ equations.cross[0].T
-        covariance = covariance + by_camera @ camera_covariance @ by_camera.T
-    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def _refined(

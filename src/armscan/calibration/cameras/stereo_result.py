@@ -97,8 +97,6 @@ class PairFit(ArrayRecord):
 
     Parameters
     ----------
-    pair
-        Its views, numbered as they were used.
     left, right
         How each view fits; None for a view that was not used.
     matched
@@ -139,18 +137,12 @@ class SideFit:
 
     Parameters
     ----------
-    single
-        The camera by itself, where it started from.
     rms_px
         Root mean square over its used points of the residual's length.
     sigma_point_px
         Standard deviation of one detected coordinate, per axis, told of the residuals.
     noise_scale
         By how much its points scatter more than their detector says.
-    n_views, n_points
-        What was used.
-    coverage
-        Of the image.
     """
 
     single: SingleCamera
@@ -167,12 +159,8 @@ class StereoFit(ArrayRecord):
 
     Parameters
     ----------
-    views
-        The cameras and their relative pose.
     covariance
         (24, 24) in the order of `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
-    left, right
-        Each camera in the solution.
     pairs
         Every pair given that was not left out by request.
     rms_px
@@ -182,20 +170,12 @@ class StereoFit(ArrayRecord):
     typical_level
         Squared distance of the typical pair's own ``right_from_left`` from that of the others over
         its covariance and the degrees of freedom: about 1 where noise is all there is.
-    hold_out
-        Hold-out test over pairs, or None.
     degrees_of_freedom
         Observed coordinates minus unknowns.
     condition
         Of the normal matrix of the free shared unknowns, unit diagonal, boards eliminated.
     target_error_mm
         By how much the target's points miss their places, one standard deviation an axis.
-    is_converged
-        False if the adjustment was stopped before the minimum.
-    warnings
-        Plain sentences that a person should read.
-    options
-        The options in force.
     """
 
     views: TwoViews
@@ -422,11 +402,6 @@ def reasons_to_refuse(fit: StereoFit) -> tuple[str, ...]:
     """Why a solved pair must not be written as if it were one; empty if nothing speaks against.
 
     The limits of each camera are those of `armscan.calibration.cameras.result`.
-
-    Parameters
-    ----------
-    fit
-        Both cameras with their evidence.
     """
     n = len(PARAMETER_NAMES)
     reasons: list[str] = []

@@ -251,18 +251,9 @@ def _judged(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contradiction:
-    """An alternative that is believed.
+    """An alternative that is believed, and the scatter of the arm that it leaves.
 
-    Parameters
-    ----------
-    failure
-        What is contradicted and what to do.
-    is_refused
-        True if the hand-eye must not be used.
-    widening
-        (6, 6) to be added to the hand-eye's covariance, so that it holds what it would change by.
-    arm_mm
-        Scatter of the arm that the alternative leaves.
+    ``widening`` (6, 6) is added to the hand-eye's covariance to hold what it would change by.
     """
 
     failure: FitFailure
@@ -287,9 +278,8 @@ def find_contradiction(
         and best.size_mm > ARM_ACCURACY_MM
         and float(np.abs(change / np.sqrt(variance)).max()) > MOST_SIGMAS
     )
-    failure = _contradicted(best, fit, plate)
     return Contradiction(
-        failure=failure,
+        failure=_contradicted(best, fit, plate),
         is_refused=is_refused,
         widening=np.outer(change, change),
         arm_mm=best.arm_mm,
@@ -352,11 +342,8 @@ def _offset_and_tilt(plane: FloatArray, by_surface: FloatArray) -> tuple[float, 
 def find_free_plane(problem: Problem, plate: PlateSurface) -> tuple[float, float, float] | None:
     """Solve hand-eye and plane together; None where the postures do not determine both.
 
-    Returns
-    -------
-    offset_mm, tilt_deg, typical_mm
-        Place of that plane on the probed one's normal, where the stripes lie; angle between them;
-        median over postures of their distance from it.
+    Its offset (mm) along the probed one's normal, where the stripes lie, its tilt (deg), and the
+    median over postures of their distance from it (mm).
     """
     observations = problem.observations
     start = linear_hand_eye(observations, plate.plane, is_offset_free=True)

@@ -52,8 +52,6 @@ class BoardPose(ArrayRecord):
 
     Parameters
     ----------
-    sensor_from_board
-        The pose.
     covariance
         (6, 6) of the points' noise, the camera held; a rotation vector in Sensor from the left,
         then the translation.
@@ -71,16 +69,9 @@ class BoardPose(ArrayRecord):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardLook:
-    """The target seen from one posture.
+    """The target seen from one posture; looks of equal postures share the arm's error.
 
-    Parameters
-    ----------
-    posture
-        Looks of equal names share the arm's error.
-    base_from_tool
-        As the arm reported it.
-    poses
-        Of the target; the better first, and those of every numbering that no view tells apart.
+    Of ``poses`` the better comes first, with those of every numbering that no view tells apart.
     """
 
     posture: str
@@ -129,14 +120,8 @@ def board_poses(
 class BoardStart:
     """A hand-eye that most looks agree on.
 
-    Parameters
-    ----------
-    tool_from_sensor, base_from_board
-        The two poses.
-    chosen
-        (N,) pose of each look that is nearest.
-    off_rad, off_mm
-        (N,) what is left of each look, in orientation and place of the target's middle.
+    ``chosen`` (N,) is the nearest pose of each look, ``off_rad`` and ``off_mm`` (N,) what is left
+    of it, in orientation and place of the target's middle.
     """
 
     tool_from_sensor: Pose[Tool, Sensor]
@@ -242,7 +227,10 @@ def find_board_start(
     shift, place = _translations(rows, chosen, rotation, base)
     hand_eye: Pose[Tool, Sensor] = Pose(rotation, shift)
     board: Pose[Base, Board] = Pose(base, place)
-    off = _placed_middles(rows, chosen, hand_eye) - board.apply(rows.middle_mm[chosen])
+    seen = np.einsum("nij,nj->ni", rows.board[chosen], rows.middle_mm[chosen])
+    in_tool = hand_eye.apply(seen + rows.board_mm[chosen])
+    placed = np.einsum("nij,nj->ni", rows.arm[chosen], in_tool) + rows.arm_mm[chosen]
+    off = placed - board.apply(rows.middle_mm[chosen])
     return BoardStart(
         hand_eye,
         board,
@@ -263,7 +251,10 @@ def _hypotheses(rows: _Candidates, n: int, max_triples: int) -> list[tuple[Float
                     sine = np.linalg.norm(np.cross(one, other))
                     if sine < APART_SINE * np.linalg.norm(one) * np.linalg.norm(other):
                         continue
-                    rotation = _align(np.array([one, other]), np.array([seen, also]))
+                    turns = np.array([one, other, np.cross(one, other)])
+                    rotation = nearest_rotation(
+                        turns.T @ np.array([seen, also, np.cross(seen, also)])
+                    )
                     found.append((rotation, rows.arm[row] @ rotation @ rows.board[row]))
     return found
 
@@ -278,13 +269,6 @@ def _turns_from(rows: _Candidates, row: int, look: int) -> list[tuple[FloatArray
         if size > TURNED_RAD and abs(size - float(np.linalg.norm(seen))) < LIKELY_TURN_RAD:
             found.append((turn, seen))
     return found
-
-
-def _align(turns: FloatArray, seen: FloatArray) -> FloatArray:
-    """Rotation (3, 3) that takes (K, 3) turns of the sensor to those of the tool."""
-    crossed = np.cross(turns[0], turns[1])[None], np.cross(seen[0], seen[1])[None]
-    turns, seen = np.concatenate([turns, crossed[0]]), np.concatenate([seen, crossed[1]])
-    return nearest_rotation(turns.T @ seen)
 
 
 def _rotation_of_turns(rows: _Candidates, chosen: IntArray) -> FloatArray:
@@ -336,15 +320,6 @@ def _subsets(n: int, most: int) -> list[tuple[int, ...]]:
         return triples
     some = np.random.default_rng(0).permutation(len(triples))[:most]
     return [triples[k] for k in some]
-
-
-def _placed_middles(
-    rows: _Candidates, chosen: IntArray, hand_eye: Pose[Tool, Sensor]
-) -> FloatArray:
-    """(N, 3) middles of the target in Base, by arm, hand-eye and view."""
-    seen = np.einsum("nij,nj->ni", rows.board[chosen], rows.middle_mm[chosen])
-    in_tool = hand_eye.apply(seen + rows.board_mm[chosen])
-    return np.asarray(np.einsum("nij,nj->ni", rows.arm[chosen], in_tool) + rows.arm_mm[chosen])
 
 
 def _refuse_turns(rows: _Candidates) -> FitFailure:
@@ -445,15 +420,8 @@ def better_reading(
 ) -> FitFailure | None:
     """Refuse in favour of another way to read the arm's poses, if it makes the looks agree.
 
-    Parameters
-    ----------
-    looks
-        As they were read.
-    fact
-        What is wrong so.
-    readings
-        Of the table that they are from, the likelier first; after them convention, direction,
-        unit and order are tried.
+    ``fact`` is what is wrong as they are read. ``readings`` are of the table that they are from,
+    the likelier first; after them convention, direction, unit and order are tried.
     """
     given, found = find_board_start(looks), None
     least_mm = np.inf if isinstance(given, FitFailure) else MUCH_BETTER * given.typical_at_lever_mm

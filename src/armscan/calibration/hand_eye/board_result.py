@@ -60,10 +60,6 @@ class BoardPosture:
 
     Parameters
     ----------
-    posture, source
-        Names of the posture and of the image.
-    n_points
-        Of the target in it.
     rms_px
         Of the target's points in the image, where the arm's pose, the hand-eye and the mean board
         put them.
@@ -95,20 +91,10 @@ class BoardHandEyeFit(ArrayRecord):
 
     Parameters
     ----------
-    calibration
-        The result; the target is not in it.
-    base_from_board
-        Where the target lay.
     board_covariance
         (6, 6) of it, a rotation vector in Base from the left, then the translation.
     looks, chosen
         Those used, and the pose of each that agrees with the others, as the moved camera sees it.
-    postures
-        What each look left over.
-    conditioning
-        How well the postures determine the hand-eye.
-    asked
-        Size of the target that the arm's shifts ask for.
     camera
         As the looks move it, within its covariance: the calibration belongs to it.
     camera_step, camera_covariance
@@ -120,8 +106,6 @@ class BoardHandEyeFit(ArrayRecord):
         put them.
     not_used
         (source, reason) of looks that contradict the others.
-    warnings
-        What is weak, in words.
     """
 
     calibration: HandEyeCalibration
@@ -148,14 +132,8 @@ class BoardHandEyeFit(ArrayRecord):
     def scanner(
         self, sensor: SensorCalibration | None, provenance: Provenance
     ) -> ScannerCalibration:
-        """Hand-eye and sensor as the looks move both; without a sensor, of the camera as given.
-
-        Parameters
-        ----------
-        sensor
-            With the camera that was given; None if there are no light sheets yet.
-        provenance
-            Of the document.
+        """Hand-eye and sensor, which has the camera given, as the looks move both; without a
+        sensor, of the camera as given.
         """
         hand_eye, follow = self.calibration, self.calibration.dhand_eye_dsensor
         if follow is None:

@@ -148,12 +148,6 @@ class HandEyeSolution:
 
     Parameters
     ----------
-    problem
-        What was solved.
-    state, placed
-        All unknowns, and the observations placed with them.
-    components, noise
-        Causes of scatter and their standard deviations.
     known
         (M, M) covariance of the residuals by what errs alike in all postures: a probed plane and
         the sensor.
@@ -332,18 +326,14 @@ def estimate(
         if is_settled:
             break
         if not is_solved_first and last is not None and float(change @ last) < 0.0:
-            sigmas = before * np.exp(change * _damping(change, last))
+            # the part of the change that meets the middle of the oscillation (Aitken)
+            ratio = float(change @ last) / float(last @ last)
+            sigmas = before * np.exp(change * (1.0 / (1.0 - ratio)))
         last = change
     solution = _solution(problem, state, components, noise)
     if solution is None:
         return None
     return replace(solution, is_settled=solution.is_settled and is_settled)
-
-
-def _damping(change: FloatArray, last: FloatArray) -> float:
-    """Part of a change that meets the middle of an oscillation with the last one (Aitken)."""
-    ratio = float(change @ last) / float(last @ last)
-    return 1.0 / (1.0 - ratio)
 
 
 def first_sigmas(

@@ -151,12 +151,8 @@ def arm_components(
 ) -> tuple[NoiseComponent, ...]:
     """The scatter of an arm's poses by itself: its shift and both `TURNS`.
 
-    Parameters
-    ----------
-    covariances
-        (M, M) of each, for a standard deviation of 1.
-    position_mm, rotation_rad
-        Given, or None to have them estimated.
+    ``covariances`` (M, M) are for a standard deviation of 1; sizes are given, or None to be
+    estimated.
     """
     shift = _component("arm", covariances[0], position_mm, TYPICAL_ARM_MM, ARM_WIDTH)
     return _pose_components(covariances, shift, rotation_rad)
@@ -394,13 +390,12 @@ class NoiseEstimate:
     """Standard deviations (C,) of the causes of scatter, and covariance (C, C) of their logarithms.
 
     Given ones are included, with a covariance of zero. ``is_settled`` is False if the steps ran
-    out; ``log_posterior`` is the highest, without constants.
+    out.
     """
 
     sigmas: FloatArray
     log_covariance: FloatArray
     is_settled: bool = True
-    log_posterior: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -585,20 +580,15 @@ def estimate_noise(
         if is_settled:
             break
     log_covariance[np.ix_(free, free)] = np.linalg.inv(information)
-    return NoiseEstimate(posterior.sigmas(logs), log_covariance, is_settled, value)
+    return NoiseEstimate(posterior.sigmas(logs), log_covariance, is_settled)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolutionCovariance:
     """Second moments of a solution's errors, and how much longer their tails are than normal ones.
 
-    Parameters
-    ----------
-    matrix
-        (K, K) covariance.
-    region_factor
-        What the usual 95 % limit of the hand-eye's ``e' C^-1 e`` is to be multiplied with so that
-        95 % of the errors lie within it; at least 1.
+    ``region_factor``, at least 1, is what the usual 95 % limit of the hand-eye's ``e' C^-1 e`` is
+    to be multiplied with so that 95 % of the errors lie within it.
     """
 
     matrix: FloatArray

@@ -131,12 +131,8 @@ class PosedStripe(RowRecord):
 
     Parameters
     ----------
-    source
-        Name of the image.
     posture
         Exposures of equal posture were taken without moving the arm.
-    base_from_tool
-        As the arm reported it.
     points_mm
         (N, 3) in the Sensor frame.
     noise_mm
@@ -181,8 +177,6 @@ class PlateReference(ArrayRecord):
         Root mean square distance of the probed points from the plane; None where not known.
     n_points
         Count of probed points; 0 where only A, B, C, D are known.
-    source
-        Where it came from.
     tip_diameter_mm
         Diameter of the probe's tip that was compensated for; 0 where not known.
     """
@@ -311,8 +305,6 @@ class CircleSection(ArrayRecord):
 
     Parameters
     ----------
-    stripe
-        The exposure.
     rows
         Indices of the points used, ordered along the arc.
     off_circle_mm
@@ -321,10 +313,6 @@ class CircleSection(ArrayRecord):
         (3,) the circle's centre in the Sensor frame.
     normal
         (3,) unit normal of the light sheet, alike for all exposures of a sheet.
-    radius_mm
-        Of the circle.
-    arc_deg
-        Extent of the arc.
     n_rejected
         Count of the exposure's points off the circle.
     """
@@ -356,22 +344,7 @@ class CircleSection(ArrayRecord):
 def find_sections(
     stripes: Sequence[PosedStripe], radius_mm: float
 ) -> tuple[tuple[CircleSection, ...], tuple[str, ...]]:
-    """Fit a section circle to the stripe of every exposure and sheet.
-
-    Parameters
-    ----------
-    stripes
-        Exposures of the sphere.
-    radius_mm
-        Of the sphere, to tell it from whatever else was seen.
-
-    Returns
-    -------
-    sections
-        One for each usable stripe.
-    left_out
-        Stripes that were not used, each with the reason, in words.
-    """
+    """Fit a circle to the stripe of every exposure and sheet; those not used with the reason."""
     planes = _sheet_planes(stripes)
     sections, left_out = [], []
     for stripe in stripes:
@@ -475,8 +448,6 @@ class CondensedObservations(ArrayRecord):
         exposure, which the images of one instant share; index into ``postures``.
     rotations, translations_mm
         (S, 3, 3) and (S, 3) ``base_from_tool`` of each stripe.
-    sources, postures
-        Names.
     dpoint_dsensor
         (N, 3, P) derivative of the points by the sensor's parameters; None where there is none.
     sensor_covariance

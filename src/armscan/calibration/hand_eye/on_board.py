@@ -101,26 +101,11 @@ def calibrate_on_board(
 ) -> BoardHandEyeFit | FitFailure:
     """Find where the camera sits on the arm's last link from looks at a target that stays put.
 
-    Parameters
-    ----------
-    looks
-        Each with the arm's pose.
-    camera
-        With which the target's poses were found. The looks move it within its covariance.
-    options
-        The arm's scatter, where it is known; else it is estimated.
-    bow
-        Of the target, with which its poses were found; None if it is flat.
-    target
-        For the words about its size.
-    readings
-        Other ways to read the arm's poses, of all looks, that are tried where they do not fit.
-
-    Returns
-    -------
-    BoardHandEyeFit
-        With method "board". The calibration belongs to the moved camera: ``covariance`` holds that
-        fixed, ``dhand_eye_dsensor`` (6, 9) says how the hand-eye follows it.
+    The looks move the camera, with which the target's poses were found, within its covariance, and
+    the calibration belongs to the moved one: ``covariance`` holds that fixed, ``dhand_eye_dsensor``
+    (6, 9) says how the hand-eye follows it. ``bow`` is that of the target with which its poses were
+    found; None if it is flat. ``target`` is for words about its size. ``readings`` are other ways
+    to read the arm's poses, of all looks, that are tried where they do not fit.
     """
     options = options or HandEyeOptions()
     refused = _refuse_few(looks)
@@ -315,7 +300,8 @@ class _Problem:
         by_arm[0][:, 3:] = sensor_from_base
         by_arm[1][:, :3] = by_arm[2][:, :3] = sensor_from_base
         by_arm[1][:, 3:] = -sensor_from_base @ skew(from_arm)
-        scan_point = arm @ hand_eye.apply(self._scan_point_mm()) + arm_mm
+        middles = [pose.sensor_from_board.apply(middle_of(pose.view)) for pose in self.chosen]
+        scan_point = arm @ hand_eye.apply(np.mean(middles, axis=0)) + arm_mm
         by_arm[2][:, 3:] = -sensor_from_base @ skew(board.translation_mm - scan_point)
         return _System(
             self,
@@ -323,11 +309,6 @@ class _Problem:
             np.concatenate([jacobian.reshape(-1, N_UNKNOWN + q + 1), prior]),
             np.concatenate([by_arm.reshape(3, -1, 3), np.zeros((3, q, 3))], axis=1),
         )
-
-    def _scan_point_mm(self) -> FloatArray:
-        """(3,) in Sensor: the mean of the target's middles."""
-        middles = [pose.sensor_from_board.apply(middle_of(pose.view)) for pose in self.chosen]
-        return np.asarray(np.mean(middles, axis=0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -511,7 +492,8 @@ def _evidence(
         stated = covariance_over_noise(
             system.residual, solution.jacobian, solution.components, system.known, solution.noise
         )
-        conditioning = _conditioning(solution)
+        whitened = Whitening(solution.total)(solution.jacobian)
+        conditioning = conditioning_of(whitened[:, :N_POSE], whitened[:, N_POSE:])
         asked = _asked_scale(solution)
     except (EstimationError, np.linalg.LinAlgError) as error:
         return FitFailure(f"{_NOTHING.reason} ({error})", TURN_MORE)
@@ -583,11 +565,6 @@ def _positive(covariance: FloatArray) -> FloatArray:
     """The nearest covariance without negative variances, which averages may leave by rounding."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-def _conditioning(solution: _Solution) -> Conditioning:
-    whitened = Whitening(solution.total)(solution.jacobian)
-    return conditioning_of(whitened[:, :N_POSE], whitened[:, N_POSE:])
 
 
 def _left_out(solution: _Solution) -> dict[str, LeftOut]:

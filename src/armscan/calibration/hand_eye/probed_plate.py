@@ -36,24 +36,12 @@ def face_towards(
     *,
     is_sign_only: bool = False,
 ) -> tuple[Plane, str] | FitFailure:
-    """Turn a plane's normal to the side of the probe.
+    """Turn a plane's normal in Base to the side of the probe, and say how that was found.
 
-    Parameters
-    ----------
-    plane
-        The plane in Base.
-    towards_mm
-        (3,) or (M, 3) places of the tool; None where not known.
-    side
-        The user's word, which wins; None to follow the tool, or `DEFAULT_SIDE` without it.
-    is_sign_only
-        Nothing but the normal's sign depends on the side: where nobody says it, the tool lies in
-        the plane or `DEFAULT_SIDE` is not clear, the axis that the plate faces most will do.
-
-    Returns
-    -------
-    plane, side_from
-        The plane, and how its side was found, in words; a failure if it is not clear.
+    ``side`` is the user's word, which wins; None to follow the places (3,) or (M, 3) of the tool,
+    or `DEFAULT_SIDE` where these are not known. With ``is_sign_only`` nothing but the normal's sign
+    depends on the side: where nobody says it, the tool lies in the plane or `DEFAULT_SIDE` is not
+    clear, the axis that the plate faces most will do.
     """
     if side is None and towards_mm is not None:
         heights = plane.distance_mm(np.atleast_2d(np.asarray(towards_mm, dtype=np.float64)))
@@ -194,8 +182,6 @@ class ProbedPlate(ArrayRecord):
         (N,) whether each touch took part.
     side_from
         How the side of the probe was found, in words.
-    warnings
-        What is weak, in words.
     rows
         Row of each touch in the table it came from, counted from 1 below the header.
     """
@@ -234,21 +220,9 @@ def fit_probed_plate(
 
     Eq. 2.44's algebraic fit favours points near the origin; distances along the normal do not.
 
-    Parameters
-    ----------
-    probed
-        Points on the surface, or centres of the tip.
-    towards_mm
-        (3,) or (M, 3) places of the arm's tool in Base while it probed or scanned: their side is
-        the plate's face. None where not known.
-    options
-        Defaults if None.
-
-    Returns
-    -------
-    ProbedPlate or FitFailure
-        A failure for fewer than three points, points near one line, points on no plane, or an
-        unclear side.
+    ``towards_mm`` (3,) or (M, 3) are places of the arm's tool in Base while it probed or scanned:
+    their side is the plate's face. None where not known. There is no plate of fewer than three
+    points, points near one line or on no plane, or with an unclear side.
 
     Raises
     ------

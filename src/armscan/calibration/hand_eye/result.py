@@ -78,17 +78,7 @@ SCATTER_NAMES = {
 
 
 class StripeResidual(RowRecord):
-    """What one exposure left over.
-
-    Parameters
-    ----------
-    source, posture
-        Names of the exposure and of its posture.
-    points_base_mm
-        (N, 3) points placed with the result.
-    residual_mm
-        (N,) signed distance from the reference.
-    """
+    """Points (N, 3) of one exposure placed with the result, and their distances (N,) left over."""
 
     source: str
     posture: str
@@ -102,10 +92,6 @@ class PostureResult:
 
     Parameters
     ----------
-    posture
-        Its name.
-    n_exposures, n_points
-        What was used.
     mean_mm, rms_mm
         Mean and root mean square distance of its points from the reference.
     normalised_mean
@@ -141,18 +127,12 @@ class HandEyeFit(ArrayRecord):
 
     Parameters
     ----------
-    calibration
-        The result.
     start
         Where the refinement started: on a plate the linear solution.
-    stripes, postures
-        What each exposure and each posture left over.
     singular_values
         (6,) of the scaled and whitened system, largest first.
     reference
         What the reference was and how far the data agree with it, as (label, value) for a reader.
-    warnings
-        What is weak, in words.
     sensor_step, sensor_covariance
         (P,) by what the stripes move the sensor's parameters, and (P, P) their covariance after it;
         None where the sensor was taken as exact. The calibration belongs to the moved sensor.
@@ -544,14 +524,9 @@ def study_repeats(
 ) -> RepeatStudy | FitFailure:
     """Compare the scatter of repeated calibrations with the standard deviations they state.
 
-    Parameters
-    ----------
-    calibrations
-        Two or more of one head; each with its covariance.
-    sensor_covariance
-        (P, P) of the one sensor that all were calibrated with. What its error does to all alike is
-        left out; how differently it moves them, as their postures differ, is a part of the
-        scatter. None takes it as exact.
+    ``sensor_covariance`` (P, P) is that of the one sensor that all were calibrated with. What its
+    error does to all alike is left out; how differently it moves them, as their postures differ, is
+    a part of the scatter. None takes it as exact.
     """
     poses = [one.tool_from_sensor for one in calibrations]
     covariances = [one.covariance for one in calibrations]
@@ -567,15 +542,7 @@ def study_repeats(
 def study_poses(
     poses: Sequence[Pose[Tool, Sensor]], covariances: Sequence[FloatArray] | None = None
 ) -> RepeatStudy | FitFailure:
-    """As `study_repeats`, from hand-eyes alone.
-
-    Parameters
-    ----------
-    poses
-        ``tool_from_sensor`` of each calibration.
-    covariances
-        (6, 6) of each in the order of
-        `armscan.models.calibration.HAND_EYE_PARAMETER_NAMES`, or None.
+    """As `study_repeats`, from hand-eyes and their covariances (6, 6) alone.
 
     Raises
     ------
@@ -619,15 +586,9 @@ def study_poses(
 def angle_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     """(6, 6) covariance of `REPEAT_NAMES` from that of the hand-eye's parameters.
 
-    With R = Rx(theta) Ry(gamma) Rz(phi) of eq. 2.69, turns of the three angles act about x, about
-    the turned y and about the twice turned z.
-
-    Parameters
-    ----------
-    rotation
-        (3, 3) of ``tool_from_sensor``; gamma not 90 degrees.
-    covariance
-        (6, 6) in the order of `armscan.models.calibration.HAND_EYE_PARAMETER_NAMES`.
+    With R = Rx(theta) Ry(gamma) Rz(phi) of eq. 2.69, ``rotation`` of ``tool_from_sensor``, turns of
+    the three angles act about x, about the turned y and about the twice turned z; gamma is not 90
+    degrees.
     """
     theta = float(np.radians(_values(Pose(rotation, np.zeros(3)))[0]))
     turned_y = np.array([0.0, np.cos(theta), np.sin(theta)])

@@ -94,16 +94,10 @@ def many_placed(
     translations_mm: FloatArray,
     surface: ReferenceSurface,
 ) -> ManyPlaced:
-    """Distances of points (N, 3) from the surface for many states at once.
+    """Distances of points (N, 3) in Sensor from the surface for many states at once.
 
-    Parameters
-    ----------
-    points_mm
-        (N, 3) in the Sensor frame.
-    rotations, translations_mm
-        (N, 3, 3) and (N, 3) ``base_from_tool`` of each.
-    surface
-        Its first parameters are unknown, as many as there are further unknowns.
+    ``base_from_tool`` of each is (N, 3, 3) and (N, 3). Of the surface's parameters the first are
+    unknown, as many as there are further unknowns.
     """
 
     def place(turns: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -131,12 +125,8 @@ def placed_on_plate(
     A distance is linear in the 12 entries of rotation and shift. However many there are, 13
     combinations of them, the rows of a QR factor, have their sum of squares for every state.
 
-    Parameters
-    ----------
-    points_mm
-        (N, 3) in the Sensor frame, or (K, N, 3) of each of the K states its own.
-    normals, constants
-        (N, 3) and (N,) of the plate in Tool (`plate_in_tool`), or (K, N, 3) and (K, N).
+    Points (N, 3) are in Sensor, normals (N, 3) and constants (N,) of `plate_in_tool`; or (K, ...),
+    each of the K states its own.
     """
     rows = (normals[..., :, None] * points_mm[..., None, :]).reshape(*points_mm.shape[:-1], 9)
     table = np.concatenate([rows, normals, constants[..., None]], axis=-1)
@@ -168,23 +158,10 @@ def descend_all(
     n_steps: int,
     scale: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Damped Gauss-Newton from many starts at once.
+    """Damped Gauss-Newton from many starts at once: rotations (K, 3, 3) and others (K, U).
 
-    Parameters
-    ----------
-    place
-        Residuals and derivatives of many states.
-    rotations, others
-        (K, 3, 3) and (K, U) to start from.
-    n_steps
-        Steps of each.
-    scale
-        (3 + U,) of `unit_steps`, or (K, 3 + U).
-
-    Returns
-    -------
-    rotations, others, cost
-        (K, 3, 3), (K, U), and the sums of squared residuals (K,).
+    ``scale`` (3 + U,) is of `unit_steps`, or (K, 3 + U). Returns both after the steps, and the sums
+    of squared residuals (K,).
     """
     residual, jacobian = place(rotations, others)
     cost = (residual**2).sum(axis=1)

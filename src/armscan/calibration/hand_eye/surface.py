@@ -291,10 +291,13 @@ def place(
         [normals, np.cross(from_tool, normals), np.cross(from_scan_point, normals)]
     )
     by_point = state.scale * in_tool_normals @ hand_eye.rotation
-    residual_mm, by_sensor = observations.mean(residual), _dresidual_dsensor(observations, by_point)
+    residual_mm, by_sensor = observations.mean(residual), None
     moved_mm = np.zeros_like(residual_mm)
-    if by_sensor is not None and state.sensor is not None:
-        moved_mm = by_sensor @ state.sensor
+    if observations.dpoint_dsensor is not None:
+        by_points = np.einsum("ni,nip->np", by_point, observations.dpoint_dsensor)
+        by_sensor = observations.mean(by_points)
+        if state.sensor is not None:
+            moved_mm = by_sensor @ state.sensor
     return Placed(
         points_base_mm=base,
         dresidual_dpoint=by_point,
@@ -304,14 +307,6 @@ def place(
         jacobian=observations.mean(jacobian),
         dresidual_dpose=observations.mean(by_pose),
     )
-
-
-def _dresidual_dsensor(
-    observations: CondensedObservations, by_point: FloatArray
-) -> FloatArray | None:
-    if observations.dpoint_dsensor is None:
-        return None
-    return observations.mean(np.einsum("ni,nip->np", by_point, observations.dpoint_dsensor))
 
 
 def free_columns(surface: ReferenceSurface, options: HandEyeOptions) -> IntArray:

@@ -412,12 +412,7 @@ def estimate_shapes_mm(
     shape's variance the mean over the likelihood is returned, all sizes up to the residuals' own
     being alike beforehand: where few boards tell little, it stays as large as it may be.
 
-    Parameters
-    ----------
-    observations, solution
-        N points used, and the joint fit.
-    noise_px
-        (N,) standard deviation with which points count as independent.
+    ``noise_px`` (N,) is the standard deviation with which points count as independent.
     """
     return tuple(
         _shape_mm(_cells(observations, solution, noise_px, k)) for k in range(len(solution.sheets))

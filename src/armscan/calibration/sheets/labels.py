@@ -41,21 +41,10 @@ Stripes = Sequence[Sequence[StripeObservation]]
 
 @dataclass(frozen=True, slots=True)
 class SheetAssignment:
-    """Sheets of all stripes.
+    """Sheets of all stripes: ``sheets[i][k]`` of stripe k of image i, -1 for none.
 
-    Parameters
-    ----------
-    names
-        Of the sheets.
-    sheets
-        ``sheets[i][k]`` is the sheet of stripe k of image i, -1 for none.
-    how
-        In words.
-    warnings
-        What is doubtful.
-    is_fan
-        True where lines of a fan were found among others: one that cannot be calibrated may then be
-        left out.
+    If ``is_fan``, lines of a fan were found among others: one that cannot be calibrated may be left
+    out.
     """
 
     names: tuple[str, ...]

@@ -140,16 +140,9 @@ _USE_LABELS = {
 class PlacedBoard:
     """A board's pose in the Sensor frame.
 
-    Parameters
-    ----------
-    sensor_from_board
-        The pose.
-    covariance
-        (6, 6) by the noise of the target's points: rotation-vector increment (rad, Sensor frame,
-        from the left), then translation (mm).
-    by_cameras
-        (6, P) derivative by the P parameters of `HeadCameras`; then by the two of the target's
-        bow, if it has one.
+    ``covariance`` (6, 6) is by the noise of the target's points: rotation-vector increment (rad,
+    Sensor frame, from the left), then translation (mm). ``by_cameras`` (6, P) is its derivative by
+    the P parameters of `HeadCameras`; then by the two of the target's bow, if it has one.
     """
 
     sensor_from_board: Pose[Sensor, Board]
@@ -341,8 +334,6 @@ class SheetFit(ArrayRecord):
 
     Parameters
     ----------
-    calibration
-        The sheet, its key figures and its diagnostics.
     covariance
         (8, 8) in the order of `armscan.models.calibration.SHEET_PARAMETER_NAMES`, camera included.
     is_bow_free
@@ -352,12 +343,6 @@ class SheetFit(ArrayRecord):
         Standard deviation of the normal's direction, the worse axis.
     offset_sigma_mm
         Standard deviation of the sheet's position in the middle of the calibrated region.
-    comparisons
-        Simpler methods on the same points.
-    points
-        Points that the stored calibration makes of its own stripes, against their boards.
-    warnings
-        What is weak, in words.
     """
 
     calibration: SheetCalibration
@@ -386,8 +371,6 @@ class LaserFit(ArrayRecord):
 
     Parameters
     ----------
-    sheets
-        One entry a sheet.
     images
         One entry an image, in the order given.
     camera, second
@@ -395,16 +378,10 @@ class LaserFit(ArrayRecord):
     covariance
         Joint covariance as `SensorCalibration` wants it: (9 + 8 S, 9 + 8 S), with 15 more for a
         second camera.
-    diagnostics
-        Of all sheets together.
     boards
         What was given: enough to solve again.
-    options
-        In force.
     warnings
         On the whole calibration; those of one sheet are with the sheet.
-    skipped
-        Images that gave nothing.
     laser_colour
         The channel of colour images in which the stripes were found.
     channel_reason

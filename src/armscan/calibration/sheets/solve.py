@@ -139,7 +139,7 @@ def stack_observations(
                 stripe=np.full(len(rows), number),
                 points_mm=points.points_mm[rows],
                 across_mm_px=np.einsum(
-                    "nij,nj->ni", points.dpoint_dq[rows], profile.normals_px[rows]
+                    "nij,nj->ni", points.dpoint_dq[rows], _to_one_side(profile.normals_px[rows])
                 ),
                 sigma_px=profile.sigma_px[rows],
                 dpoint_dpose=points.dpoint_dpose[rows],
@@ -147,6 +147,16 @@ def stack_observations(
             )
         )
     return SheetObservations.concat(parts)
+
+
+def _to_one_side(normals: FloatArray) -> FloatArray:
+    """Normals (N, 2) of the segments of a stripe, each known but for its sign, on the first's side.
+
+    A residual means the same all along the stripe then.
+    """
+    middle = np.linalg.eigh(normals.T @ normals)[1][:, 1]
+    is_there = normals @ middle >= 0.0
+    return np.where((is_there == is_there[0])[:, None], normals, -normals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,33 +265,17 @@ def solve_sheets(
 ) -> SheetSolution | FitFailure:
     """Fit the sheets by Gauss-Newton steps.
 
-    Parameters
-    ----------
-    observations
-        Points with the sheet of each.
-    start
-        Starting sheets; their axes define u and v.
-    errors
-        Covariance of the boards' poses and of the camera.
-    is_bowed
-        For each sheet, whether its bow is free; a bow that is not free is zero.
-    sigma_factor
-        Multiplies the stripes' sigmas in the weights; one number, or one a point.
-    is_robust
-        Weigh points down by Huber's function on what remains; for finding outliers.
-    are_cameras_held
-        Solve for the sheets that belong to the cameras as calibrated.
-    may_bow
-        A bow that is not free is not zero but known beforehand to be so to `LIKELY_BOW`: a plane is
-        kept as long as no test asks for more, which is no proof that the sheet is one. Where the
-        stripes say nothing of a bow it stays zero, and uncertain by as much; where they show that
-        there is none, next to nothing is added to what is stated.
+    The axes of the starting sheets define u and v. A bow that is not free (``is_bowed``) is zero.
+    ``sigma_factor`` multiplies the stripes' sigmas, one number or one a point; ``is_robust`` weighs
+    points down by Huber's function on what remains, for finding outliers; ``are_cameras_held``
+    solves for the sheets that belong to the cameras as calibrated. With ``may_bow`` a bow that is
+    not free is not zero but known beforehand to be so to `LIKELY_BOW`: a plane is kept as long as
+    no test asks for more, which is no proof that the sheet is one. Where the stripes say nothing of
+    a bow it stays zero, and uncertain by as much; where they show that there is none, next to
+    nothing is added.
 
-    Returns
-    -------
-    SheetSolution or FitFailure
-        A failure where the points do not determine a sheet, or a step turns one by more than 45
-        degrees.
+    A failure where the points do not determine a sheet, or a step turns one by more than 45
+    degrees.
     """
     sheets = [replace(sheet, bow_mm=np.zeros(5)) for sheet in start]
     is_free = np.concatenate(

@@ -437,19 +437,10 @@ def find_straight_stripes(
     Lines through two points of one segment, or of two, are tried with a fixed seed; the best
     supported one is refined, its points are taken away, and the search goes on.
 
-    Parameters
-    ----------
-    points_mm, sigma_mm, segment
-        (N, 2) points in the board's plane, (N,) their standard deviation across the stripe, and
-        (N,) their connected segment.
-    shortest_mm, tolerance_mm
-        Least length of a stripe, and half the width of its band.
-    n_lines
-        Most stripes to look for; 0 for all.
-
-    Returns
-    -------
-    Rows (K,) of each stripe's points, ordered along it.
+    Points (N, 2) are in the board's plane, with a sigma (N,) across the stripe and the number (N,)
+    of their connected segment; a stripe is ``shortest_mm`` long at least, and its band
+    ``tolerance_mm`` wide to each side. At most ``n_lines`` are looked for, 0 for all. Rows (K,) are
+    ordered along each stripe.
     """
     stripes: list[IntArray] = []
     lines: list[Line] = []

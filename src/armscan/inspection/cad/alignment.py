@@ -68,14 +68,8 @@ MIRRORED = 0.5
 class FreeMotion:
     """A motion of the cloud over the part that its points do not hold.
 
-    Parameters
-    ----------
-    kind
-        ``turn`` or ``shift``.
-    direction
-        (3,) unit vector in Cad: the axis, or the way.
-    point_mm
-        (3,) on the axis.
+    ``direction`` (3,) is the axis of a turn, through ``point_mm`` (3,), or the way of a shift, in
+    Cad.
     """
 
     kind: Literal["turn", "shift"]
@@ -233,14 +227,7 @@ def align_best(
     Robust point to surface: Gauss-Newton on the signed distances, weighted by the points' own
     covariances along the normal and by what else scatters, with Tukey's biweight.
 
-    Parameters
-    ----------
-    surface
-        The part.
-    cloud
-        Points of it, in any frame.
-    errors_known
-        True if the cloud's covariances are to be used.
+    ``errors_known``: true if the cloud's covariances are to be used.
 
     Returns
     -------
@@ -355,12 +342,7 @@ def fit_to_part(
 ) -> Alignment:
     """Fit a cloud that lies nearly right: the robust fit of `align_best` without its search.
 
-    Parameters
-    ----------
-    surface, cloud, errors_known
-        As of `align_best`.
-    pose
-        Where the cloud lies, to a few hundredths of the part's size.
+    ``pose``: where the cloud lies, to a few hundredths of the part's size.
     """
     rows = spread_rows(cloud.points_mm, MOST_POINTS)
     normals = None if cloud.normals is None else cloud.normals[rows]

@@ -144,18 +144,12 @@ class FaceComparison:
 
     Parameters
     ----------
-    name
-        The face's.
-    statistics
-        Of its points.
     u_mean_mm
         U (k = 2) of the mean, of the points' errors or of how far exposures disagree, the larger;
         NaN where not known, and of a face without points.
     spot_mm, u_spot_mm, spot_place_mm
         Median deviation of the spot that decides, of those the one that deviates most, its U, and
         (3,) where in Cad it is; NaN where no spot has enough points.
-    tolerance_mm
-        Of the face; NaN for none.
     decision
         The worse of those on the mean and on every spot; empty without a tolerance.
     is_seen_once
@@ -179,10 +173,6 @@ class CadComparison(RowRecord):
 
     Parameters
     ----------
-    alignment
-        Where the cloud was laid.
-    options
-        In force.
     rows
         (N,) rows of the cloud within reach; the rest of the fields are of these.
     points_mm, closest_mm, normals
@@ -198,14 +188,6 @@ class CadComparison(RowRecord):
         be of either face. It counts in ``overall`` alone.
     decision
         (N,) number in `DECISIONS`; -1 without a tolerance, or beside an edge.
-    overall
-        Statistics over all.
-    faces
-        Each face.
-    n_given
-        Points of the cloud.
-    spot_width_mm
-        Width of a spot.
     is_fused
         True if the cloud no longer tells its exposures apart.
     """
@@ -264,19 +246,6 @@ def compare_with_part(
 ) -> CadComparison | FitFailure:
     """Deviations of an aligned cloud.
 
-    Parameters
-    ----------
-    surface
-        The part.
-    cloud
-        Its points.
-    alignment
-        Where they lie.
-    options
-        What belongs to the part and what is allowed.
-    errors_known
-        True if the cloud's covariances are to be used.
-
     Returns
     -------
     FitFailure
@@ -322,7 +291,7 @@ def compare_with_part(
             float(limits[k]),
             d[by_face[k]],
             float(u_face[k]),
-            spots.of_face(k),
+            spots.select(spots.face == k),
             is_once=bool(once[k]),
         )
         for k, name in enumerate(part.face_names)
@@ -448,9 +417,6 @@ class _Spots(RowRecord):
     u_mm: FloatArray = floats("N", nan=True)
     place_mm: FloatArray = floats("N", 3)
     is_once: BoolArray = bools("N")
-
-    def of_face(self, k: int) -> _Spots:
-        return self.select(self.face == k)
 
 
 def _spots(closest_mm: FloatArray, face: IntArray, width_mm: float) -> tuple[IntArray, int]:

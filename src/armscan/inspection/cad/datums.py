@@ -81,18 +81,10 @@ TURNS_OF: dict[ShapeKind, tuple[int, ...]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DatumFeature:
-    """A feature of the part that an alignment rests on.
+    """A feature of the part that an alignment rests on: where it should be, in Cad; its size is
+    free.
 
-    Parameters
-    ----------
-    name
-        Of the datum.
-    shape
-        Where it should be, in Cad; its size holds nothing.
-    face
-        Number of the model's face that it is; -1 for one that the model does not have.
-    region
-        In Cad; of a datum that is no face, only points inside are its own.
+    ``face`` is the model's, -1 for none; then only points inside ``region``, in Cad, are its own.
     """
 
     name: str
@@ -103,16 +95,8 @@ class DatumFeature:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Datums:
-    """What an alignment rests on.
-
-    Parameters
-    ----------
-    faces
-        Numbers of three faces, for ``321``.
-    features
-        For ``features``, in the order in which they hold.
-    points
-        For ``points`` and ``markers``.
+    """What an alignment rests on: by ``321`` three numbers of faces, by ``features`` these in their
+    order, by ``points`` and ``markers`` reference points.
     """
 
     faces: tuple[int, ...] = ()
@@ -163,14 +147,7 @@ def align(
 ) -> Alignment | FitFailure:
     """Lay a cloud on its part: by the best fit, from there on its datums, or on reference points.
 
-    Parameters
-    ----------
-    surface, cloud, errors_known
-        As of `align_best`.
-    method
-        How.
-    datums
-        What it rests on; those of the method.
+    ``surface``, ``cloud``, ``errors_known`` as of `align_best`.
 
     Returns
     -------
@@ -232,15 +209,6 @@ def align_datums(
 
     The first face takes as many motions as it holds, three for a plane; the second and the third
     what the ones before left. A face is met by all its points on the model's own surface.
-
-    Parameters
-    ----------
-    surface, cloud, errors_known
-        As of `align_best`.
-    faces
-        Numbers of the part's faces.
-    start
-        A best fit.
     """
     at = _Placing.of(surface, cloud, errors_known)
     pose = start.cad_from_part
@@ -275,15 +243,6 @@ def align_features(
     far as the ones before left it, its direction before its place (ISO 5459 constrains a later
     datum in orientation, not in location), by least squares over its points. Sizes hold nothing:
     a bore that is too large stays where its axis is.
-
-    Parameters
-    ----------
-    surface, cloud, errors_known
-        As of `align_best`.
-    features
-        In the order in which they hold.
-    start
-        A best fit: it says which points are a feature's.
 
     Returns
     -------
@@ -514,8 +473,6 @@ class _Fitted:
 
     Parameters
     ----------
-    feature
-        Where it should be.
     shape
         Fitted, in the cloud's frame.
     source

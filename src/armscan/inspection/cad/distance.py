@@ -59,17 +59,10 @@ class PartSurface:
     Points beside an edge or a corner are inside or outside by the angle-weighted normal there,
     which is right for every closed surface (Baerentzen and Aanaes 2005).
 
-    Parameters
-    ----------
-    part
-        The model.
-
     Attributes
     ----------
     diagonal_mm
         Of the box about the part.
-    is_closed
-        True if each edge joins two triangles, so that inside and outside are parted.
     """
 
     def __init__(self, part: PartModel) -> None:

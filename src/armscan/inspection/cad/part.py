@@ -34,12 +34,6 @@ class PartModel(ArrayRecord):
         (F, 3) rows of ``vertices_mm``, anticlockwise seen from outside.
     face
         (F,) index into ``face_names``.
-    face_names
-        Names of the faces.
-    source
-        Where it was read from, in words.
-    notes
-        What is odd about it, in words.
     """
 
     vertices_mm: FloatArray = floats("V", 3)
@@ -101,19 +95,8 @@ def part_of(
 ) -> PartModel:
     """Join loose triangles to a part.
 
-    Parameters
-    ----------
-    corners_mm
-        (F, 3, 3) corners of each triangle.
-    source
-        Where they come from, in words.
-    face, face_names
-        (F,) face of each triangle and the faces' names; None to group them by creases.
-
-    Raises
-    ------
-    InputError
-        If there are no triangles with an area, or a corner is not finite.
+    ``corners_mm``: (F, 3, 3) corners of each triangle. ``face``, ``face_names``: (F,) face of each
+    triangle and the faces' names; None to group them by creases.
     """
     if not np.isfinite(corners_mm).all():
         bad = int((~np.isfinite(corners_mm).all(axis=(1, 2))).sum())
@@ -141,7 +124,9 @@ def part_of(
         )
     vertices, triangles = _welded(corners, SAME_PLACE * diagonal)
     notes = list(_odd_edges(triangles, source))
-    if not notes and _signed_volume(corners) < 0.0:
+    here = corners - corners.mean(axis=(0, 1))
+    volumes = np.einsum("ij,ij->", here[:, 0], np.cross(here[:, 1], here[:, 2]))
+    if not notes and float(volumes) < 0.0:
         # closed, and every triangle looks into the part: there is one way to mend it
         corners, triangles = corners[:, ::-1], triangles[:, ::-1]
         notes.append(f"{source}: the surface was turned inside out; its triangles are turned back")
@@ -174,12 +159,6 @@ def edges_of(triangles: IntArray) -> tuple[IntArray, IntArray]:
 def _crosses(corners: FloatArray) -> FloatArray:
     """(F, 3) cross products of both sides at the first corner."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def _signed_volume(corners: FloatArray) -> float:
-    """Of a closed surface, negative if its triangles look inward (divergence theorem)."""
-    here = corners - corners.mean(axis=(0, 1))
-    return float(np.einsum("ij,ij->", here[:, 0], np.cross(here[:, 1], here[:, 2]))) / 6.0
 
 
 def _welded(corners: FloatArray, tolerance: float) -> tuple[FloatArray, IntArray]:

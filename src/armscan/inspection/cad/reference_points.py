@@ -53,8 +53,6 @@ class ReferencePoints(RowRecord):
 
     Parameters
     ----------
-    names
-        Of the points.
     nominal_mm
         (N, 3) in Cad.
     measured_mm
@@ -65,8 +63,6 @@ class ReferencePoints(RowRecord):
         True if they were picked roughly in the cloud: the nearest point of the cloud is taken.
     is_marker
         True if they are markers, whose calibration's error is common and not in the covariance.
-    notes
-        What a person should know of them, in words.
     """
 
     names: tuple[str, ...]
@@ -81,16 +77,9 @@ class ReferencePoints(RowRecord):
 def paired_markers(
     nominal: MarkerSet, measured: MarkerSet, *, by_number: bool
 ) -> ReferencePoints | FitFailure:
-    """Measured markers beside their nominal places.
+    """Measured markers, in the cloud's frame, beside their nominal places in Cad.
 
-    Parameters
-    ----------
-    nominal
-        In Cad.
-    measured
-        In the cloud's frame.
-    by_number
-        True if equal numbers are the same marker; else they are matched by their distances.
+    ``by_number``: equal numbers are the same marker; else their distances match them.
     """
     notes: tuple[str, ...] = ()
     if by_number:
@@ -118,13 +107,6 @@ def paired_markers(
 
 def align_points(cloud: PointCloud, points: ReferencePoints) -> Alignment | FitFailure:
     """Lay a cloud on measured points.
-
-    Parameters
-    ----------
-    cloud
-        In the frame of the measured points.
-    points
-        Nominal and measured places.
 
     Returns
     -------

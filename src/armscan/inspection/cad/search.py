@@ -57,8 +57,6 @@ class PoseCandidate:
 
     Parameters
     ----------
-    cad_from_part
-        The pose.
     cost
         Mean square deviation over the best pose's robust variance, each clipped at `CLIPPED`.
     scale_mm
@@ -85,14 +83,8 @@ def search_pose(
 ) -> tuple[PoseCandidate, ...]:
     """Find where a cloud lies on a part.
 
-    Parameters
-    ----------
-    surface
-        The part.
-    points_mm
-        (N, 3) the cloud, in a frame of its own.
-    normals
-        (N, 3) outward unit normals, or None; with them both sides of a plate are told apart.
+    ``points_mm``: (N, 3) the cloud, in a frame of its own. ``normals``: (N, 3) outward unit
+    normals, or None; with them both sides of a plate are told apart.
 
     Returns
     -------
@@ -113,7 +105,8 @@ def search_pose(
         (SOME, LAST, diagonal * np.geomspace(0.04, 0.01, 8)),
     ):
         few = _thinned(len(centred), count)
-        costs = _descended(centred[few], _part_of(facing, few), grid, widths, poses)
+        looks = np.zeros((0, 3)) if facing is None else np.ascontiguousarray(facing[few])
+        costs = _descended(centred[few], looks, grid, widths, poses)
         poses = _distinct(poses, costs, centred, APART * diagonal, kept)
     candidates = [_typed(pose, middle) for pose in poses]
     compared = spread_rows(points_mm, ALL)
@@ -237,10 +230,6 @@ def even_turns(count: int) -> FloatArray:
 def _thinned(n: int, count: int) -> IntArray:
     random = np.random.default_rng(1)
     return np.arange(n) if n <= count else random.choice(n, count, replace=False)
-
-
-def _part_of(values: FloatArray | None, rows: IntArray) -> FloatArray:
-    return np.zeros((0, 3)) if values is None else np.ascontiguousarray(values[rows])
 
 
 def _distance_grid(surface: PartSurface) -> _DistanceGrid:
@@ -442,14 +431,7 @@ def unit_mismatch(
 ) -> FitFailure | None:
     """Notice a cloud or a part in another unit by how much better the cloud fits when scaled.
 
-    Parameters
-    ----------
-    surface
-        The part.
-    cloud
-        Its points, of a size that a scan of the part may have.
-    best
-        Where they fit best as they are.
+    ``best`` is where the points, of a size that a scan may have, fit best as they are.
     """
     ours, theirs = across_mm(cloud.points_mm), surface.diagonal_mm
     if best.scale_mm <= DOUBTFUL * ours:

@@ -31,15 +31,17 @@ from armscan.report.inspection.cad import (
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import read_cloud
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.parts.datums import (
-    datum_faces,
-    datum_features,
-    read_reference_markers,
-    read_reference_points,
-)
 from armscan.storage.parts.meshes import UNITS_MM, read_part
 from armscan.storage.parts.step import ChordError
-from armscan.storage.parts.tables import deviation_ply_bytes, face_table_bytes, read_tolerances
+from armscan.storage.parts.tables import (
+    datum_faces,
+    datum_features,
+    deviation_ply_bytes,
+    face_table_bytes,
+    read_reference_markers,
+    read_reference_points,
+    read_tolerances,
+)
 
 STAGES = ("model", "cloud", "alignment", "deviations")
 
@@ -55,7 +57,7 @@ class PartOptions:
         three faces; ``features``: by fitted features one after the other; ``points``,
         ``markers``: by points whose places on the part are known.
     datums
-        Of ``321`` and ``features``, as of `armscan.storage.parts.datums`.
+        Of ``321`` and ``features``, as of `armscan.storage.parts.tables`.
     unit
         Unit of a mesh: mm, cm, m or inch.
     points
@@ -82,31 +84,15 @@ def inspect_cad(
     options: CadOptions | None = None,
     chord: ChordError | None = None,
 ) -> Summary:
-    """Compare a cloud with the model of its part.
+    """Compare a cloud with the model of its part, in STL, PLY, OBJ or STEP.
 
     Beside the page go ``NAME.csv``, a row a face, and ``NAME.ply``, the points with their
     deviations.
 
-    Parameters
-    ----------
-    job
-        Where to write the page, if anywhere.
-    cloud_path
-        A cloud of ``armscan reconstruct``, or any file that `armscan.storage.read_cloud` reads.
-    part_path
-        The model: STL, PLY, OBJ or STEP.
-    tolerance
-        A length in mm, or a table of them as of `armscan.storage.parts.tables.read_tolerances`.
-    region
-        ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm of the cloud's frame; empty for all of it.
-    part_options, options, chord
-        How to read, lay and judge; tolerances are those of ``tolerance``.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the cloud is not of this part; nothing is
-        written then.
+    ``tolerance``: a length in mm, or a table of them as of
+    `armscan.storage.parts.tables.read_tolerances`. ``region``: ``xmin, xmax, ymin, ymax, zmin,
+    zmax`` in mm of the cloud's frame; empty for all of it. ``part_options``, ``options``,
+    ``chord``: how to read, lay and judge; tolerances are those of ``tolerance``.
     """
     how, options = part_options or PartOptions(), options or CadOptions()
     _check_options(how)

@@ -165,21 +165,9 @@ class _Run:
 def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summary:
     """Inspect parts by a recipe.
 
-    Parameters
-    ----------
-    job
-        Its output is the folder of the results, made if need be. A part that is in it, done with
-        the same recipe, model and cloud, is not done again.
-    recipe_path
-        The recipe.
-    places
-        Clouds, and folders of clouds, in the order of the trend.
-
-    Raises
-    ------
-    ArmscanError
-        If the recipe is wrong, or the folder is not one of results; nothing is written then. What
-        is wrong with one part stands in its row.
+    ``job``: its output is the folder of the results, made if need be. A part that is in it, done
+    with the same recipe, model and cloud, is not done again. ``places``: clouds, and folders of
+    clouds, in the order of the trend.
     """
     if job.output is None:
         raise OptionError("no folder is named", where="-o", remedy="name a folder for the results")
@@ -218,13 +206,7 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
 
 
 def clouds_of(places: Sequence[Path]) -> dict[str, Path]:
-    """Clouds by the names of their parts; those of a folder in the order of their numbers.
-
-    Raises
-    ------
-    OptionError
-        If a folder holds none, or two have one name.
-    """
+    """Clouds by the names of their parts; those of a folder in the order of their numbers."""
     found: dict[str, Path] = {}
     seen: dict[str, Path] = {}
     for place in places:

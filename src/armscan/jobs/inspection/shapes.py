@@ -61,28 +61,10 @@ def inspect_plane(
 ) -> Summary:
     """Inspect a flat face.
 
-    Parameters
-    ----------
-    job
-        Where to write the page, if anywhere.
-    path
-        A cloud of ``armscan reconstruct``, or any PLY or text file with x, y, z in mm.
-    plane
-        ``A,B,C,D`` of the nominal plane, D in mm; empty for none.
-    plate
-        Probed points of the nominal plane, or a file with ``A,B,C,D``; None for none.
-    side
-        Side of the plate that was touched; None for where nobody said it.
-    region
-        ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm; empty for the whole cloud.
-    options
-        What belongs to the feature.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or there is no such face; nothing is written
-        then.
+    ``plane``: ``A,B,C,D`` of the nominal plane, D in mm; empty for none. ``plate``: probed points
+    of the nominal plane, or a file with ``A,B,C,D``; None for none. ``side``: side of the plate
+    that was touched; None for where nobody said it. ``region``: ``xmin, xmax, ymin, ymax, zmin,
+    zmax`` in mm; empty for the whole cloud.
     """
     options = options or InspectionOptions()
     job.places(".html")
@@ -273,24 +255,7 @@ WORDS = {
 def inspect_feature(
     job: Job, path: Path, wanted: WantedFeature, *, options: InspectionOptions | None = None
 ) -> Summary:
-    """Inspect one feature of a cloud.
-
-    Parameters
-    ----------
-    job
-        Where to write the page, if anywhere.
-    path
-        A cloud in any format that is read.
-    wanted
-        What is looked for.
-    options
-        Which points belong to it.
-
-    Raises
-    ------
-    ArmscanError
-        If the file is unreadable, an option is wrong, or there is no such feature.
-    """
+    """Inspect one feature of a cloud."""
     options = options or InspectionOptions()
     job.places(".html")
     cloud = read_cloud(path)
@@ -316,13 +281,7 @@ def inspect_relation(
 
 
 def parse_feature(text: str, where: str) -> WantedFeature:
-    """The feature of a description such as ``cylinder:diameter=20:seed=1,2,3``.
-
-    Raises
-    ------
-    OptionError
-        If it is not understood.
-    """
+    """The feature of a description such as ``cylinder:diameter=20:seed=1,2,3``."""
     kind, *parts = text.split(":")
     words = ", ".join(WORDS)
     remedy = f"write KIND:WORD=VALUE:..., as cylinder:diameter=20:seed=1,2,3; words are {words}"
@@ -343,13 +302,7 @@ def parse_feature(text: str, where: str) -> WantedFeature:
 
 
 def wanted_feature(kind: str, where: str, given: dict[str, object]) -> WantedFeature:
-    """A feature of values that are numbers, or tuples of them, by field; None for not given.
-
-    Raises
-    ------
-    OptionError
-        If one of them is wrong.
-    """
+    """A feature of values that are numbers, or tuples of them, by field; None for not given."""
     values = {name: value for name, value in given.items() if value not in (None, ())}
     for name, value in values.items():
         single = name in ("diameter_mm", "half_angle_deg")

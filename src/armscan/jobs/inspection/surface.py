@@ -47,21 +47,7 @@ def draw_mesh(
 ) -> Summary:
     """Draw triangles over a cloud and write them.
 
-    Parameters
-    ----------
-    job
-        Where to write: ``.stl`` or ``.ply``.
-    path
-        A cloud with normals.
-    options
-        Cell and reach.
-    n_triangles
-        Triangles that are kept, the flattest joined first; None for all.
-
-    Raises
-    ------
-    ArmscanError
-        If the cloud is unreadable or has no surface, or an option is wrong; nothing is written.
+    ``n_triangles``: triangles that are kept, the flattest joined first; None for all.
     """
     if n_triangles is not None and n_triangles < LEAST_TRIANGLES:
         raise OptionError(f"--triangles is {n_triangles}", remedy="give 4 or more")
@@ -147,22 +133,7 @@ def _warnings(surface: ScannedSurface) -> tuple[str, ...]:
 
 
 def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
-    """Clean a cloud.
-
-    Parameters
-    ----------
-    job
-        Where to write the cleaned cloud; ``NAME.html`` is written beside it.
-    path
-        A cloud in any format that is read.
-    options
-        Which filters take points out.
-
-    Raises
-    ------
-    ArmscanError
-        If the file is unreadable, an option is wrong, or no point is left; nothing is written then.
-    """
+    """Clean a cloud."""
     if job.output is None:
         raise OptionError("no output is named", where="-o", remedy="name the cloud to write")
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",), reads=(path,))

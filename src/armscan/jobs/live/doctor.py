@@ -64,17 +64,9 @@ OPTIONAL = {
 
 
 def examine_installation(*, warm: bool = False) -> Summary:
-    """Check packages, the compiler and the folder for temporary files.
+    """Check packages, the compiler and the folder for temporary files; what is wrong is a warning.
 
-    Parameters
-    ----------
-    warm
-        Also compile all kernels, so that the first use does not wait.
-
-    Returns
-    -------
-    Summary
-        Its warnings are what is wrong; none if all is well.
+    ``warm``: also compile all kernels, so that the first use does not wait.
     """
     problems: list[str] = []
     facts = [
@@ -259,16 +251,7 @@ class _Bundle:
 def pack_bundle(
     output: Path, paths: Sequence[Path] = (), *, is_overwriting: bool = False
 ) -> Summary:
-    """Pack versions, documents, logs and a cut of recordings into one archive.
-
-    Parameters
-    ----------
-    output
-        The archive, ``.zip``.
-    paths
-        Documents, logs and recordings that belong to the question.
-    is_overwriting
-        Replace an archive of that name.
+    """Pack versions, documents, logs and a cut of recordings into one archive ``.zip``.
 
     Raises
     ------

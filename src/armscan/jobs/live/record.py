@@ -43,8 +43,6 @@ class RecordRequest:
     rig
         Path of ``rig.toml``, or the address of a simulated rig, ``twin:HEAD``; empty where the
         devices are given.
-    devices
-        Devices by address in place of ``rig.toml``.
     scanner
         Path of ``scanner.json``, to measure meanwhile; None for that of ``rig.toml``, if any.
     seconds, n_exposures
@@ -53,8 +51,6 @@ class RecordRequest:
         Triggers a second; None for what ``rig.toml`` says, or the default.
     is_common_trigger
         Frames and arm samples bear ids of one trigger, whatever ``rig.toml`` says.
-    is_stripe_band
-        Keep pixels near stripes alone; see `WriterOptions`.
     """
 
     rig: str = ""
@@ -67,15 +63,7 @@ class RecordRequest:
     is_stripe_band: bool = False
 
     def description(self) -> RigDescription:
-        """The rig that is asked for.
-
-        Raises
-        ------
-        OptionError
-            If none is, or two are.
-        FileFormatError
-            If its description cannot be read.
-        """
+        """The rig that is asked for."""
         self._check_numbers()
         is_named = bool(self.devices.cameras or self.devices.arm or self.devices.lasers)
         if self.rig and is_named:
@@ -141,23 +129,11 @@ def record_scan(
 ) -> Summary:
     """Record until the time or count is reached, or Ctrl-C; what is there is then whole.
 
-    Parameters
-    ----------
-    request
-        What.
-    output
-        File to write, ``.mcap``; it grows while it is recorded.
-    tell
-        Told at once of faults.
-    show_rate
-        Told once a second how it goes; None for ``tell``.
-    is_overwriting
-        Replace a file that exists.
+    ``tell``: told at once of faults. ``show_rate``: told once a second how it goes; None for
+    ``tell``.
 
     Raises
     ------
-    OptionError
-        If the request contradicts itself.
     DeviceError
         If a device does not answer at the start, no image came at all, what arrived could not be
         kept to the end, or none of it can be used; what was written stays.

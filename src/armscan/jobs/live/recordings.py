@@ -82,26 +82,7 @@ def recording_mark(recording: Path, given: str) -> str:
 def convert_recording(
     source: Path, output: Path, *, is_overwriting: bool = False, is_stripe_band: bool = False
 ) -> Summary:
-    """Write a folder recording as one file, or the other way.
-
-    Parameters
-    ----------
-    source, output
-        From where to where.
-    is_overwriting
-        Replace a file of that name.
-    is_stripe_band
-        Keep pixels near stripes alone; see `WriterOptions`.
-
-    Raises
-    ------
-    OptionError
-        If neither is a folder.
-    FileFormatError
-        If the source cannot be read, or is unfinished.
-    OutputError
-        If the output exists or cannot be written.
-    """
+    """Write a folder recording as one file, or the other way."""
     if is_stripe_band and output.suffix.lower() != SUFFIX:
         raise OptionError(
             "a stripe band is for recordings in one file",
@@ -139,15 +120,7 @@ def convert_recording(
 
 
 def recover_recording(source: Path, output: Path, *, is_overwriting: bool = False) -> Summary:
-    """Write what is whole of a killed or damaged file as a folder, or as a file that has its end.
-
-    Raises
-    ------
-    FileFormatError
-        If no exposure is whole.
-    OutputError
-        If the output exists or cannot be written.
-    """
+    """Write what is whole of a killed or damaged file as a folder, or a file that has its end."""
     title = "Recovered."
     _refuse_points(output, source)
     if output.exists() and output.samefile(source):

@@ -100,19 +100,9 @@ class DemoRequest:
 
     Parameters
     ----------
-    folder
-        Made if need be; an earlier demo in it is replaced.
-    head
-        Name of the head.
-    seed
-        Everything random follows from it.
-    preset
-        How good the instrument and how kind the surroundings are.
     most_views
         Views of a scene that are used, evenly chosen; where lasers are chosen meanwhile, exposures
         of a pass. Scenes that are not named are used whole.
-    processes
-        Processes that render.
     """
 
     folder: Path
@@ -208,24 +198,20 @@ class _Run:
         """
         self.place("").mkdir()
         record_touches(self.place("probing"), self.twin)
+        is_single = len(self.twin.truth.sheet_points_mm) == 1
+        unused = ("mesh_search", "naming") if is_single else ("mesh_search",)
         coming = recorded_scenes(
             {scene: self.place(scene) for scene in scenes},
             self.request.twin,
             self.request.most_views,
             processes=self.request.processes,
             progress=self.progress,
-            meanwhile=partial(load_kernels, without=self._unused_kernels),
+            meanwhile=partial(load_kernels, without=unused),
         )
         with closing(coming):
             self._coming.append(coming)
             yield
             self.timed("render", lambda: deque(coming, 0))
-
-    @property
-    def _unused_kernels(self) -> tuple[str, ...]:
-        """Modules of kernels that the head's demo does not need."""
-        is_many = len(self.twin.truth.sheet_points_mm) > 1
-        return ("mesh_search",) if is_many else ("mesh_search", "naming")
 
     def recorded(self, scene: TwinScene) -> Path:
         """Wait until a scene is recorded; returns its folder."""
@@ -251,15 +237,13 @@ class _Run:
 
 
 def run_head_demo(request: DemoRequest, progress: Progress = silent) -> Summary:
-    """Record, calibrate, measure, inspect, compare with the truth, and write it all.
-
-    Raises
-    ------
-    ArmscanError
-        If the head has no demo, the folder holds something else than an earlier demo or cannot be
-        written, or a stage does not determine its result.
-    """
-    _check_head(request)
+    """Record, calibrate, measure, inspect, compare with the truth, and write it all."""
+    if request.head not in KINDS:
+        raise OptionError(
+            f"there is no demo of the head {request.head!r}",
+            remedy=f"give one of {', '.join(KINDS)}",
+        )
+    request.twin.build()
     with demo_folder(request.folder) as place:
         return make_head_demo(request, place, progress)[0]
 
@@ -294,15 +278,6 @@ def run_all_heads(request: DemoRequest, progress: Progress = silent) -> Summary:
         document = render_page(heads_page(heads, demos, footer(provenance)))
         write_files({page: document, result: summary_json(summary).encode()})
         return summary
-
-
-def _check_head(request: DemoRequest) -> None:
-    if request.head not in KINDS:
-        raise OptionError(
-            f"there is no demo of the head {request.head!r}",
-            remedy=f"give one of {', '.join(KINDS)}",
-        )
-    request.twin.build()
 
 
 def calibrate_head(request: DemoRequest, folder: Path, progress: Progress = silent) -> Calibrated:

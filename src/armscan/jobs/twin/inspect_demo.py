@@ -37,11 +37,6 @@ def run_workpiece_demo(request: DemoRequest, progress: Progress = silent) -> Sum
     """Calibrate a simulated scanner, scan the workpiece with it, and compare it with its model.
 
     The cloud is laid on the model from its points alone; what is true is looked at afterwards.
-
-    Raises
-    ------
-    ArmscanError
-        As the demos of heads; or if the extra ``cad`` is not installed.
     """
     with demo_folder(request.folder) as folder:
         command = request.command("workpiece")

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 
 from armscan.devices.sources import TwinScene
@@ -15,52 +15,28 @@ OF_TARGET = ("camera", "laser")
 """Scenes in which a calibration target stands."""
 
 
-@dataclass(frozen=True, slots=True)
-class SimulateRequest:
-    """What to simulate.
-
-    Parameters
-    ----------
-    head, scene
-        Names of the head and of what it looks at.
-    folder
-        Of the recording.
-    options
-        Preset, seed, processes.
-    """
-
-    head: str
-    scene: TwinScene
-    folder: Path
-    options: SimulateOptions = field(default_factory=SimulateOptions)
-
-
-def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Summary:
-    """Write the recording, and its truth beside it.
-
-    Raises
-    ------
-    ArmscanError
-        As `simulate_scene`.
-    """
-    found = simulate_scene(request.folder, request.head, request.scene, request.options, progress)
+def run_simulation(
+    head: str, scene: TwinScene, folder: Path, options: SimulateOptions, progress: Progress = silent
+) -> Summary:
+    """Write the recording into a folder, and its truth beside it."""
+    found = simulate_scene(folder, head, scene, options, progress)
     counts = [fact("images", str(found.n_images))] if found.n_images else []
     counts += [fact("arm samples", str(found.n_arm_samples))] if found.n_arm_samples else []
-    target = found.target if request.scene in OF_TARGET else None
+    target = found.target if scene in OF_TARGET else None
     counts += [fact("target", target)] if target else []
     return Summary(
-        title=f"Simulated: head {request.head}, scene {request.scene}, preset "
-        f"{request.options.preset}, seed {request.options.seed}",
+        title=f"Simulated: head {head}, scene {scene}, preset {options.preset}, "
+        f"seed {options.seed}",
         quantities=tuple(counts),
         warnings=sentences(found.notes),
         written=(found.folder, found.truth),
-        next_step=_next_step(request.scene, found),
+        next_step=_next_step(scene, found),
         extra={
             "kind": "simulate",
             "simulated": True,
-            "head": request.head,
-            "scene": request.scene,
-            **asdict(request.options),
+            "head": head,
+            "scene": scene,
+            **asdict(options),
             "images": found.n_images,
             "arm_samples": found.n_arm_samples,
             "target": target,
@@ -71,11 +47,13 @@ def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Sum
 
 
 def _next_step(scene: TwinScene, found: SimulatedScene) -> str:
-    folder = found.folder
+    folder, is_stereo = found.folder, found.n_cameras > 1
+    cameras = "stereo" if is_stereo else "camera"
     if scene in OF_TARGET:
-        return f"{_next_calibration(scene, found)} --target {found.target} -o " + (
-            "sensor.json" if scene == "laser" else _cameras_document(found)
-        )
+        is_laser = scene == "laser"
+        how = f"laser --camera {cameras}.json" if is_laser else cameras
+        document = "sensor" if is_laser else cameras
+        return f"armscan calibrate {how} --scan {folder} --target {found.target} -o {document}.json"
     if scene == "probing":
         return f"armscan probe {folder} -o plate.csv"
     if scene == "hand-eye":
@@ -86,24 +64,8 @@ def _next_step(scene: TwinScene, found: SimulatedScene) -> str:
     if scene == "latency":
         return f"armscan calibrate latency {folder} --scanner scanner.json -o scanner-timed.json"
     if scene in ("markers", "markers-moved"):
-        return _next_for_markers(found)
+        images = folder / "images"
+        left, right = (images / side / "0001.png" for side in ("left", "right"))
+        of_two = f"{left} {right} --stereo stereo.json -o markers.csv"
+        return f"armscan markers {of_two if is_stereo else f'{images} -o rings.html'}"
     return f"armscan reconstruct {folder} --scanner scanner.json -o cloud.ply"
-
-
-def _next_calibration(scene: TwinScene, found: SimulatedScene) -> str:
-    if scene == "camera":
-        kind = "stereo" if found.n_cameras > 1 else "camera"
-        return f"armscan calibrate {kind} --scan {found.folder}"
-    return f"armscan calibrate laser --camera {_cameras_document(found)} --scan {found.folder}"
-
-
-def _cameras_document(found: SimulatedScene) -> str:
-    return "stereo.json" if found.n_cameras > 1 else "camera.json"
-
-
-def _next_for_markers(found: SimulatedScene) -> str:
-    images = found.folder / "images"
-    if found.n_cameras == 1:
-        return f"armscan markers {images} -o rings.html"
-    left, right = (images / side / "0001.png" for side in ("left", "right"))
-    return f"armscan markers {left} {right} --stereo stereo.json -o markers.csv"

@@ -74,8 +74,10 @@ def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...
     sigma = np.sqrt(np.maximum(np.diag(a.step_covariance), 0.0))
     beyond = found.n_given - len(found)
     seen = sum(one.decision != "not seen" for one in found.faces)
+    size = " × ".join(f"{value:.4g}" for value in part.high_mm - part.low_mm)
+    model = f"triangles of {part.source} in {len(part.face_names)} faces, {size} mm"
     told = [
-        Quantity("part.triangles", "Model", len(part.triangles), meaning=_model_text(part)),
+        Quantity("part.triangles", "Model", len(part.triangles), meaning=model),
         Quantity(
             "points.n", "Points", overall.n,
             meaning=f"of {found.n_given:,} given; {beyond:,} lie farther than "
@@ -139,11 +141,6 @@ ALIGNMENTS = {
     "points": "by reference points, all together",
     "markers": "by markers, all together",
 }
-
-
-def _model_text(part: PartModel) -> str:
-    size = " × ".join(f"{value:.4g}" for value in part.high_mm - part.low_mm)
-    return f"triangles of {part.source} in {len(part.face_names)} faces, {size} mm"
 
 
 def _overall_quantities(found: CadComparison) -> list[Quantity]:
@@ -324,21 +321,7 @@ def cad_page(
     *,
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the page.
-
-    Parameters
-    ----------
-    found
-        The comparison.
-    part, cloud
-        What was compared.
-    provenance
-        How it came to be.
-    warnings
-        What is odd.
-    is_simulated
-        True if the images were rendered.
-    """
+    """Lay out the page."""
     told = cad_quantities(found, part)
     limit = colour_limit_mm(found)
     definitions = tuple((label, meaning) for label, meaning in DEFINITIONS.values())

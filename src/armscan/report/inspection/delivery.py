@@ -29,19 +29,7 @@ LONG_YEARS = 800.0
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """What a report says beside its results.
-
-    Parameters
-    ----------
-    heading
-        The title block.
-    quantities
-        Title block and calibration for terminal and programs.
-    setup
-        What was measured with what.
-    warnings
-        What is odd about the calibration.
-    """
+    """What a report says beside its results; ``quantities`` are for terminal and programs."""
 
     heading: tuple[Quantity, ...]
     quantities: tuple[Quantity, ...]
@@ -66,15 +54,7 @@ class Delivery:
 def delivery_of(
     block: TitleBlock, state: CalibrationState, cloud: PointCloud, source: str
 ) -> Delivery:
-    """What a report of a cloud says beside its results.
-
-    Parameters
-    ----------
-    block, state
-        Title block, and how the calibration stands.
-    cloud, source
-        What was inspected, and the name of its file.
-    """
+    """What a report of a cloud says beside its results."""
     texts = {key: getattr(block, key) for key in TITLE_LABELS}
     heading = tuple(
         Quantity(f"title_block.{key}", TITLE_LABELS[key], text)
@@ -182,18 +162,7 @@ def require_pdf() -> None:
 
 
 def pdf_bytes(page: bytes) -> bytes:
-    """The PDF of a page, A4; nothing is loaded from elsewhere.
-
-    Parameters
-    ----------
-    page
-        HTML of `armscan.report.page.render_page`.
-
-    Raises
-    ------
-    OptionError
-        As `require_pdf`.
-    """
+    """The PDF of a page, A4; nothing is loaded from elsewhere."""
     weasyprint = _weasyprint()
     logging.getLogger("fontTools").setLevel(logging.ERROR)
     logging.getLogger("weasyprint").setLevel(logging.CRITICAL)

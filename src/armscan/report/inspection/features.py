@@ -117,13 +117,14 @@ def feature_quantities(found: FeatureInspection) -> tuple[Quantity, ...]:
         )
     if found.length_mm:
         told.append(Quantity("fitted.length_mm", "Extent along it", found.length_mm, unit="mm"))
+    form = "diameter of the tube that holds them" if kind == "line" else "largest minus smallest"
     told.append(
         Quantity(
             "fitted.form_mm",
             found.form_name.capitalize(),
             found.form_mm,
             unit="mm",
-            meaning=f"{_form_meaning(kind)}, of all points, outliers included",
+            meaning=f"{form}, of all points, outliers included",
         )
     )
     told.append(fact("Positive", POSITIVE[kind]))
@@ -133,10 +134,6 @@ def feature_quantities(found: FeatureInspection) -> tuple[Quantity, ...]:
     if found.nominal is not None:
         told += deviation_quantities("nominal", found.nominal)
     return tuple(told)
-
-
-def _form_meaning(kind: str) -> str:
-    return "diameter of the tube that holds them" if kind == "line" else "largest minus smallest"
 
 
 def _diameter(found: FeatureInspection, diameter: MeasuredLength) -> list[Quantity]:

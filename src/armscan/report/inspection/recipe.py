@@ -38,15 +38,7 @@ COLOURS_TEXT = (
 
 
 def part_page(run: FollowedRecipe, row: PartRow, page: Page) -> Page:
-    """The page of one part: its features before what a comparison's page shows.
-
-    Parameters
-    ----------
-    run, row
-        What was found.
-    page
-        The comparison's, or one without sections but for its origin.
-    """
+    """The page of one part: its features before what ``page``, that of a comparison, shows."""
     sections = list(page.sections)
     values = [one for one in row.quantities if one.kind == "feature"]
     if values:
@@ -156,20 +148,10 @@ def parts_table(rows: Sequence[PartRow]) -> Table:
 
 
 def recipe_page(title: str, rows: Sequence[PartRow], provenance: Provenance) -> Page:
-    """Lay out the page of all parts.
-
-    Parameters
-    ----------
-    title
-        Of the recipe.
-    rows
-        The parts, in the order of the trend.
-    provenance
-        Of this run.
-    """
+    """Lay out the page of all parts."""
     told = recipe_quantities(title, rows)
     counts = told[2].value
-    labels = _labels(rows)
+    labels = list({(one.name, one.kind): None for row in rows for one in row.quantities})
     features = [name for name, kind in labels if kind == "feature"]
     faces = sorted(
         {name: None for name, kind in labels if kind != "feature"},
@@ -197,12 +179,6 @@ def recipe_page(title: str, rows: Sequence[PartRow], provenance: Provenance) -> 
         cards=cards,
         is_simulated=any(row.is_simulated for row in rows),
     )
-
-
-def _labels(rows: Sequence[PartRow]) -> list[tuple[str, str]]:
-    """Name and kind of every quantity, in the order of the recipe."""
-    found = {(one.name, one.kind): None for row in rows for one in row.quantities}
-    return list(found)
 
 
 def _of(row: PartRow, name: str, kinds: Sequence[str]) -> list[PartQuantity]:
@@ -252,14 +228,7 @@ def _chart_sections(
 def trend_chart(rows: Sequence[PartRow], name: str, kinds: Sequence[str]) -> Picture:
     """Deviations of one feature or face over the parts, with U and limits.
 
-    Parameters
-    ----------
-    rows
-        The parts.
-    name
-        Of the feature or face.
-    kinds
-        Of its quantities, drawn beside each other.
+    ``kinds``: of its quantities, drawn beside each other.
     """
     with styled():
         figure = new_figure(PAGE_WIDTH / 2.0, 2.9)

@@ -93,22 +93,8 @@ colour-blind readers."""
 class InspectionReport:
     """One inspection, ready for a page, a terminal and a program.
 
-    Parameters
-    ----------
-    title, subtitle
-        What was inspected.
-    quantities
-        All that is told of it.
-    cards
-        Key figures.
-    references
-        Deviations with a heading for each, nominal first.
-    histograms, views
-        Pictures.
-    counts
-        What became of the points.
-    warnings
-        Sentences that a person should read first.
+    ``references`` are deviations with a heading for each, nominal first; ``counts`` is what became
+    of the points.
     """
 
     title: str
@@ -361,15 +347,10 @@ def length_quantity(
         "sigma_scatter_mm": length.sigma_scatter_mm,
         "sigma_propagated_mm": length.sigma_propagated_mm,
     }
-    text = shown or length_text(length)
-    return Quantity(key, label, data, meaning=meaning, shown=text)
-
-
-def length_text(length: MeasuredLength) -> str:
-    """A length with its standard deviation, in words."""
-    if math.isnan(length.sigma_mm):
-        return f"{length.value_mm:.4f} mm"
-    return with_sigma(length.value_mm, length.sigma_mm, "mm")
+    if not shown and math.isnan(length.sigma_mm):
+        shown = f"{length.value_mm:.4f} mm"
+    shown = shown or with_sigma(length.value_mm, length.sigma_mm, "mm")
+    return Quantity(key, label, data, meaning=meaning, shown=shown)
 
 
 def sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
@@ -546,44 +527,29 @@ def deviation_histogram(
     *,
     title: str,
     axis_label: str = "deviation, mm",
-    band_mm: float = BAND_MM,
-    caption: str = "",
 ) -> Picture:
     """Histogram of deviations with a band and the share of the points within it.
 
     As the thesis's figures 5.12 and 5.14.
-
-    Parameters
-    ----------
-    deviations
-        What to count.
-    title, axis_label
-        Texts of the picture and of its horizontal axis.
-    band_mm
-        Half width of the band that is drawn and whose share is stated, one of
-        `armscan.inspection.results.WITHIN_MM`.
-    caption
-        Put before what the picture says of itself.
     """
     values = deviations.deviations_mm
-    half_width = _half_width_mm(values, band_mm)
+    half_width = _half_width_mm(values, BAND_MM)
     counted = histogram(values, half_width)
-    share = deviations.value(within_key(band_mm))
+    share = deviations.value(within_key(BAND_MM))
     with styled():
         figure = new_figure(6.0, 3.4)
         axes = figure.add_subplot()
         axes.stairs(counted.counts, counted.edges_mm, fill=True, color=ACCENT)
-        axes.axvspan(-band_mm, band_mm, color=ACCENT, alpha=0.08, linewidth=0)
-        for edge in (-band_mm, band_mm):
+        axes.axvspan(-BAND_MM, BAND_MM, color=ACCENT, alpha=0.08, linewidth=0)
+        for edge in (-BAND_MM, BAND_MM):
             axes.axvline(edge, color=MUTED, linewidth=0.9, linestyle="--")
         axes.axvline(0.0, color=INK, linewidth=0.7)
         axes.set_xlim(-half_width, half_width)
         axes.set_xlabel(f"{axis_label}, from the {deviations.reference} reference")
         axes.set_ylabel("points")
         axes.grid(axis="y")
-        axes.set_title(f"{share:.2f} % of {len(values):,} points within {band_mm:g} mm", loc="left")
-    parts = [caption.rstrip()] if caption else []
-    parts.append(f"Deviations from {deviations.reference_text}; {deviations.points_text}.")
+        axes.set_title(f"{share:.2f} % of {len(values):,} points within {BAND_MM:g} mm", loc="left")
+    parts = [f"Deviations from {deviations.reference_text}; {deviations.points_text}."]
     if beyond := counted.n_below + counted.n_above:
         parts.append(
             f"{beyond:,} of them lie beyond {significant(half_width)} mm, outside the picture; "
@@ -640,18 +606,9 @@ def feature_view(cloud: PointCloud, rows: IntArray, deviations: Deviations) -> P
 def deviation_view(
     points_mm: FloatArray, deviations_mm: FloatArray, *, title: str, frame: str, reference: str
 ) -> Picture:
-    """Points in space, coloured by deviation: dark inside or below, light outside or above.
+    """(N, 3) points in mm, coloured by deviation: dark inside or below, light outside or above.
 
-    Parameters
-    ----------
-    points_mm, deviations_mm
-        (N, 3) and (N,).
-    title
-        Of the picture.
-    frame
-        Name of the coordinate frame.
-    reference
-        What the deviations are counted from, in words.
+    ``reference`` is what the deviations are counted from, in words.
     """
     step = max(1, math.ceil(len(points_mm) / MAX_SHOWN))
     limit = max(float(np.percentile(np.abs(deviations_mm), 98)), 1e-6)

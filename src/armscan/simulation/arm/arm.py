@@ -40,8 +40,6 @@ class ScrewArm:
         (7, 3) unit directions of the joints' axes in Base, all angles zero.
     points_mm
         (7, 3) a point on each axis, in Base.
-    rest
-        ``base_from_tool`` with all angles zero.
     """
 
     axes: FloatArray
@@ -126,29 +124,13 @@ LEVER_MM = 200.0
 """A turn of 1 rad counts as much as this distance when steps are weighed."""
 
 
-@dataclass(frozen=True, slots=True)
-class InverseOptions:
-    """When the solver stops, and how it moves.
-
-    Parameters
-    ----------
-    tolerance_mm
-        Largest error left, in mm at the tool and at a point `LEVER_MM` away.
-    max_steps
-        Steps before it gives up.
-    max_turn_rad
-        Largest turn of a joint in one step.
-    damping
-        Damping far from the goal, in the units of the goal's error over `LEVER_MM`.
-    comfort
-        Share of the way to the preferred elbow that is gone in each step.
-    """
-
-    tolerance_mm: float = 1e-8
-    max_steps: int = 400
-    max_turn_rad: float = 0.3
-    damping: float = 0.05
-    comfort: float = 0.5
+_LEFT_MM = 1e-8
+"""Largest error left, at the tool and at a point `LEVER_MM` away."""
+_MAX_STEPS, _MAX_TURN_RAD = 400, 0.3
+_DAMPING = 0.05
+"""Far from the goal, in the units of the goal's error over `LEVER_MM`."""
+_COMFORT = 0.5
+"""Share of the way to the preferred elbow that is gone in each step."""
 
 
 def reach(
@@ -156,30 +138,24 @@ def reach(
     base_from_tool: Pose[Base, Tool],
     start_rad: FloatArray = COMFORTABLE_RAD,
     preferred_rad: FloatArray = COMFORTABLE_RAD,
-    options: InverseOptions | None = None,
 ) -> FloatArray:
-    """Joint angles (7,) with which an arm holds its tool at a pose.
-
-    Raises
-    ------
-    EstimationError
-        If the pose is out of reach.
+    """Joint angles (7,) with which an arm holds its tool at a pose; `EstimationError` beyond its
+    reach.
     """
-    settings = InverseOptions() if options is None else options
     joints = np.array(start_rad, dtype=np.float64)
-    for _ in range(settings.max_steps):
+    for _ in range(_MAX_STEPS):
         error, jacobian = _error_and_jacobian(arm, joints, base_from_tool)
         size = float(np.linalg.norm(error))
-        damping = settings.damping * min(1.0, size)
+        damping = _DAMPING * min(1.0, size)
         weights = jacobian @ jacobian.T + damping**2 * np.eye(6)
         step = jacobian.T @ np.linalg.solve(weights, error)
-        wish = settings.comfort * (preferred_rad - joints)
+        wish = _COMFORT * (preferred_rad - joints)
         ease = wish - jacobian.T @ np.linalg.solve(weights, jacobian @ wish)
-        is_there = LEVER_MM * size < settings.tolerance_mm
+        is_there = LEVER_MM * size < _LEFT_MM
         if is_there and float(np.abs(ease).max()) < 1e-5:
             return joints
         step = step + ease
-        joints = joints + step * min(1.0, settings.max_turn_rad / float(np.abs(step).max()))
+        joints = joints + step * min(1.0, _MAX_TURN_RAD / float(np.abs(step).max()))
     raise EstimationError(
         f"the simulated arm cannot bring its tool to {np.round(base_from_tool.translation_mm, 1)}"
         f" mm: {LEVER_MM * size:.3g} mm are left",
@@ -228,14 +204,7 @@ class ArmErrors:
 class MeasuringArm(ArrayRecord, kw_only=False):
     """The true arm, the controller's arm and the encoders between them.
 
-    Parameters
-    ----------
-    true, nominal
-        The arm that stands there, and the drawing.
-    white_rad
-        Standard deviation of one reading.
-    waves_rad
-        (7, 4) cosine and sine amplitudes once per turn, then twice per turn, of each encoder.
+    ``waves_rad`` (7, 4): cosine and sine amplitudes once per turn, then twice, of each encoder.
     """
 
     true: ScrewArm

@@ -202,14 +202,10 @@ class HandTremor:
 
     Parameters
     ----------
-    tilt_deg
-        About each axis of the head.
     depth_mm
         Of the stand-off.
     aside_mm
         Across the way.
-    speed
-        Of the speed, over its mean.
     """
 
     tilt_deg: float = 1.5
@@ -270,14 +266,6 @@ class ScanPass:
         (3, 3) rotation of the face that is scanned; z is its normal.
     start_mm, end_mm
         (3,) where the middle of the stripe shall go from and to, in Base.
-    aim
-        How the head is held.
-    speed_mm_s
-        Mean speed.
-    n_exposures
-        Images to keep, evenly from all that the camera's clock gives.
-    pace
-        Slowest and fastest progress, and whether the camera takes every tick of its clock.
     """
 
     base_from_face: FloatArray
@@ -295,15 +283,9 @@ class ScanPass:
 
 
 class Trajectory(ArrayRecord):
-    """What the person did: joint angles over time, cubic between knots.
+    """What the person did: joint angles over time, cubic between knots, in ns and s from the start.
 
-    Parameters
-    ----------
-    t_s, joints_rad
-        (N,) times of the knots from the start of the pass, from a little before its first exposure
-        to a little after its last, and (N, 7) true joint angles there.
-    exposure_t_ns
-        (M,) mid-exposure times, ns from the start of the pass.
+    Knots (N,) begin a little before the pass's first exposure and end a little after its last.
     """
 
     t_s: FloatArray = floats("N")
@@ -370,11 +352,6 @@ def bounce(
     """Hold the head over a spot (3,) as a pass begins, moved nearer and away, aside and tilted.
 
     Exposures are ``start.n_exposures`` at every second tick of the camera's clock.
-
-    Raises
-    ------
-    EstimationError
-        If the arm does not reach.
     """
     ticks = 2 * np.arange(1, start.n_exposures + 1, dtype=np.int64)
     knots = np.arange(-2 * _MARGIN_S, 1e-9 * CAMERA_CLOCK_NS * ticks[-1] + 2 * _MARGIN_S, _KNOT_S)
@@ -594,10 +571,7 @@ _HISTORY_NS = 12_000_000_000
 class HandHistory:
     """Where the joints were over the last seconds: ways, each followed by a wait at its end.
 
-    Parameters
-    ----------
-    joints_rad
-        (7,) where the arm rests at first.
+    It begins at rest at ``joints_rad`` (7,).
     """
 
     def __init__(self, joints_rad: FloatArray) -> None:

@@ -504,18 +504,9 @@ _OUTLINE_BITS = 6
 def render_board(
     board: PrintedBoard, camera: RenderCamera, lamp: RoomLight, background: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Render a board under room light over a background image.
+    """Render a board under room light over a background (H, W), which is written over.
 
-    Parameters
-    ----------
-    board, camera, lamp
-        What is seen, by what, under which light.
-    background
-        (H, W) parts of full scale; written over.
-
-    Returns
-    -------
-    (H, W) parts of full scale, blurred by the lens, without noise.
+    Result and background are parts of full scale; the board is blurred by the lens, without noise.
     """
     view = _BoardView.of(board, camera)
     outline, kernel = outline_px(board, camera), blur_kernel(camera.blur_sigma_px)

@@ -17,7 +17,6 @@ from armscan.geometry.poses import Part, Pose, Sensor
 from armscan.simulation.kernels import Three, compiled
 from armscan.simulation.optics.scene import OneColour
 
-LIMB_COLUMNS = 12
 MAX_STEPS = 2000
 """A ray that has not met the body after so many steps counts as passing."""
 
@@ -168,18 +167,9 @@ GRADIENT_STEP_MM = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class MetaballLimb:
-    """A rounded cone between two balls.
+    """A rounded cone between two balls, centres in the Part frame; taken away if it is hollow.
 
-    Parameters
-    ----------
-    start_mm, end_mm
-        Centres of the balls in the Part frame.
-    start_radius_mm, end_radius_mm
-        Their radii.
-    blend_mm
-        Over this length the limb melts into those named before it; 0 gives a sharp edge.
-    is_hollow
-        True if the limb is taken away instead of added.
+    Over ``blend_mm`` it melts into those named before it; 0 gives a sharp edge.
     """
 
     start_mm: tuple[float, float, float]
@@ -220,16 +210,9 @@ class MetaballLimb:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body(OneColour):
-    """Limbs joined in order, standing somewhere in the scene.
+    """Limbs joined in order, at least one, the first solid, standing somewhere in the scene.
 
-    Parameters
-    ----------
-    limbs
-        At least one; the first is solid.
-    sensor_from_part
-        Where the body stands.
-    colour
-        (3,) albedo.
+    ``colour`` is the albedo (3,).
     """
 
     limbs: tuple[MetaballLimb, ...]

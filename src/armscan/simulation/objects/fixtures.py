@@ -49,10 +49,7 @@ _TRIES = 4000
 class MarkedPlate:
     """The plate's shapes and its markers, in its own frame.
 
-    Parameters
-    ----------
-    markers
-        (N,) on upward faces, no two nearer than a marker's width.
+    Markers are on upward faces, no two nearer than a marker's width.
     """
 
     markers: tuple[RingMarker, ...]
@@ -143,14 +140,6 @@ class Fixtures:
     ----------
     plate, base_from_plate
         The reference plate; z = 0 of its frame is the best plane through it.
-    ball
-        In Base.
-    base_from_ground
-        Frame of the ground plate under the gauge blocks, its normal along z.
-    ground
-        That plate, in its frame.
-    part, base_from_part
-        The free-form part in its own frame, and where it stands.
     waves, base_from_waves
         The wavy plate in its own frame, and where it lies.
     marked, base_from_marked
@@ -199,6 +188,9 @@ class Fixtures:
         base_from_marked = _put_down(_MARKED_MM, rng)
         moved_from_marked = _put_down(_MARKED_AFTER_MOVE_MM, rng, _TURN_OF_MOVE_RAD)
         workpiece = Mesh(made_workpiece() if part_mm is None else part_mm, _GREY)
+        low, high = workpiece.bounds_mm
+        middle_below = np.array([*(0.5 * (low + high))[:2], low[2]])
+        from_foot: Pose[Any, Part] = Pose(np.eye(3), -middle_below)
         return Fixtures(
             plate=plate,
             base_from_plate=base_from_plate,
@@ -213,7 +205,7 @@ class Fixtures:
             base_from_marked=base_from_marked,
             moved_from_base=moved_from_marked @ base_from_marked.inverse(),
             workpiece=workpiece,
-            base_from_workpiece=_put_down(_WORKPIECE_MM, rng) @ _from_foot(workpiece.bounds_mm),
+            base_from_workpiece=_put_down(_WORKPIECE_MM, rng) @ from_foot,
             bore_mm=np.array(_BORE_MM) if part_mm is None else None,
         )
 
@@ -297,12 +289,6 @@ def made_workpiece() -> FloatArray:
     raw = (files("armscan.simulation") / "workpiece" / "as_made.stl").read_bytes()
     facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
     return np.frombuffer(raw, facet, offset=84)["corners"].astype(np.float64)
-
-
-def _from_foot(bounds_mm: FloatArray) -> Pose[Any, Part]:
-    """From a part's frame to one in the middle of its underside."""
-    foot = np.array([*bounds_mm[:, :2].mean(axis=0), bounds_mm[0, 2]])
-    return Pose(np.eye(3), -foot)
 
 
 def _put_down(

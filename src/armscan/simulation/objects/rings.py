@@ -30,16 +30,9 @@ _OFF_FACE_MM = 0.5
 
 
 class RingMarker(ArrayRecord, kw_only=False):
-    """One marker.
+    """One marker: (3,) middle of its disc, on a face, and the face's normal.
 
-    Parameters
-    ----------
-    centre_mm, normal
-        (3,) middle of the disc, on the face, and the face's normal.
-    disc_mm, ring_mm
-        Diameters of the bright disc and of the dark ring around it.
-    light, dark
-        Albedo of the two tones.
+    ``disc_mm`` and ``ring_mm`` are diameters of the bright disc and of the dark ring around it.
     """
 
     centre_mm: FloatArray = floats(3)
@@ -93,15 +86,7 @@ def _covered(inside_mm: FloatArray, sides_mm: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marked:
-    """A surface with markers on it; it is a `Surface` itself.
-
-    Parameters
-    ----------
-    surface
-        What the markers are on.
-    markers
-        In the frame of the surface.
-    """
+    """A surface with markers in its frame; it is a `Surface` itself."""
 
     surface: Surface
     markers: Sequence[RingMarker]
@@ -146,18 +131,9 @@ _RAY_TOLERANCE = 1e-8
 def draw_markers(
     light: FloatArray, markers: Sequence[RingMarker], scene: Scene, camera: RenderCamera
 ) -> FloatArray:
-    """Image (H, W) of the room's light with markers drawn into it.
+    """Image (H, W) of the room's light with markers drawn into ``light`` (H, W), that of the faces.
 
-    Parameters
-    ----------
-    light
-        (H, W) light of the faces without markers.
-    markers
-        In the scene's frame.
-    scene
-        What may hide them; its origin is the camera.
-    camera
-        Lens and sensor; its image is H x W.
+    Markers are in the scene's frame, whose origin is the camera; the scene may hide them.
     """
     drawn = np.array(light, dtype=np.float64)
     for marker in markers:
@@ -175,7 +151,8 @@ def draw_markers(
         )
         disc, ring, visible = _cover(marker, scene, camera, patch)
         # all light that the face sends back, as though it were white
-        white = drawn[inside] / marker_face_albedo(marker, scene)
+        face = scene.trace(marker.centre_mm + marker.normal, -marker.normal[None, :])
+        white = drawn[inside] / float(scene.albedo(face)[0, 0])
         shown = (
             disc[own] * marker.light * white
             + ring[own] * marker.dark * white
@@ -183,13 +160,6 @@ def draw_markers(
         )
         drawn[inside] = np.where(visible[own], shown, drawn[inside])
     return drawn
-
-
-def marker_face_albedo(marker: RingMarker, scene: Scene) -> float:
-    """Reflected part of the light on the face beside the marker's middle."""
-    above = marker.centre_mm + marker.normal
-    hits = scene.trace(above, -marker.normal[None, :])
-    return float(scene.albedo(hits)[0, 0])
 
 
 def _patch(marker: RingMarker, camera: RenderCamera) -> tuple[int, int, int, int] | None:

@@ -25,15 +25,7 @@ class Solid(Surface, Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A shape moved into another frame.
-
-    Parameters
-    ----------
-    shape
-        In a frame of its own.
-    scene_from_shape
-        Where that frame is in the scene.
-    """
+    """A shape moved from a frame of its own into another one."""
 
     shape: Surface
     scene_from_shape: Pose[Any, Any]
@@ -62,12 +54,7 @@ class Placed:
 class Box(OneColour):
     """A block with sharp edges that stands on z = 0 of its frame, its footprint centred on z.
 
-    Parameters
-    ----------
-    size_mm
-        (3,) length along x, width along y, height along z.
-    colour
-        (3,) albedo.
+    ``size_mm`` (3,) is along x, y, z; ``colour`` (3,) is the albedo.
     """
 
     size_mm: FloatArray
@@ -145,8 +132,6 @@ class FlatPlate(HeightField):
     waves_mm
         (K, L) amplitudes of the waves ``cos(k pi x / length) cos(l pi y / width)``, counted from
         the corner; of these the best plane is taken away. None for a perfect plane.
-    colour
-        (3,) albedo.
     """
 
     size_mm: FloatArray
@@ -306,14 +291,7 @@ class Wave:
 class WavyPlate(HeightField):
     """A rectangle in x and y of its frame whose height is a sum of sines, seen from +z.
 
-    Parameters
-    ----------
-    size_mm
-        Length along x and width along y, centred on the origin.
-    waves
-        At least one.
-    colour
-        (3,) albedo.
+    ``size_mm`` is its length along x and width along y, centred on the origin.
     """
 
     size_mm: tuple[float, float]

@@ -86,17 +86,7 @@ class RenderCamera:
     def rays(self, pixels_px: FloatArray, tolerance: float = STEP_TOLERANCE) -> FloatArray:
         """Return the ideal coordinates ``X/Z, Y/Z`` (..., 2) seen by (..., 2) pixels.
 
-        Parameters
-        ----------
-        pixels_px
-            (..., 2) pixels.
-        tolerance
-            Size of the step after which the search ends; what is left is smaller by far.
-
-        Raises
-        ------
-        InputError
-            If the fixed-point steps do not settle: the distortion folds over inside the image.
+        ``tolerance``: size of the step after which the search ends; what is left is smaller by far.
         """
         pixels = np.asarray(pixels_px, dtype=np.float64)
         seen_x = (pixels[..., 0] - self.cx) / self.fx

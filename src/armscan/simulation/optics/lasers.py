@@ -76,8 +76,6 @@ class LineLaser:
 
     Parameters
     ----------
-    name
-        Name of the light sheet.
     source_mm
         (3,) where the fan starts, in the frame of the scene.
     forward, across
@@ -95,12 +93,8 @@ class LineLaser:
         part of the camera's full scale that a white surface then shows.
     falloff
         Part of the brightness that is lost from the fan's middle to its ends.
-    source
-        Name of the light source that it is switched with; by default that of the sheet.
     cubic_rad
         Bends the sheet further: its centre at the fan angle a is raised by this times ``a**3``.
-    section
-        Shape of the brightness across the sheet.
     """
 
     name: str

@@ -29,16 +29,8 @@ SAME_SURFACE_MM = 3.0
 class StripeTruth(ArrayRecord):
     """True centre points of one laser's stripe, one a row (or a column, if it lies flat).
 
-    Parameters
-    ----------
-    laser
-        Name of the laser.
-    points_px
-        (N, 2) full-sensor pixels.
-    points_mm
-        (N, 3) in the Sensor frame.
-    surface
-        (N,) index into the scene's surfaces, as float64.
+    Full-sensor pixels (N, 2), places in Sensor (N, 3); ``surface`` (N,) is an index into the
+    scene's surfaces, as float64.
     """
 
     laser: str
@@ -69,14 +61,7 @@ def find_stripe(
 ) -> StripeTruth:
     """Find where the sheet's centre crosses the pixel rows or columns within a band.
 
-    Parameters
-    ----------
-    scene, camera, laser
-        What is seen, and by what light.
-    band
-        (H, W) True where the light may reach.
-    tracer
-        Traces the scene sooner than it does itself.
+    ``band`` (H, W) is True where the light may reach; ``tracer`` is quicker than the scene itself.
     """
 
     def trace(pixels_px: FloatArray) -> Hits:
@@ -164,14 +149,9 @@ COARSE_STEP_PX = 8
 
 @dataclass(frozen=True, slots=True)
 class Speckle:
-    """Grain of laser light.
+    """Grain of laser light: standard deviation over its mean before the lens's blur, and its sigma.
 
-    Parameters
-    ----------
-    contrast
-        Standard deviation of the light over its mean, before the lens's blur.
-    grain_px
-        Gaussian sigma of the grain; 0 gives independent samples.
+    A grain of 0 px gives independent samples.
     """
 
     contrast: float = 0.2
@@ -336,10 +316,6 @@ class Imaging:
         Even light of the room during a scan on white, as a part of full scale.
     target_light
         The same while a target is photographed.
-    speckle
-        Grain of laser light.
-    detector
-        Sensor noise, halo, bits.
     gloss, texture
         Factors on the gloss and texture of everything in the scene.
     ghost_share, ghost_sigma_px

@@ -47,15 +47,7 @@ class OneColour:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Floor(OneColour):
-    """An endless plane of one colour.
-
-    Parameters
-    ----------
-    point_mm, normal
-        (3,) a point on it and its normal, on the side that is seen.
-    colour
-        (3,) albedo.
-    """
+    """An endless plane of one colour through a point (3,); its normal (3,) is on the seen side."""
 
     point_mm: FloatArray
     normal: FloatArray
@@ -159,14 +151,7 @@ GROUND_STEEL = Material(gloss=0.5, gloss_width_rad=0.18, texture=0.05, texture_m
 class SceneObject:
     """A surface in Base with its finish; it is a `Surface` itself.
 
-    Parameters
-    ----------
-    name
-        What truth and messages call it.
-    surface
-        In Base.
-    finish
-        Gloss and texture.
+    Truth and messages call it by its name.
     """
 
     name: str
@@ -235,16 +220,9 @@ class RoomLight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """First points that rays meet.
+    """First points that rays meet; nothing met: infinite distance, surface -1, points NaN.
 
-    Parameters
-    ----------
-    distance_mm
-        (N,) along the ray; infinite where nothing is met.
-    surface
-        (N,) index into the scene's surfaces; -1 where nothing is met.
-    points_mm
-        (N, 3); NaN where nothing is met.
+    ``distance_mm`` (N,), ``surface`` (N,) index into the scene's, ``points_mm`` (N, 3).
     """
 
     distance_mm: FloatArray

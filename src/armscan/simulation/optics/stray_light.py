@@ -29,17 +29,8 @@ _STRAY_WIDENING = 2.0
 class CentreSpot:
     """The beam that a grating leaves undiffracted, round and Gaussian; see `TracedLight`.
 
-    Parameters
-    ----------
-    source_mm
-        (3,) where it starts.
-    direction
-        (3,) unit.
-    sigma_mm
-        Gaussian sigma of its cross-section.
-    irradiance
-        In its middle, on a surface that faces it; as for
-        `armscan.simulation.optics.lasers.LineLaser`.
+    ``irradiance`` is in its middle, on a surface that faces it; as for
+    `armscan.simulation.optics.lasers.LineLaser`.
     """
 
     source_mm: FloatArray
@@ -79,16 +70,7 @@ def stray_lights(
 ) -> tuple[TracedLight, ...]:
     """All that one light source casts besides its lines; nothing if it has a single line.
 
-    Parameters
-    ----------
-    source
-        In the frame of the camera.
-    things
-        In Base, with the gloss that they are to have.
-    base_from_eye
-        Where the camera is.
-    imaging
-        How strong.
+    ``source`` is in the camera's frame, ``things`` in Base, with the gloss that they are to have.
     """
     if len(source.sheets) == 1:
         return ()

@@ -98,18 +98,9 @@ RAY_TOLERANCE = 1e-7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedView:
-    """What one pose of the exposure sees.
+    """What one pose of the exposure sees, in Sensor; ``nodes`` are hits of the coarse grid's rays.
 
-    Parameters
-    ----------
-    scene
-        Surfaces in the Sensor frame.
-    finishes
-        One for each surface.
-    nodes
-        Hits of the coarse grid's rays.
-    numbers
-        The scene for the compiled loops; None if they do not know one of its surfaces.
+    ``numbers`` are None if the compiled loops do not know one of the surfaces.
     """
 
     scene: Scene

@@ -58,7 +58,7 @@ _GLOSS_WIDTH, _COLOUR, _START, _STOP = 16, 17, 18, 19
 """Columns of a surface's row; 1 to 9 are its rotation in the scene, 10 to 12 its place there."""
 _FIXED_POINT_STEPS = 400
 _SLANT_X, _SLANT_Y = SLANT
-_N_LENS, _N_SHEET = 9, 22
+_N_SHEET = 22
 
 Counts = NDArray[np.int64]
 

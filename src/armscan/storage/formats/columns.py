@@ -85,8 +85,6 @@ class CloudColumns:
         Lines beside them: ``frame Sensor``, ``sheet 0 "A"``, ``exposure 0 "laser.png"``.
     sources
         Names of the exposures of a file that is not armscan's; empty for the file's own.
-    remarks
-        What a person should know of the reading, in words.
     passed_over
         Names of columns that the file has and that were not read.
     """
@@ -107,14 +105,8 @@ class CloudColumns:
 class CloudPiece:
     """Points of a cloud that is written piece by piece.
 
-    Parameters
-    ----------
-    cloud
-        The points.
-    sigma_mm
-        (N,) as `PointCloud.sigma_mm`, where it is known already.
-    n_points
-        (N,) measured points that each stands for; None if each is one.
+    ``sigma_mm`` (N,) is that of the cloud, where it is known already; ``n_points`` (N,) are the
+    measured points that each stands for, None if each is one.
     """
 
     cloud: PointCloud
@@ -241,11 +233,6 @@ def cloud_of_columns(found: CloudColumns, path: Path) -> PointCloud:
 
     Points of other programs come with covariances of zero, which stands for "not known". Their
     normals and intensities are kept.
-
-    Raises
-    ------
-    FileFormatError
-        If there is no x, y or z, or what is there makes no cloud.
     """
     where = path_text(path)
     if found.is_own:
@@ -296,13 +283,7 @@ def _refuse_gaps(points_mm: FloatArray, where: str) -> None:
 
 
 def own_cloud(found: CloudColumns, where: str) -> PointCloud:
-    """The cloud of columns that armscan wrote.
-
-    Raises
-    ------
-    FileFormatError
-        If they lack what armscan writes, or make no cloud.
-    """
+    """The cloud of columns that armscan wrote."""
     columns = found.columns
     needed = {*POINT, *COVARIANCE, *INDICES, "sigma_noise_mm", "intensity"}
     if missing := sorted(needed - set(columns)):

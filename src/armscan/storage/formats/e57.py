@@ -118,8 +118,6 @@ def e57_columns(data: bytes, path: Path) -> CloudColumns:
 
     Raises
     ------
-    FileFormatError
-        If it is damaged.
     OptionError
         If the package is not installed.
     """

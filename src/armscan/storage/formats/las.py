@@ -100,8 +100,6 @@ def las_columns(data: bytes, path: Path) -> CloudColumns:
 
     Raises
     ------
-    FileFormatError
-        If it is damaged.
     OptionError
         If the packages are not installed.
     """

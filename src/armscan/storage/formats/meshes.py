@@ -24,29 +24,15 @@ from armscan.storage.formats.columns import (
     CloudPiece,
 )
 from armscan.storage.formats.ply import vertices_remark
-from armscan.storage.formats.text import SIGMA_LOSS
+from armscan.storage.formats.text import XYZ_LOSES
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-OBJ_LOSES = (
-    SIGMA_LOSS,
-    "sheet, exposure and segment",
-    "intensity",
-    "where the sensor stood",
-    "which calibration",
-    "n_points of a fused cloud",
-    "digits beyond 0.1 nm",
-)
+OBJ_LOSES = tuple(words for words in XYZ_LOSES if words != "normals")
 """What an OBJ file of points does not hold."""
 
 
 def stl_columns(data: bytes, path: Path) -> CloudColumns:
-    """Vertices of an STL file, binary or ASCII, each once.
-
-    Raises
-    ------
-    FileFormatError
-        If it is cut short, or no STL file.
-    """
+    """Vertices of an STL file, binary or ASCII, each once."""
     corners = stl_corners(data, path_text(path))
     points = np.unique(corners.reshape(-1, 3), axis=0)
     return CloudColumns(
@@ -81,13 +67,7 @@ class ObjContent(NamedTuple):
 
 
 def parse_obj(data: bytes, where: str) -> ObjContent:
-    """Content of an OBJ file.
-
-    Raises
-    ------
-    FileFormatError
-        If numbers or faces are not understood.
-    """
+    """Content of an OBJ file."""
     vertices: list[bytes] = []
     normals: list[bytes] = []
     polygons: list[IntArray] = []
@@ -138,13 +118,7 @@ def _polygon(words: list[bytes], n: int, where: str) -> IntArray:
 
 
 def obj_columns(data: bytes, path: Path) -> CloudColumns:
-    """Vertices of an OBJ file, with its normals where there is one for each.
-
-    Raises
-    ------
-    FileFormatError
-        If it holds no vertices, or numbers that are not understood.
-    """
+    """Vertices of an OBJ file, with its normals where there is one for each."""
     found = parse_obj(data, path_text(path))
     points, normals = found.vertices, found.normals
     if not len(points):
@@ -180,13 +154,7 @@ VERTEX = re.compile(rb"^[ \t]*vertex[ \t]+(.*)$", re.MULTILINE)
 
 
 def stl_corners(data: bytes, where: str) -> FloatArray:
-    """(F, 3, 3) corners; the normals in the file are not used: the order of corners tells them.
-
-    Raises
-    ------
-    FileFormatError
-        If it is cut short, or no STL file.
-    """
+    """(F, 3, 3) corners; the normals in the file are not used: the order of corners tells them."""
     count = int.from_bytes(data[80:84], "little") if len(data) >= STL_HEADER else -1
     is_text = data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:4096].lower()
     if count >= 0 and len(data) == STL_HEADER + STL_RECORD * count:
@@ -223,13 +191,7 @@ def _text_corners(data: bytes, where: str) -> FloatArray:
 
 
 def float_numbers(words: list[bytes], where: str, kind: str) -> FloatArray:
-    """(N,) numbers of a text file of some kind, as ``STL``.
-
-    Raises
-    ------
-    FileFormatError
-        If one of them is none.
-    """
+    """(N,) numbers of a text file of some kind, as ``STL``."""
     try:
         return np.array(words, dtype=np.bytes_).astype(np.float64) if words else np.zeros(0)
     except ValueError as error:

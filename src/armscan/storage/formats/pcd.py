@@ -82,11 +82,6 @@ def pcd_columns(data: bytes, path: Path) -> CloudColumns:
 
     Points of an organised cloud (more than one row) without a position are left out: there they
     stand for "nothing seen here".
-
-    Raises
-    ------
-    FileFormatError
-        If it is no PCD file, or cut short.
     """
     where = path_text(path)
     try:

@@ -88,13 +88,7 @@ def ply_header(kind: np.dtype[Any], count: int, comments: Iterable[str]) -> byte
 
 
 def parse_ply(data: bytes, where: str) -> PlyVertices:
-    """Read the vertices of any PLY file whose first element they are.
-
-    Raises
-    ------
-    FileFormatError
-        If it is no PLY file, its vertices are lists or not first, or it is cut short.
-    """
+    """Read the vertices of any PLY file whose first element they are."""
     is_ply = data.startswith(b"ply")
     end = data.find(b"\nend_header", 0, MOST_HEADER_BYTES) if is_ply else -1
     start = data.find(b"\n", end + 1) + 1
@@ -204,13 +198,7 @@ def ply_columns(data: bytes, path: Path) -> CloudColumns:
 
 
 def ply_pieces(path: Path, most_points: int) -> Iterator[CloudColumns] | None:
-    """Vertices of a binary PLY file, so many at a time; None for any other file.
-
-    Raises
-    ------
-    FileFormatError
-        While it is read, if it is cut short.
-    """
+    """Vertices of a binary PLY file, so many at a time; None for any other file."""
     with path.open("rb") as file:
         lines: list[bytes] = []
         n_bytes = 0
@@ -260,11 +248,5 @@ def vertices_remark(n_triangles: int) -> str:
 
 
 def read_ply(path: Path) -> PointCloud:
-    """Read a cloud that armscan wrote.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is cut short, is no PLY, or lacks what armscan writes.
-    """
+    """Read a cloud that armscan wrote."""
     return own_cloud(ply_columns(read_bytes(path), path), path_text(path))

@@ -90,13 +90,7 @@ def csv_bytes(piece: CloudPiece) -> bytes:
 
 
 def text_columns(data: bytes, path: Path) -> CloudColumns:
-    """Columns of a table of numbers: those that its heading names, else the first three as x, y, z.
-
-    Raises
-    ------
-    FileFormatError
-        If it holds no points, or numbers that are not understood.
-    """
+    """Columns of a table of numbers: those that its heading names, else the first three as xyz."""
     lines = data.decode("utf-8-sig", errors="replace").splitlines()
     start = 1 if _is_heading(lines, path) else 0
     body = [line.partition("#")[0] for line in lines[start:]]
@@ -124,13 +118,7 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
 
 
 def _named(heading: list[str], path: Path) -> dict[str, int]:
-    """Numbers of the columns that are read, by name; without x, y and z in it the first three.
-
-    Raises
-    ------
-    FileFormatError
-        If x, y and z are in another unit.
-    """
+    """Numbers of the columns that are read, by name; without x, y and z in it the first three."""
     named: dict[str, int] = {}
     words = [word.strip("#/\"'").lower() for word in heading]
     for k, word in enumerate(words):
@@ -182,13 +170,7 @@ def _notes(lines: list[str]) -> tuple[str, ...]:
 
 
 def _is_heading(lines: list[str], path: Path) -> bool:
-    """Whether the first line is no point but a count of points, or names of columns.
-
-    Raises
-    ------
-    FileFormatError
-        If it is none of these: a damaged point is not to be dropped in silence.
-    """
+    """Whether the first line is no point but a count of points, or names of columns."""
     words = _words(lines[0]) if lines else []
     if not words or lines[0].startswith("#"):
         return False

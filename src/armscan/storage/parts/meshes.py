@@ -41,8 +41,6 @@ def read_part(path: Path, *, unit: str = "mm", chord: ChordError | None = None) 
     ------
     OptionError
         If a unit is given for a STEP file, or a chord error for a mesh.
-    FileFormatError
-        If the file is none of these, is cut short, or is not understood.
     InputError
         If it holds no surface.
     """

@@ -51,16 +51,16 @@ from armscan.storage.documents import (
     read_sensor_calibration,
 )
 from armscan.storage.files import is_file, path_text, read_bytes
-from armscan.storage.parts.datums import (
+from armscan.storage.parts.meshes import read_part
+from armscan.storage.parts.tables import (
     MEASURED,
     PICKED,
     datum_faces,
     datum_features,
     read_reference_markers,
     read_reference_points,
+    require_face,
 )
-from armscan.storage.parts.meshes import read_part
-from armscan.storage.parts.tables import require_face
 from armscan.storage.tables import csv_bytes, number_text, read_csv
 
 REMEDY = "write it as in the reference of recipes (docs/reference/files.md)"
@@ -208,14 +208,10 @@ class RecipeFile:
 
     Parameters
     ----------
-    recipe
-        What to do.
     part
         The model; None without one.
     inputs
         The recipe's file, the model's, and that of reference points.
-    title_block
-        At the head of every page.
     has_pdf
         Whether every part's page is written as PDF too.
     measured_beside
@@ -262,8 +258,6 @@ def read_recipe(path: Path) -> RecipeFile:
 
     Raises
     ------
-    FileFormatError
-        If it is no TOML, a key is not known or has a wrong value, or the model has no such face.
     OptionError
         If the model's format needs a package that is not installed.
     """
@@ -577,14 +571,8 @@ class FoundFeature:
 class PartResult:
     """``features.json``: what a recipe found on a part, and from which files.
 
-    Parameters
-    ----------
-    armscan_version, recipe_sha256, part_sha256, cloud_sha256
-        A part that is done by the same is not done again; the model's is empty without one.
-    row
-        Its row of the table.
-    features
-        Those that were found.
+    A part that is done by the same version and files is not done again; ``row`` is its row of the
+    table.
     """
 
     armscan_version: str
@@ -619,13 +607,7 @@ def part_result_bytes(result: PartResult) -> bytes:
 
 
 def read_part_result(path: Path) -> PartResult:
-    """Read a part's result.
-
-    Raises
-    ------
-    FileFormatError
-        If it is not one.
-    """
+    """Read a part's result."""
     where = path_text(path)
     try:
         return RESULT.read(PartResult, parse_json(read_bytes(path), where))

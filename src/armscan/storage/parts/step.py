@@ -36,14 +36,9 @@ REFERRED, DEFINED = re.compile(rb"#(\d{1,18})"), re.compile(rb"#(\d{1,18})\s*=")
 
 @dataclass(frozen=True, slots=True)
 class ChordError:
-    """How far triangles may lie from the surface that they stand for.
+    """How far triangles may lie from their surface, and the normal may turn along an edge.
 
-    Parameters
-    ----------
-    chord_mm
-        Largest distance. A fifth of what a scanner of 0.01 mm tells.
-    angle_deg
-        Largest turn of the normal along an edge.
+    By default a fifth of what a scanner of 0.01 mm tells.
     """
 
     chord_mm: float = 0.002
@@ -61,19 +56,10 @@ class ChordError:
 def read_step(path: Path, chord: ChordError) -> PartModel:
     """Read a STEP file; lengths are in mm whatever the file's unit, and faces stay as they are.
 
-    Parameters
-    ----------
-    path
-        The file.
-    chord
-        How finely faces are made into triangles.
-
     Raises
     ------
     OptionError
         If the extra ``cad`` is not installed.
-    FileFormatError
-        If the file is cut short.
     InputError
         If it holds no faces, or a part so large that its triangles would be too many.
     """

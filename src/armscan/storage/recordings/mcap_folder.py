@@ -263,13 +263,6 @@ def pieces_of(
 
     After a damage it goes on with the next chunk that is whole. A file without its end ends in a
     damage.
-
-    Parameters
-    ----------
-    file
-        Opened for reading.
-    size
-        Its bytes.
     """
     topics: dict[int, str] = {}
     place = len(MAGIC)
@@ -405,13 +398,7 @@ def _message(body: bytes, topics: Mapping[int, str]) -> StoredMessage:
 
 
 def opened(path: Path) -> BinaryIO:
-    """An MCAP file, for reading.
-
-    Raises
-    ------
-    FileFormatError
-        If it is none, or cannot be read.
-    """
+    """An MCAP file, for reading."""
     head = b""
     if is_file(path):
         with suppress(OSError), path.open("rb") as file:
@@ -428,13 +415,7 @@ def opened(path: Path) -> BinaryIO:
 
 
 def read_summary(path: Path) -> FileSummary:
-    """What a finished file lists of itself.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is no MCAP file, or unfinished.
-    """
+    """What a finished file lists of itself."""
     with opened(path) as file:
         size = path.stat().st_size
         length = FOOTER.size + len(MAGIC)
@@ -488,16 +469,6 @@ class McapFolder:
 
     Its tables are those that `extract_recording` writes. Images that were recorded raw are given as
     PGM or PPM files under the names that they have there.
-
-    Parameters
-    ----------
-    path
-        The file.
-
-    Raises
-    ------
-    FileFormatError
-        If it is no recording of armscan, unfinished or damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -524,13 +495,7 @@ class McapFolder:
         return name in self._files or name in self._images
 
     def read(self, name: str) -> bytes:
-        """Content of a file.
-
-        Raises
-        ------
-        FileFormatError
-            If there is none of that name, or it is damaged.
-        """
+        """Content of a file."""
         if name in self._files:
             return self._files[name]
         if name not in self._images:
@@ -648,13 +613,7 @@ class _ImagePlaces:
 
 
 def folder_in(path: Path) -> McapFolder:
-    """The folder that a file holds; kept until the file changes.
-
-    Raises
-    ------
-    FileFormatError
-        As `McapFolder`.
-    """
+    """The folder that a file holds; kept until the file changes."""
     if not is_file(path):
         read_bytes(path)
     facts = path.stat()

@@ -238,8 +238,6 @@ def extract_recording(path: Path, folder: Path, *, is_recovering: bool = False) 
     FileFormatError
         If the file is none of armscan, holds no exposure that is whole, or, unless recovering, is
         unfinished or damaged.
-    OutputError
-        If the folder holds something, or cannot be written.
     """
     where = path_text(path)
     stated = _stated(path, is_recovering=is_recovering)
@@ -314,24 +312,9 @@ def record_folder(
 
     An ``output`` that exists is replaced when the new one is whole.
 
-    Parameters
-    ----------
-    folder, output
-        From where to where.
-    most
-        So many exposures, the first ones, and what the arm reported a second before and after
-        them; None for all.
-    edit
-        What becomes of each document; None leaves them.
-    is_stripe_band
-        See `WriterOptions`; grey pixels are then written raw, not as their files.
-
-    Raises
-    ------
-    FileFormatError
-        If the recording cannot be read.
-    OutputError
-        If the file cannot be written.
+    Of ``most`` exposures, the first ones, with what the arm reported a second before and after
+    them; of all if None. ``edit`` says what becomes of each document. With ``is_stripe_band``
+    (`WriterOptions`) grey pixels are written raw, not as their files.
     """
     recording = read_recording(folder)
     session = written_session(recording)
@@ -356,14 +339,11 @@ def record_folder(
     return _record(
         output,
         _Content(session, documents, rows, columns, arm, arm_cells),
-        _stored(recording, rows) if is_stripe_band else image_bytes(folder, rows),
+        _stored(recording, rows)
+        if is_stripe_band
+        else (read_bytes(folder / row.source) for row in rows),
         options=WriterOptions(is_stripe_band=is_stripe_band),
     )
-
-
-def image_bytes(folder: Path, rows: Sequence[ExposureRow]) -> Iterator[bytes]:
-    """The image files of rows as they are."""
-    return (read_bytes(folder / row.source) for row in rows)
 
 
 def _stored(
@@ -392,26 +372,7 @@ def record_source(
     encoded: Iterable[bytes] | None = None,
     beside: Mapping[Path, bytes] | None = None,
 ) -> WriterStatus:
-    """Write a scan as an MCAP file: what `write_recording` writes into a folder.
-
-    Parameters
-    ----------
-    output
-        Must not exist.
-    source
-        What to write.
-    progress
-        Called with images written, images in all, and the name of the latest.
-    encoded
-        (N,) the images' PNG files, where they were made already.
-    beside
-        Files that appear with it; they must not exist.
-
-    Raises
-    ------
-    OutputError
-        If the file exists or cannot be written; nothing is left then.
-    """
+    """Write a scan as a new MCAP file: what `write_recording`, whose arguments these are, does."""
     check_new_file(output)
     session, rows = written_session(source), named_rows(source)
     columns, arm = exposure_columns(rows, {}), source.arm
@@ -422,13 +383,7 @@ def record_source(
 
 
 def check_new_file(output: Path) -> None:
-    """Raise before long work if a new file could not be written afterwards.
-
-    Raises
-    ------
-    OutputError
-        If it exists, or its folder does not or may not be written.
-    """
+    """Raise before long work if a new file could not be written afterwards."""
     if output.exists():
         raise OutputError("the file exists", where=path_text(output), remedy="name another file")
     check_outputs((output,))

@@ -50,19 +50,7 @@ def rotations_of_form(
     A quaternion is w, x, y, z (Hamilton, active), of either sign and norm 1 within 1e-6; a matrix
     is row by row and orthonormal within 1e-5, and the nearest rotation is taken.
 
-    Parameters
-    ----------
-    numbers
-        Finite.
-    form, convention
-        How they are written.
-    places
-        (N,) file and line of each, for messages.
-
-    Raises
-    ------
-    FileFormatError
-        If a row is no rotation.
+    Numbers are finite; ``places`` (N,) name file and line of each, for messages.
     """
     if form == "quaternion":
         return _from_quaternions(numbers, places)
@@ -155,12 +143,7 @@ def are_surely_metres(rotations: FloatArray, translations_mm: FloatArray) -> boo
     They do not where the tool stays within 10 mm of Base's origin and moves, while it turns about
     two axes: a stage of small travel does not turn, and a turntable turns about one axis only.
 
-    Parameters
-    ----------
-    rotations
-        (N, 3, 3) of ``base_from_tool``.
-    translations_mm
-        (N, 3) as written under the name of millimetres.
+    ``translations_mm`` (N, 3) is as written under the name of millimetres.
     """
     if len(rotations) < 3 or not are_within_reach_of_base(translations_mm):
         return False
@@ -234,12 +217,7 @@ def other_table_readings(
 ) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
     """Other ways to read a table that `read_robot_poses` has read with a convention.
 
-    Yields
-    ------
-    words, remedy
-        What is read otherwise, and what to type.
-    rotations, translations_mm
-        (N, 3, 3) and (N, 3) of ``base_from_tool`` then.
+    What is read otherwise, what to type, and (N, 3, 3) and (N, 3) of ``base_from_tool`` then.
     """
     table = _read_table(path)
     if len(table.rows[0]) != N_ANGLES:

@@ -149,13 +149,6 @@ class RecordingWriter:
     Exposures, samples of the arm and events may be added from several threads. Times may be in any
     order: what is recorded is what was delivered. A file whose `close` never came has no summary;
     its chunks are whole, checksummed, and declare what they hold; facts follow their images.
-
-    Parameters
-    ----------
-    path
-        File to write; must not exist.
-    options
-        How it is written.
     """
 
     def __init__(self, path: Path, options: WriterOptions | None = None) -> None:
@@ -178,19 +171,10 @@ class RecordingWriter:
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
 
     def begin(self, session: Session, documents: Mapping[str, bytes] | None = None) -> None:
-        """Make the file, with what holds for all of it.
-
-        Parameters
-        ----------
-        session
-            Cameras, clock and form of the poses; written as ``session.toml``.
-        documents
-            Further files of a recording by name, as ``arm.toml``.
+        """Make the file, with what holds for all of it: the session and further documents.
 
         Raises
         ------
-        OutputError
-            If the file exists or cannot be made; nothing is left of it then.
         InputError
             If the recording was begun before.
         """
@@ -258,11 +242,6 @@ class RecordingWriter:
         -------
         fill
             Part of the queue that is filled, 0 to 1; at 1 the next call waits.
-
-        Raises
-        ------
-        OutputError
-            If the disk is full or refuses; says how much is safe.
         """
         if not 0 <= row.camera < len(self._session.cameras):
             raise InputError(f"camera {row.camera} is not among those of the session")
@@ -304,11 +283,6 @@ class RecordingWriter:
             (N,) texts of further columns by name, as buttons.
         cells
             (N,) texts of all columns of ``arm.csv`` as they stand there; made of ``track`` if None.
-
-        Returns
-        -------
-        fill
-            As `add_exposure`.
         """
         session = self._session
         extra = {name: tuple(cells) for name, cells in (columns or {}).items()}
@@ -338,13 +312,7 @@ class RecordingWriter:
             return WriterStatus(*counts, self._file.n_bytes)
 
     def close(self) -> WriterStatus:
-        """Write all that waits, and the summary with which readers find exposures.
-
-        Raises
-        ------
-        OutputError
-            If the disk is full or refuses; says how much is safe.
-        """
+        """Write all that waits, and the summary with which readers find exposures."""
         with self._ready:
             self._is_closing = True
             self._ready.notify_all()

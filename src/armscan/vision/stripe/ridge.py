@@ -543,7 +543,21 @@ def link(points: FloatArray) -> RidgePoints:
     order = np.zeros(n, np.int64)
     chain = np.zeros(n, np.int64)
     count = walk_chains(ahead, behind, order, chain)
-    return RidgePoints(np.take(points, order[:count], axis=0), chain[:count])
+    table, chain = np.take(points, order[:count], axis=0), chain[:count]
+    _turn_normals(table, chain)
+    return RidgePoints(table, chain)
+
+
+def _turn_normals(table: FloatArray, chain: IntArray) -> None:
+    """Point the normals of a chain to one side: each is known but for its sign."""
+    normals = table[:, 2:4]
+    is_same = chain[1:] == chain[:-1]
+    is_against = is_same & (np.einsum("ni,ni->n", normals[1:], normals[:-1]) < 0.0)
+    if not is_against.any():
+        return
+    n_turns = np.concatenate([[0], np.cumsum(is_against)])
+    first = np.maximum.accumulate(np.where(np.append(True, ~is_same), np.arange(len(chain)), 0))
+    normals[(n_turns - n_turns[first]) % 2 == 1] *= -1.0
 
 
 def is_bright(ridge: RidgePoints) -> NDArray[np.bool_]:

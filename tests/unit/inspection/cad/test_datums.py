@@ -33,7 +33,7 @@ from armscan.inspection.cad.reference_points import (
     paired_markers,
 )
 from armscan.records.points import MarkerSet
-from armscan.storage.parts.datums import datum_features, read_reference_markers
+from armscan.storage.parts.tables import datum_features, read_reference_markers
 from armscan.storage.points import markers_csv
 from rigs.inspection_clouds import cloud_of
 from rigs.parts import box_corners, extruded, turned

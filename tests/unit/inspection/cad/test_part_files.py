@@ -14,10 +14,9 @@ import trimesh
 
 from armscan.errors import ArmscanError, FileFormatError, InputError, OptionError
 from armscan.inspection.cad.part import part_of
-from armscan.storage.parts.datums import datum_faces
 from armscan.storage.parts.meshes import read_part
 from armscan.storage.parts.step import ChordError, face_kind
-from armscan.storage.parts.tables import read_tolerances
+from armscan.storage.parts.tables import datum_faces, read_tolerances
 from rigs.parts import box_corners, extruded, wedge_part
 
 PART = part_of(box_corners([1, 2, 3.0], [11, 7, 5]), source="box")

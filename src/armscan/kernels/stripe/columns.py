@@ -171,34 +171,48 @@ MOST_WIDER = 4.0
 """Of a line's variance over that of the bell it is looked at through."""
 
 
-@compiled(error_model="numpy")
-def keep_moments(
-    sums: Row, lane: int, centre: float, sigma: float, base: float, i: int, result: TableOut
-) -> None:
-    """A line's amplitude, centre and sigma from its moments under a bell.
+@compiled(error_model="numpy", is_inlined=True)
+def weigh_moments(sums: Row, given: Floats, told: FloatsOut) -> None:
+    """Amplitude, centre and sigma of `LANES` lines from their moments under a bell.
 
     A Gaussian times the bell has the variance 1 / (1 / V + 1 / W), and its mean lies as far from
     the bell's middle as V / (V + W) of the line's centre: so the first steps of an iteration to the
     centre are left out. What the bell's own moments are over the pixels is in ``sums``.
+
+    ``given``: (3 `LANES`,) middle, sigma and background of the bells. ``told``: (6 `LANES`,)
+    output, rows of `FIRST_ROWS`.
     """
-    own, norm = float(sums[lane]), float(sums[3 * LANES + lane])
-    result[:, i] = 0.0
-    if own > 0.0 and norm > 0.0:
-        mean = sums[LANES + lane] / own
-        seen = sums[2 * LANES + lane] / own - mean * mean
-        bell = sums[4 * LANES + lane] / norm
+    for k in range(LANES):
+        own, norm = float(sums[k]), float(sums[3 * LANES + k])
+        is_lit = (own > 0.0) & (norm > 0.0)
+        mean = sums[LANES + k] / own
+        seen = sums[2 * LANES + k] / own - mean * mean
+        bell = sums[4 * LANES + k] / norm
         line = seen * bell / max(bell - seen, bell / (1.0 + MOST_WIDER))
         line = max(line, 1.0 / MOST_WIDER)
-        result[CENTRE, i] = centre + sigma * mean * (bell + line) / bell
-        result[SIGMA, i] = sigma * math.sqrt(line)
-        result[AMPLITUDE, i] = own / (norm * math.sqrt(line / (bell + line)))
-    n_low, n_high = sums[5 * LANES + lane], sums[7 * LANES + lane]
-    result[LOW_SIDE, i] = base + sums[6 * LANES + lane] / n_low if n_low > 0.0 else np.nan
-    result[HIGH_SIDE, i] = base + sums[8 * LANES + lane] / n_high if n_high > 0.0 else np.nan
-    result[N_SIDES, i] = min(n_low, n_high)
+        centre = given[k] + given[LANES + k] * mean * (bell + line) / bell
+        height = own / (norm * math.sqrt(line / (bell + line)))
+        told[AMPLITUDE * LANES + k] = height if is_lit else 0.0
+        told[CENTRE * LANES + k] = centre if is_lit else 0.0
+        told[SIGMA * LANES + k] = given[LANES + k] * math.sqrt(line) if is_lit else 0.0
+    for k in range(LANES):
+        # none on a side: 0 / 0
+        base = given[2 * LANES + k]
+        n_low, n_high = sums[5 * LANES + k], sums[7 * LANES + k]
+        told[LOW_SIDE * LANES + k] = base + sums[6 * LANES + k] / n_low
+        told[HIGH_SIDE * LANES + k] = base + sums[8 * LANES + k] / n_high
+        told[N_SIDES * LANES + k] = min(n_low, n_high)
 
 
-@compiled()
+@compiled(is_inlined=True)
+def keep_lanes(told: Floats, shift: int, n: int, first: int, result: TableOut) -> None:
+    """Take the numbers (R `LANES`,) of ``n`` lanes from one on to points of a table (R, N)."""
+    for row in range(result.shape[0]):
+        for k in range(n):
+            result[row, first + k] = told[row * LANES + shift + k]
+
+
+@compiled(error_model="numpy")
 def look_across(
     raw: Mask,
     image: Image,
@@ -218,6 +232,7 @@ def look_across(
     height, width = raw.shape if has_bytes else image.shape
     levels, lanes = np.zeros(LANES, np.float32), np.zeros(3 * LANES, np.float32)
     sums = np.zeros(N_FIRST_SUMS * LANES, np.float32)
+    given, told = np.zeros(3 * LANES), np.zeros(FIRST_ROWS * LANES)
     first = 0
     while first < points.shape[0]:
         n = count_lanes(points, first)
@@ -233,10 +248,12 @@ def look_across(
         top, bottom = max(math.floor(low), 0), min(math.ceil(high), height - 1)
         for lane in range(LANES):
             i = min(max(first + lane - shift, first), first + n - 1)
-            middle = 0.5 * (points[i, POINT_LOW] + points[i, POINT_HIGH])
-            lanes[lane] = np.float32(middle - top)
-            lanes[LANES + lane] = np.float32(1.0 / sigma[i])
-            lanes[2 * LANES + lane] = np.float32(base[i])
+            given[lane] = 0.5 * (points[i, POINT_LOW] + points[i, POINT_HIGH])
+            given[LANES + lane], given[2 * LANES + lane] = sigma[i], base[i]
+        for lane in range(LANES):
+            lanes[lane] = np.float32(given[lane] - top)
+            lanes[LANES + lane] = np.float32(1.0 / given[LANES + lane])
+            lanes[2 * LANES + lane] = np.float32(given[2 * LANES + lane])
         sums[:] = np.float32(0.0)
         for y in range(top, bottom + 1):
             if has_bytes:
@@ -244,10 +261,8 @@ def look_across(
             else:
                 copy_levels(image, y, left, levels)
             add_moments(levels, np.float32(y - top), lanes, sums)
-        for k in range(n):
-            i = first + k
-            middle = 0.5 * (points[i, POINT_LOW] + points[i, POINT_HIGH])
-            keep_moments(sums, k + shift, middle, sigma[i], base[i], i, result)
+        weigh_moments(sums, given, told)
+        keep_lanes(told, shift, n, first, result)
         first += n
 
 
@@ -311,20 +326,20 @@ def count_unclipped(clipped: Mask, y: int, x: int, counts: RowOut) -> None:
         counts[k] = zero if own[k] > 0 else one
 
 
-@compiled(is_inlined=True)
-def count_below(levels: Row, clip: np.float32, counts: RowOut) -> None:
-    """1 or 0 for each of `LANES` levels, of which those from ``clip`` on saturated."""
-    one, zero = np.float32(1.0), np.float32(0.0)
-    for k in range(LANES):
-        counts[k] = one if levels[k] < clip else zero
-
-
 @compiled(fastmath=True, error_model="numpy", is_inlined=True)
 def add_weighted(
-    levels: Row, counts: Row, y: np.float32, noise: Row, lanes: Row, sums: RowOut
+    levels: Row,
+    counts: Row,
+    clip: np.float32,
+    y: np.float32,
+    noise: Row,
+    lanes: Row,
+    sums: RowOut,
 ) -> None:
     """Add a row's pixels to the weighted sums of a Gauss-Newton step of centre and amplitude.
 
+    ``counts``: (`LANES`,) 0 for pixels that saturated, else 1. ``clip``: Level from which pixels
+    did so, too: asked apart, it would be written one by one, and reading the row would wait.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``lanes``: (5 `LANES`,) centre, 1 over sigma,
     amplitude, background at the centre, its rise a row. ``sums``: (10 `LANES`,) products of the
     derivatives by centre and log amplitude as 00 01 11, their right-hand side, residual times the
@@ -342,7 +357,8 @@ def add_weighted(
         behind = lanes[3 * LANES + k] + d * lanes[4 * LANES + k]
         r = levels[k] - behind - m
         is_line = one if uu < reach else zero
-        w = is_line * counts[k] / (square * m * m + linear * max(m + behind, zero) + constant)
+        count = counts[k] if levels[k] < clip else zero
+        w = is_line * count / (square * m * m + linear * max(m + behind, zero) + constant)
         j = m * u
         wj = w * j
         wm = w * m
@@ -356,46 +372,43 @@ def add_weighted(
         sums[6 * LANES + k] += wq * j
         sums[7 * LANES + k] += wq * j * (uu - three)
         sums[8 * LANES + k] += wj * m * uu * u
-        sums[9 * LANES + k] += is_line * (one - counts[k])
+        sums[9 * LANES + k] += is_line * (one - count)
 
 
 MOST_STEP = 0.7
 """Of a line's sigma, by which the second pass moves a centre at most: farther off it failed."""
 
 
-@compiled(error_model="numpy")
-def keep_step(sums: Row, lane: int, given: Table, i: int, result: TableOut) -> None:
-    """Take the step of one lane to point ``i``; variance 0 where it fails.
+@compiled(error_model="numpy", is_inlined=True)
+def take_step(sums: Row, given: Floats, told: FloatsOut) -> None:
+    """Steps of `LANES` lines; variance 0 where one fails.
 
-    ``given``, ``result``: As for `fit_columns`.
+    ``given``: (5 `LANES`,) amplitude, centre, sigma and sides. ``told``: (8 `LANES`,) output, rows
+    of `SECOND_ROWS`.
     """
-    h00, h01 = float(sums[lane]), float(sums[LANES + lane])
-    h11, b0 = float(sums[2 * LANES + lane]), float(sums[3 * LANES + lane])
-    b1, q0 = float(sums[4 * LANES + lane]), float(sums[6 * LANES + lane])
-    determinant = h00 * h11 - h01 * h01
-    result[:, i] = 0.0
-    sigma = given[SIGMA, i]
-    result[AMPLITUDE, i], result[CENTRE, i], result[SIGMA, i] = (
-        given[AMPLITUDE, i],
-        given[CENTRE, i],
-        sigma,
-    )
-    result[N_CLIPPED, i] = sums[9 * LANES + lane]
-    if not determinant > 0.0:
-        return
-    step = (h11 * b0 - h01 * b1) / determinant
-    if not abs(step) < MOST_STEP:
-        return
-    grown = (h00 * b1 - h01 * b0) / determinant
-    result[CENTRE, i] = given[CENTRE, i] + sigma * step
-    result[AMPLITUDE, i] = given[AMPLITUDE, i] * (1.0 + min(max(grown, -0.5), 1.0))
-    result[VARIANCE, i] = sigma * sigma * h11 / determinant
-    result[LEAN, i] = sums[5 * LANES + lane] - q0 / h00 * b0
-    result[LEAN_NORM, i] = max(sums[7 * LANES + lane] - q0 * q0 / h00, 0.0)
-    result[BEND_GAIN, i] = sums[8 * LANES + lane] / h00
+    for k in range(LANES):
+        h00, h01 = float(sums[k]), float(sums[LANES + k])
+        h11, b0 = float(sums[2 * LANES + k]), float(sums[3 * LANES + k])
+        b1, q0 = float(sums[4 * LANES + k]), float(sums[6 * LANES + k])
+        height, centre, sigma = given[k], given[LANES + k], given[2 * LANES + k]
+        determinant = h00 * h11 - h01 * h01
+        step = (h11 * b0 - h01 * b1) / determinant
+        is_sound = (determinant > 0.0) & (abs(step) < MOST_STEP)
+        grown = (h00 * b1 - h01 * b0) / determinant
+        grown = height * (1.0 + min(max(grown, -0.5), 1.0))
+        lean = float(sums[5 * LANES + k]) - q0 / h00 * b0
+        norm = max(float(sums[7 * LANES + k]) - q0 * q0 / h00, 0.0)
+        told[AMPLITUDE * LANES + k] = grown if is_sound else height
+        told[CENTRE * LANES + k] = centre + sigma * step if is_sound else centre
+        told[SIGMA * LANES + k] = sigma
+        told[VARIANCE * LANES + k] = sigma * sigma * h11 / determinant if is_sound else 0.0
+        told[LEAN * LANES + k] = lean if is_sound else 0.0
+        told[LEAN_NORM * LANES + k] = norm if is_sound else 0.0
+        told[BEND_GAIN * LANES + k] = float(sums[8 * LANES + k]) / h00 if is_sound else 0.0
+        told[N_CLIPPED * LANES + k] = float(sums[9 * LANES + k])
 
 
-@compiled()
+@compiled(error_model="numpy")
 def fit_columns(
     raw: Mask,
     image: Image,
@@ -419,9 +432,10 @@ def fit_columns(
     has_bytes, has_mask = raw.shape[0] > 1, clipped.shape[0] > 1
     height, width = raw.shape if has_bytes else image.shape
     share, limit = np.float32(1.0 / unit), np.float32(clip)
-    levels, counts = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
+    levels, counts = np.zeros(LANES, np.float32), np.ones(LANES, np.float32)
     lanes = np.zeros(5 * LANES, np.float32)
     sums = np.zeros(N_SECOND_SUMS * LANES, np.float32)
+    own, told = np.zeros(5 * LANES), np.zeros(SECOND_ROWS * LANES)
     first = 0
     while first < points.shape[0]:
         n = count_lanes(points, first)
@@ -434,13 +448,16 @@ def fit_columns(
         top, bottom = max(math.floor(low), 0), min(math.ceil(high), height - 1)
         for lane in range(LANES):
             i = min(max(first + lane - shift, first), first + n - 1)
-            sides = given[HIGH_SIDE, i] - given[LOW_SIDE, i]
-            lanes[lane] = np.float32(given[CENTRE, i] - top)
-            lanes[LANES + lane] = np.float32(1.0 / given[SIGMA, i])
-            lanes[2 * LANES + lane] = np.float32(given[AMPLITUDE, i])
-            lanes[3 * LANES + lane] = np.float32(given[LOW_SIDE, i] + 0.5 * sides)
-            apart = (SIDE_FROM + SIDE_TO) * given[SIGMA, i]
-            lanes[4 * LANES + lane] = np.float32(sides / apart)
+            for row in range(N_SIDES):
+                own[row * LANES + lane] = given[row, i]
+        for lane in range(LANES):
+            low_side, sigma = own[LOW_SIDE * LANES + lane], own[SIGMA * LANES + lane]
+            sides = own[HIGH_SIDE * LANES + lane] - low_side
+            lanes[lane] = np.float32(own[CENTRE * LANES + lane] - top)
+            lanes[LANES + lane] = np.float32(1.0 / sigma)
+            lanes[2 * LANES + lane] = np.float32(own[AMPLITUDE * LANES + lane])
+            lanes[3 * LANES + lane] = np.float32(low_side + 0.5 * sides)
+            lanes[4 * LANES + lane] = np.float32(sides / ((SIDE_FROM + SIDE_TO) * sigma))
         sums[:] = np.float32(0.0)
         for y in range(top, bottom + 1):
             if has_bytes:
@@ -449,11 +466,9 @@ def fit_columns(
                 copy_levels(image, y, left, levels)
             if has_mask:
                 count_unclipped(clipped, y, left, counts)
-            else:
-                count_below(levels, limit, counts)
-            add_weighted(levels, counts, np.float32(y - top), noise, lanes, sums)
-        for k in range(n):
-            keep_step(sums, k + shift, given, first + k, result)
+            add_weighted(levels, counts, limit, np.float32(y - top), noise, lanes, sums)
+        take_step(sums, own, told)
+        keep_lanes(told, shift, n, first, result)
         first += n
 
 

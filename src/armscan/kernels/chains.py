@@ -404,8 +404,8 @@ def middle_of_squares(values: FloatsOut) -> float:
         if below + smaller >= 0.5 * total:
             last = left - 1
         elif below + smaller + alike >= 0.5 * total:
-            return pivot
+            return float(pivot)
         else:
             below += smaller + alike
             first = right + 1
-    return values[min(first, values.shape[0] - 1)]
+    return float(values[min(first, values.shape[0] - 1)])

@@ -30,6 +30,9 @@ WIDE = 0.02
 """Points whose variance across is less than this part of that along lie on one line."""
 HALVINGS = 60
 """Steps that seek a bound between two squares of distances; many more than are taken."""
+AT_ONCE = 16
+FEW_PLACES = 3000
+"""To go through so many takes less than to look for bins that are mostly empty."""
 X, Y, Z, SQUARE = (row * MOST_NEAR for row in range(4))
 """Where the coordinates of the means near a cell begin, and the squares of their distances."""
 
@@ -257,6 +260,35 @@ def _bound(
     return high
 
 
+@compiled(is_inlined=True)
+def _least_square(
+    place: Floats, u: Floats, v: Floats, w: Floats, of: Floats, limit: float, least: FloatsOut
+) -> float:
+    """Least square of the distances of a place (4,) to others (N,) of another exposure, or a limit.
+
+    ``least``: (`AT_ONCE`,) for what is found on the way: so many are compared at once.
+    """
+    x, y, z, own = place[0], place[1], place[2], place[3]
+    least[:] = limit
+    whole = len(u) - len(u) % AT_ONCE
+    for first in range(0, whole, AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        a, b, c, other = u[part], v[part], w[part], of[part]
+        for k in range(AT_ONCE):
+            dx, dy, dz = a[k] - x, b[k] - y, c[k] - z
+            square = dx * dx + dy * dy + dz * dz
+            square = square if other[k] != own else math.inf
+            least[k] = square if square < least[k] else least[k]
+    best = limit
+    for m in range(whole, len(u)):
+        dx, dy, dz = u[m] - x, v[m] - y, w[m] - z
+        if of[m] != own:
+            best = min(best, dx * dx + dy * dy + dz * dz)
+    for k in range(AT_ONCE):
+        best = min(best, least[k])
+    return best
+
+
 @compiled()
 def nearest_others(
     asked: Table,
@@ -281,9 +313,15 @@ def nearest_others(
     nearest
         (S,) input: how far is looked; output: the distance where it is less.
     """
-    mask = len(slots) - 1
+    mask, columns = len(slots) - 1, np.ascontiguousarray(places.T)
+    u_, v_, w_, of = columns[0], columns[1], columns[2], columns[3]
+    least = np.zeros(AT_ONCE)
     for s in range(len(asked)):
         x, y, z, own = asked[s, 0], asked[s, 1], asked[s, 2], asked[s, 3]
+        if len(places) <= FEW_PLACES:
+            best = nearest[s] * nearest[s]
+            nearest[s] = math.sqrt(_least_square(asked[s], u_, v_, w_, of, best, least))
+            continue
         u, v, w = (x - low[0]) / width, (y - low[1]) / width, (z - low[2]) / width
         bin_x, bin_y, bin_z = math.floor(u), math.floor(v), math.floor(w)
         # of its bin's least far side
@@ -302,33 +340,11 @@ def nearest_others(
                         if row < 0:
                             continue
                         for m in range(starts[row], starts[row + 1]):
-                            if places[m, 3] != own:
-                                dx, dy, dz = places[m, 0] - x, places[m, 1] - y, places[m, 2] - z
+                            if of[m] != own:
+                                dx, dy, dz = u_[m] - x, v_[m] - y, w_[m] - z
                                 best = min(best, dx * dx + dy * dy + dz * dz)
             ring += 1
         nearest[s] = math.sqrt(best)
-
-
-@compiled()
-def drop_hidden(
-    asked: Table, first: Ints, stop: Ints, places: Table, looked_at: int, nearest: FloatsOut
-) -> None:
-    """Infinite distances of places that as many of their own exposure, or more, are nearer to.
-
-    ``asked``: (S, 4). ``first``, ``stop``: (S,) rows of its own exposure in ``places`` (M, 4).
-    ``looked_at``: The place itself is counted. ``nearest``: (S,) of `nearest_others`.
-    """
-    for s in range(len(asked)):
-        nearer, square = 0, nearest[s] * nearest[s]
-        for m in range(first[s], stop[s]):
-            dx, dy, dz = (
-                places[m, 0] - asked[s, 0],
-                places[m, 1] - asked[s, 1],
-                places[m, 2] - asked[s, 2],
-            )
-            nearer += 1 if dx * dx + dy * dy + dz * dz < square else 0
-        if nearer >= looked_at:
-            nearest[s] = math.inf
 
 
 @compiled(error_model="numpy")

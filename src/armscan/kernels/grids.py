@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measured points on grids: what a voxel adds up (weighted places, covariances, normals, counts),
-sums over cells that are numbered by one integer and found by hashing, and the heights of nodes.
+sums over cells that are numbered by one integer and found by hashing, points sorted into bins, and
+the heights of nodes.
 """
 
 from __future__ import annotations
@@ -390,3 +391,25 @@ def slot_of(key: int, slots: Ints, keys: Ints, mask: int) -> int:
     while slots[slot] >= 0 and keys[slots[slot]] != key:
         slot = (slot + 1) & mask
     return slot
+
+
+@compiled()
+def drop_hidden(
+    asked: Table, first: Ints, stop: Ints, places: Table, looked_at: int, nearest: FloatsOut
+) -> None:
+    """Infinite distances of places that as many of their own exposure, or more, are nearer to.
+
+    ``asked``: (S, 4). ``first``, ``stop``: (S,) rows of its own exposure in ``places`` (M, 4).
+    ``looked_at``: The place itself is counted. ``nearest``: (S,) of `nearest_others`.
+    """
+    columns = np.ascontiguousarray(places.T)
+    for s in range(len(asked)):
+        nearer, square = 0, nearest[s] * nearest[s]
+        x, y, z = asked[s, 0], asked[s, 1], asked[s, 2]
+        span = slice(first[s], stop[s])
+        u, v, w = columns[0, span], columns[1, span], columns[2, span]
+        for m in range(len(u)):
+            dx, dy, dz = u[m] - x, v[m] - y, w[m] - z
+            nearer += 1 if dx * dx + dy * dy + dz * dz < square else 0
+        if nearer >= looked_at:
+            nearest[s] = math.inf

@@ -182,12 +182,14 @@ def weigh_moments(sums: Row, given: Floats, told: FloatsOut) -> None:
     ``given``: (3 `LANES`,) middle, sigma and background of the bells. ``told``: (6 `LANES`,)
     output, rows of `FIRST_ROWS`.
     """
+    one = np.float32(1.0)
     for k in range(LANES):
-        own, norm = float(sums[k]), float(sums[3 * LANES + k])
-        is_lit = (own > 0.0) & (norm > 0.0)
+        is_lit = (sums[k] > 0.0) & (sums[3 * LANES + k] > 0.0)
+        own = sums[k] if is_lit else one
+        norm = sums[3 * LANES + k] if is_lit else one
         mean = sums[LANES + k] / own
         seen = sums[2 * LANES + k] / own - mean * mean
-        bell = sums[4 * LANES + k] / norm
+        bell = sums[4 * LANES + k] / norm if is_lit else one
         line = seen * bell / max(bell - seen, bell / (1.0 + MOST_WIDER))
         line = max(line, 1.0 / MOST_WIDER)
         centre = given[k] + given[LANES + k] * mean * (bell + line) / bell
@@ -196,11 +198,12 @@ def weigh_moments(sums: Row, given: Floats, told: FloatsOut) -> None:
         told[CENTRE * LANES + k] = centre if is_lit else 0.0
         told[SIGMA * LANES + k] = given[LANES + k] * math.sqrt(line) if is_lit else 0.0
     for k in range(LANES):
-        # none on a side: 0 / 0
         base = given[2 * LANES + k]
         n_low, n_high = sums[5 * LANES + k], sums[7 * LANES + k]
-        told[LOW_SIDE * LANES + k] = base + sums[6 * LANES + k] / n_low
-        told[HIGH_SIDE * LANES + k] = base + sums[8 * LANES + k] / n_high
+        low_side = base + sums[6 * LANES + k] / max(n_low, one)
+        high_side = base + sums[8 * LANES + k] / max(n_high, one)
+        told[LOW_SIDE * LANES + k] = low_side if n_low > 0.0 else np.nan
+        told[HIGH_SIDE * LANES + k] = high_side if n_high > 0.0 else np.nan
         told[N_SIDES * LANES + k] = min(n_low, n_high)
 
 
@@ -386,26 +389,29 @@ def take_step(sums: Row, given: Floats, told: FloatsOut) -> None:
     ``given``: (5 `LANES`,) amplitude, centre, sigma and sides. ``told``: (8 `LANES`,) output, rows
     of `SECOND_ROWS`.
     """
+    one = np.float32(1.0)
     for k in range(LANES):
-        h00, h01 = float(sums[k]), float(sums[LANES + k])
-        h11, b0 = float(sums[2 * LANES + k]), float(sums[3 * LANES + k])
-        b1, q0 = float(sums[4 * LANES + k]), float(sums[6 * LANES + k])
+        h00, h01 = sums[k], sums[LANES + k]
+        h11, b0 = sums[2 * LANES + k], sums[3 * LANES + k]
+        b1, q0 = sums[4 * LANES + k], sums[6 * LANES + k]
         height, centre, sigma = given[k], given[LANES + k], given[2 * LANES + k]
-        determinant = h00 * h11 - h01 * h01
+        product = h00 * h11 - h01 * h01
+        is_definite = product > 0.0
+        determinant, own = product if is_definite else one, h00 if is_definite else one
         step = (h11 * b0 - h01 * b1) / determinant
-        is_sound = (determinant > 0.0) & (abs(step) < MOST_STEP)
+        is_sound = is_definite & (abs(step) < MOST_STEP)
         grown = (h00 * b1 - h01 * b0) / determinant
         grown = height * (1.0 + min(max(grown, -0.5), 1.0))
-        lean = float(sums[5 * LANES + k]) - q0 / h00 * b0
-        norm = max(float(sums[7 * LANES + k]) - q0 * q0 / h00, 0.0)
+        lean = sums[5 * LANES + k] - q0 / own * b0
+        norm = max(sums[7 * LANES + k] - q0 * q0 / own, 0.0)
         told[AMPLITUDE * LANES + k] = grown if is_sound else height
         told[CENTRE * LANES + k] = centre + sigma * step if is_sound else centre
         told[SIGMA * LANES + k] = sigma
         told[VARIANCE * LANES + k] = sigma * sigma * h11 / determinant if is_sound else 0.0
         told[LEAN * LANES + k] = lean if is_sound else 0.0
         told[LEAN_NORM * LANES + k] = norm if is_sound else 0.0
-        told[BEND_GAIN * LANES + k] = float(sums[8 * LANES + k]) / h00 if is_sound else 0.0
-        told[N_CLIPPED * LANES + k] = float(sums[9 * LANES + k])
+        told[BEND_GAIN * LANES + k] = sums[8 * LANES + k] / own if is_sound else 0.0
+        told[N_CLIPPED * LANES + k] = sums[9 * LANES + k]
 
 
 @compiled(error_model="numpy")
@@ -499,8 +505,9 @@ def mark_near(
         is_beside = (gap <= sigma) | (gap + own < limits[0] * sigma)
         is_beside &= fits[AMPLITUDE, i] > limits[1]
         is_wide = (own > length[i]) | (sigma > limits[3] * (limits[2] * steep[i]))
-        near[i] = is_beside | is_wide | (dips[i] > 0)
-        count += near[i]
+        is_near = is_beside | is_wide | (dips[i] > 0)
+        near[i] = is_near
+        count += 1 if is_near else 0
     return count
 
 

@@ -371,3 +371,41 @@ def sum_windows(values: Table, chain: Ints, half: int, sums: TableOut) -> None:
             for i in range(first, stop):
                 sums[row, i] = running[min(i + half + 1, stop)] - running[max(i - half, first)]
             first = stop
+
+
+@compiled()
+def middle_of_squares(values: FloatsOut) -> float:
+    """Least of some values (N,) up to which they have half of the sum of all squares.
+
+    The values are brought into another order.
+    """
+    total = below = 0.0
+    for i in range(values.shape[0]):
+        total += values[i] * values[i]
+    first, last = 0, values.shape[0] - 1
+    while first < last:
+        low, high = min(values[first], values[last]), max(values[first], values[last])
+        pivot = min(max(values[(first + last) // 2], low), high)
+        # smaller ones first, then its equals
+        left, right, i, smaller, alike = first, last, first, 0.0, 0.0
+        while i <= right:
+            own = values[i]
+            if own < pivot:
+                smaller += own * own
+                values[i], values[left] = values[left], own
+                left += 1
+                i += 1
+            elif own > pivot:
+                values[i], values[right] = values[right], own
+                right -= 1
+            else:
+                alike += own * own
+                i += 1
+        if below + smaller >= 0.5 * total:
+            last = left - 1
+        elif below + smaller + alike >= 0.5 * total:
+            return float(pivot)
+        else:
+            below += smaller + alike
+            first = right + 1
+    return float(values[min(first, values.shape[0] - 1)])

@@ -17,12 +17,11 @@ from armscan.kernels.arrays import (
     IntsOut,
     Table,
     TableOut,
+    Three,
     compiled,
 )
-from armscan.kernels.grids import SPREAD, principal_axes
+from armscan.kernels.grids import BIN_BITS, slot_of
 
-BIN_BITS = 21
-"""Of the number of a bin along an axis, counted from 1 so that a neighbour has one as well."""
 CELLS_A_BIN = 4
 """Along an axis: a bin is as wide as the radius about a point, a cell a quarter of it."""
 MOST_NEAR = 1024
@@ -31,73 +30,11 @@ WIDE = 0.02
 """Points whose variance across is less than this part of that along lie on one line."""
 HALVINGS = 60
 """Steps that seek a bound between two squares of distances; many more than are taken."""
+AT_ONCE = 16
+FEW_PLACES = 3000
+"""To go through so many takes less than to look for bins that are mostly empty."""
 X, Y, Z, SQUARE = (row * MOST_NEAR for row in range(4))
 """Where the coordinates of the means near a cell begin, and the squares of their distances."""
-
-
-@compiled()
-def sort_into_bins(
-    cells: Table,
-    low: Floats,
-    size: float,
-    slots: IntsOut,
-    bin_keys: IntsOut,
-    starts: IntsOut,
-    ordered: TableOut,
-) -> None:
-    """Put means of cells, or points, bin by bin, in their order within each bin.
-
-    Parameters
-    ----------
-    cells
-        (M, 3) places, or (M, K) with more numbers behind them.
-    low, size
-        (3,) lowest corner of all, and the width of a bin.
-    slots
-        (S,) of -1, becomes the hash table: row of the bin, S a power of two of at least 2 M.
-    bin_keys, starts
-        (M,) number of each bin, and (M + 1,) first of its means; the bins that there are.
-    ordered
-        (M, K) the same rows.
-    """
-    mask = len(slots) - 1
-    member = np.zeros(len(cells), np.int64)
-    count = 0
-    for m in range(len(cells)):
-        key = 0
-        for k in range(3):
-            key = key << BIN_BITS | int((cells[m, k] - low[k]) / size) + 1
-        slot = _slot_of(key, slots, bin_keys, mask)
-        if slots[slot] < 0:
-            slots[slot] = count
-            bin_keys[count] = key
-            starts[count] = 0
-            count += 1
-        member[m] = slots[slot]
-        starts[slots[slot]] += 1
-    first = 0
-    for b in range(count):
-        size_of_bin = starts[b]
-        starts[b] = first
-        first += size_of_bin
-    for m in range(len(cells)):
-        row = starts[member[m]]
-        starts[member[m]] += 1
-        for k in range(cells.shape[1]):
-            ordered[row, k] = cells[m, k]
-    for b in range(count, 0, -1):
-        starts[b] = starts[b - 1]
-    starts[0] = 0
-
-
-@compiled(is_inlined=True)
-def _slot_of(key: int, slots: Ints, keys: Ints, mask: int) -> int:
-    """Place of a number in a hash table, or the free one where it would go."""
-    mixed = key * SPREAD
-    slot = (mixed ^ (mixed >> 29)) & mask
-    while slots[slot] >= 0 and keys[slots[slot]] != key:
-        slot = (slot + 1) & mask
-    return slot
 
 
 @compiled()
@@ -181,7 +118,7 @@ def _gather(
         for j in range(bin_y - 1, bin_y + 2):
             for k in range(bin_z - 1, bin_z + 2):
                 key = (i << BIN_BITS | j) << BIN_BITS | k
-                row = slots[_slot_of(key, slots, bin_keys, mask)]
+                row = slots[slot_of(key, slots, bin_keys, mask)]
                 if row < 0:
                     continue
                 for m in range(starts[row], starts[row + 1]):
@@ -233,20 +170,42 @@ def _least_direction(
     sx, sy, sz = sx / n, sy / n, sz / n
     xx, xy, xz = xx / n - sx * sx, xy / n - sx * sy, xz / n - sx * sz
     yy, yz, zz = yy / n - sy * sy, yz / n - sy * sz, zz / n - sz * sz
-    mean = (xx + yy + zz) / 3.0
-    a, b, c_ = xx - mean, yy - mean, zz - mean
-    spread = math.sqrt((a * a + b * b + c_ * c_ + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
-    if not spread > 0.0:
-        return
-    det = a * (b * c_ - yz * yz) - xy * (xy * c_ - yz * xz) + xz * (xy * yz - b * xz)
-    cosine = min(max(0.5 * det / (spread * spread * spread), -1.0), 1.0)
-    angle = math.acos(cosine) / 3.0
-    least = mean + 2.0 * spread * math.cos(angle + 2.0 * math.pi / 3.0)
-    middle = 3.0 * mean - least - (mean + 2.0 * spread * math.cos(angle))
+    least, middle, _ = _spreads(xx, xy, xz, yy, yz, zz)
     width = math.sqrt(max(middle, 0.0))
     thickness = math.sqrt(max(least, 0.0))
     if width < limits[2] * radius or thickness > limits[3] * width:
         return
+    _axis_of(xx, xy, xz, yy, yz, zz, least, found)
+
+
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def _spreads(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> Three:
+    """Eigenvalues of a symmetric matrix, rising."""
+    mean = (xx + yy + zz) / 3.0
+    a, b, c_ = xx - mean, yy - mean, zz - mean
+    spread = math.sqrt((a * a + b * b + c_ * c_ + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    if not spread > 0.0:
+        return mean, mean, mean
+    det = a * (b * c_ - yz * yz) - xy * (xy * c_ - yz * xz) + xz * (xy * yz - b * xz)
+    cosine = min(max(0.5 * det / (spread * spread * spread), -1.0), 1.0)
+    angle = math.acos(cosine) / 3.0
+    least = mean + 2.0 * spread * math.cos(angle + 2.0 * math.pi / 3.0)
+    largest = mean + 2.0 * spread * math.cos(angle)
+    return least, 3.0 * mean - least - largest, largest
+
+
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def _axis_of(
+    xx: float,
+    xy: float,
+    xz: float,
+    yy: float,
+    yz: float,
+    zz: float,
+    least: float,
+    found: FloatsOut,
+) -> None:
+    """Unit eigenvector (3,) of a symmetric matrix for a single root; as it was if there is none."""
     a, b, c_ = xx - least, yy - least, zz - least
     longest = 0.0
     for k in range(3):
@@ -301,6 +260,35 @@ def _bound(
     return high
 
 
+@compiled(is_inlined=True)
+def _least_square(
+    place: Floats, u: Floats, v: Floats, w: Floats, of: Floats, limit: float, least: FloatsOut
+) -> float:
+    """Least square of the distances of a place (4,) to others (N,) of another exposure, or a limit.
+
+    ``least``: (`AT_ONCE`,) for what is found on the way: so many are compared at once.
+    """
+    x, y, z, own = place[0], place[1], place[2], place[3]
+    least[:] = limit
+    whole = len(u) - len(u) % AT_ONCE
+    for first in range(0, whole, AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        a, b, c, other = u[part], v[part], w[part], of[part]
+        for k in range(AT_ONCE):
+            dx, dy, dz = a[k] - x, b[k] - y, c[k] - z
+            square = dx * dx + dy * dy + dz * dz
+            square = square if other[k] != own else math.inf
+            least[k] = square if square < least[k] else least[k]
+    best = limit
+    for m in range(whole, len(u)):
+        dx, dy, dz = u[m] - x, v[m] - y, w[m] - z
+        if of[m] != own:
+            best = min(best, dx * dx + dy * dy + dz * dz)
+    for k in range(AT_ONCE):
+        best = min(best, least[k])
+    return best
+
+
 @compiled()
 def nearest_others(
     asked: Table,
@@ -325,9 +313,15 @@ def nearest_others(
     nearest
         (S,) input: how far is looked; output: the distance where it is less.
     """
-    mask = len(slots) - 1
+    mask, columns = len(slots) - 1, np.ascontiguousarray(places.T)
+    u_, v_, w_, of = columns[0], columns[1], columns[2], columns[3]
+    least = np.zeros(AT_ONCE)
     for s in range(len(asked)):
         x, y, z, own = asked[s, 0], asked[s, 1], asked[s, 2], asked[s, 3]
+        if len(places) <= FEW_PLACES:
+            best = nearest[s] * nearest[s]
+            nearest[s] = math.sqrt(_least_square(asked[s], u_, v_, w_, of, best, least))
+            continue
         u, v, w = (x - low[0]) / width, (y - low[1]) / width, (z - low[2]) / width
         bin_x, bin_y, bin_z = math.floor(u), math.floor(v), math.floor(w)
         # of its bin's least far side
@@ -342,71 +336,15 @@ def nearest_others(
                     for k in range(-ring, ring + 1, step):
                         key = (bin_x + i + 1) << BIN_BITS | (bin_y + j + 1)
                         key = key << BIN_BITS | (bin_z + k + 1)
-                        row = slots[_slot_of(key, slots, bin_keys, mask)]
+                        row = slots[slot_of(key, slots, bin_keys, mask)]
                         if row < 0:
                             continue
                         for m in range(starts[row], starts[row + 1]):
-                            if places[m, 3] != own:
-                                dx, dy, dz = places[m, 0] - x, places[m, 1] - y, places[m, 2] - z
+                            if of[m] != own:
+                                dx, dy, dz = u_[m] - x, v_[m] - y, w_[m] - z
                                 best = min(best, dx * dx + dy * dy + dz * dz)
             ring += 1
         nearest[s] = math.sqrt(best)
-
-
-@compiled()
-def drop_hidden(
-    asked: Table, first: Ints, stop: Ints, places: Table, looked_at: int, nearest: FloatsOut
-) -> None:
-    """Infinite distances of places that as many of their own exposure, or more, are nearer to.
-
-    ``asked``: (S, 4). ``first``, ``stop``: (S,) rows of its own exposure in ``places`` (M, 4).
-    ``looked_at``: The place itself is counted. ``nearest``: (S,) of `nearest_others`.
-    """
-    for s in range(len(asked)):
-        nearer, square = 0, nearest[s] * nearest[s]
-        for m in range(first[s], stop[s]):
-            dx, dy, dz = (
-                places[m, 0] - asked[s, 0],
-                places[m, 1] - asked[s, 1],
-                places[m, 2] - asked[s, 2],
-            )
-            nearer += 1 if dx * dx + dy * dy + dz * dz < square else 0
-        if nearer >= looked_at:
-            nearest[s] = math.inf
-
-
-@compiled()
-def first_in_cells(
-    points: Table,
-    exposure: Ints,
-    low: Floats,
-    size: float,
-    slots: IntsOut,
-    keys: IntsOut,
-    rows: IntsOut,
-) -> int:
-    """Rows of the first point of each cell of each exposure, rising.
-
-    ``points``: (N, 3), none below ``low`` (3,). ``exposure``: (N,). ``size``: Width of a cell.
-    ``slots``: (S,) of -1, S a power of two of at least 2 N. ``keys``: (N,) for what is found.
-    ``rows``: (N,) output. Returns how many rows there are.
-    """
-    mask, count = len(slots) - 1, 0
-    for n in range(len(points)):
-        key = 0
-        for k in range(3):
-            key = key << BIN_BITS | int((points[n, k] - low[k]) / size)
-        mixed = (key + exposure[n] * SPREAD) * SPREAD
-        slot = (mixed ^ (mixed >> 29)) & mask
-        row = slots[slot]
-        while row >= 0 and (keys[row] != key or exposure[rows[row]] != exposure[n]):
-            slot = (slot + 1) & mask
-            row = slots[slot]
-        if row < 0:
-            slots[slot] = count
-            keys[count], rows[count] = key, n
-            count += 1
-    return count
 
 
 @compiled(error_model="numpy")
@@ -439,23 +377,33 @@ def quadric_offsets(
         and the inverse normal matrix's element of that distance, and distance of the asked point
         from the points' middle over the radius; -1 where they lie on one line.
     """
-    near, kept = np.zeros((len(rows), 4)), np.zeros(len(rows), np.int64)
-    seen = np.zeros(int(limits[0]) + 1)
-    matrix, axes = np.zeros((3, 3)), np.zeros((3, 3))
-    gram, side = np.zeros((6, 6)), np.zeros((3, 6))
+    # of one place more than there are rows: what is not kept is written, too
+    offsets, kept = np.zeros((5, len(rows) + 1)), np.zeros(len(rows) + 1, np.int64)
+    x, y, z, square = offsets[0], offsets[1], offsets[2], offsets[3]
+    places = np.ascontiguousarray(rows.T)
+    seen, axes = np.zeros(int(limits[0]) + 1), np.zeros((3, 3))
+    scratch, spans = np.zeros((14, 6)), np.zeros(2 * BINS_ABOUT, np.int64)
+    last_x, last_y, last_z, n_spans = -1, -1, -1, 0
     for n in range(len(asked)):
         found[n, 0] = 0.0
+        bin_x = math.floor((asked[n, 0] - low[0]) / radius) + 1
+        bin_y = math.floor((asked[n, 1] - low[1]) / radius) + 1
+        bin_z = math.floor((asked[n, 2] - low[2]) / radius) + 1
+        if bin_x != last_x or bin_y != last_y or bin_z != last_z:
+            n_spans = _spans_about(bin_x, bin_y, bin_z, slots, bin_keys, starts, spans)
+            last_x, last_y, last_z = bin_x, bin_y, bin_z
         count = _nearest_rows(
-            asked[n, 0], asked[n, 1], asked[n, 2], low, radius, slots, bin_keys, starts, rows,
-            int(limits[0]), near, kept,
-        )  # fmt: skip
+            asked[n], radius, places, spans[: 2 * n_spans], int(limits[0]), offsets, kept
+        )
+        if count < limits[1]:
+            continue
         inside, n_seen, least, first = 0, 0, math.inf, -1
         for c in range(count):
             exposure = rows[kept[c], 3]
             if exposure == asked[n, 3]:
                 continue
-            if near[c, 3] < least:
-                least, first = near[c, 3], kept[c]
+            if square[c] < least:
+                least, first = square[c], kept[c]
             is_new = True
             for k in range(n_seen):
                 if seen[k] == exposure:
@@ -464,157 +412,281 @@ def quadric_offsets(
             if is_new:
                 seen[n_seen] = exposure
                 n_seen += 1
-            for k in range(3):
-                near[inside, k] = near[c, k]
+            x[inside], y[inside], z[inside] = x[c], y[c], z[c]
             inside += 1
         if inside >= limits[1] and n_seen >= limits[2]:
             found[n, 0], found[n, 1] = 1.0, rows[first, 4]
-            _fit_quadric(near, inside, radius, limits[3], matrix, axes, gram, side, found[n])
+            own = found[n]
+            _fit_quadric(x, y, z, inside, radius, limits[3], axes, scratch, own)
+
+
+BINS_ABOUT = 27
+"""A bin, and all that touch it."""
+SECANTS = 20
+"""Steps that seek a bound by how a surface fills; where they end without, it is halved."""
 
 
 @compiled()
-def _nearest_rows(
-    x: float,
-    y: float,
-    z: float,
-    low: Floats,
-    radius: float,
+def _spans_about(
+    bin_x: int,
+    bin_y: int,
+    bin_z: int,
     slots: Ints,
     bin_keys: Ints,
     starts: Ints,
-    rows: Table,
-    most: int,
-    near: TableOut,
-    kept: IntsOut,
+    spans: IntsOut,
 ) -> int:
-    """Count of the nearest rows within the radius: their offsets, squares and numbers."""
+    """First row and row after the last of each bin about one, one pair after another.
+
+    Returns how many pairs there are.
+    """
     mask, count = len(slots) - 1, 0
-    bin_x = math.floor((x - low[0]) / radius) + 1
-    bin_y = math.floor((y - low[1]) / radius) + 1
-    bin_z = math.floor((z - low[2]) / radius) + 1
     for i in range(bin_x - 1, bin_x + 2):
         for j in range(bin_y - 1, bin_y + 2):
             for k in range(bin_z - 1, bin_z + 2):
                 key = (i << BIN_BITS | j) << BIN_BITS | k
-                row = slots[_slot_of(key, slots, bin_keys, mask)]
-                if row < 0:
-                    continue
-                for m in range(starts[row], starts[row + 1]):
-                    dx, dy, dz = rows[m, 0] - x, rows[m, 1] - y, rows[m, 2] - z
-                    square = dx * dx + dy * dy + dz * dz
-                    if square < radius * radius:
-                        near[count, 0], near[count, 1], near[count, 2] = dx, dy, dz
-                        near[count, 3] = square
-                        kept[count] = m
-                        count += 1
+                row = slots[slot_of(key, slots, bin_keys, mask)]
+                if row >= 0:
+                    spans[2 * count], spans[2 * count + 1] = starts[row], starts[row + 1]
+                    count += 1
+    return count
+
+
+@compiled()
+def _nearest_rows(
+    place: Floats,
+    radius: float,
+    places: Table,
+    spans: Ints,
+    most: int,
+    offsets: TableOut,
+    kept: IntsOut,
+) -> int:
+    """Count of the nearest rows within the radius: their offsets and squares, and numbers.
+
+    ``places``: (>= 3, M). ``spans``: Of `_spans_about`. ``offsets``: (5, M + 1) of which the
+    last one is scratch.
+    """
+    x, y, z, square, apart = offsets[0], offsets[1], offsets[2], offsets[3], offsets[4]
+    limit, count = radius * radius, 0
+    for s in range(0, len(spans), 2):
+        first, stop = spans[s], spans[s + 1]
+        u, v, w = places[0, first:stop], places[1, first:stop], places[2, first:stop]
+        for k in range(stop - first):
+            dx, dy, dz = u[k] - place[0], v[k] - place[1], w[k] - place[2]
+            apart[k] = dx * dx + dy * dy + dz * dz
+        for k in range(stop - first):
+            square[count], kept[count] = apart[k], first + k
+            count += 1 if apart[k] < limit else 0
+    for c in range(count):
+        m = kept[c]
+        x[c], y[c], z[c] = places[0, m] - place[0], places[1, m] - place[1], places[2, m] - place[2]
     if count <= most:
         return count
-    # halved until so many lie below it; a library's selection takes seconds to compile
-    low_square, bound = 0.0, radius * radius
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low_square + bound)
-        inside = 0
-        for c in range(count):
-            inside += 1 if near[c, 3] < middle else 0
-        if inside < most:
-            low_square = middle
-        else:
-            bound = middle
-        if inside == most:
-            break
+    bound = _nearest_bound(square[:count], radius * radius, most)
     inside = 0
     for c in range(count):
-        if near[c, 3] < bound and inside < most:
-            for k in range(4):
-                near[inside, k] = near[c, k]
-            kept[inside] = kept[c]
-            inside += 1
+        if inside == most:
+            break
+        x[inside], y[inside], z[inside], square[inside] = x[c], y[c], z[c], square[c]
+        kept[inside] = kept[c]
+        inside += 1 if square[inside] < bound else 0
     return inside
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", fastmath=FUSED)
+def _nearest_bound(squares: Floats, largest: float, most: int) -> float:
+    """A number below which ``most`` of the squares lie, or, of equal ones, as few more as can be.
+
+    All lie below ``largest``, and there are more of them.
+    """
+    low, high, guess = 0.0, largest, largest * (most + 0.5) / len(squares)
+    for step in range(SECANTS + HALVINGS):
+        inside = 0.0
+        for c in range(len(squares)):
+            inside += 1.0 if squares[c] < guess else 0.0
+        if inside == most:
+            return guess
+        if inside < most:
+            low = guess
+        else:
+            high = guess
+        wanted = middle = 0.5 * (low + high)
+        if step < SECANTS:
+            wanted = guess * (most + 0.5) / max(inside, 1.0)
+        reach = 0.25 * (high - low)
+        guess = min(max(wanted, middle - reach), middle + reach)
+    return high
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
 def _fit_quadric(
-    near: TableOut,
+    x: FloatsOut,
+    y: FloatsOut,
+    z: FloatsOut,
     count: int,
     radius: float,
     ridge: float,
-    matrix: TableOut,
     axes: TableOut,
-    gram: TableOut,
-    side: TableOut,
+    scratch: TableOut,
     found: FloatsOut,
 ) -> None:
-    """What `quadric_offsets` says of a point, from offsets of the points near it."""
-    mean, terms = side[0], side[1]
+    """What `quadric_offsets` says of a point, from offsets (N,) of the points near it.
+
+    ``axes``: (3, 3), and ``scratch``: (14, 6), for what is found on the way.
+    """
+    is_wide = _principal_rows(x, y, z, count, axes)
+    _turn_offsets(x, y, z, count, 1.0 / radius, axes)
+    gram, side = scratch[:6], scratch[6]
+    _sum_terms(x, y, z, count, gram, side)
+    inverse = _solve_terms(gram, side, ridge, scratch[7:])
+    a, b, c, d, e, f = side[0], side[1], side[2], side[3], side[4], side[5]
+    left = 0.0
+    for k in range(count):
+        u, v = x[k], y[k]
+        apart = z[k] - (a + b * u + c * v + d * u * u + e * u * v + f * v * v)
+        left += apart * apart
+    found[2] = -a
+    for k in range(3):
+        found[3 + k] = axes[2, k]
+    found[6], found[7] = math.sqrt(left / max(count - 6.0, 1.0)), inverse
+    found[8] = math.hypot(gram[1, 0], gram[2, 0]) / count if is_wide else -1.0
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def _principal_rows(x: Floats, y: Floats, z: Floats, count: int, axes: TableOut) -> bool:
+    """Unit axes (3, 3), row by row, along which offsets from their mean vary most and least.
+
+    True where they do not lie on one line.
+    """
+    sx = sy = sz = 0.0
+    for c in range(count):
+        sx += x[c]
+        sy += y[c]
+        sz += z[c]
+    sx, sy, sz = sx / count, sy / count, sz / count
+    xx = xy = xz = yy = yz = zz = 0.0
+    for c in range(count):
+        dx, dy, dz = x[c] - sx, y[c] - sy, z[c] - sz
+        xx += dx * dx
+        xy += dx * dy
+        xz += dx * dz
+        yy += dy * dy
+        yz += dy * dz
+        zz += dz * dz
+    axis, first, second = axes[2], axes[0], axes[1]
+    least, middle, largest = _spreads(xx, xy, xz, yy, yz, zz)
+    axis[0], axis[1], axis[2] = 0.0, 0.0, 1.0
+    _axis_of(xx, xy, xz, yy, yz, zz, least, axis)
+    # any two axes across the least one, turned by what the scatter between them asks for
+    p, q = 0, 1
+    if axis[2] * axis[2] > axis[0] * axis[0]:
+        p, q = 1, 2
+    first[0] = first[1] = first[2] = 0.0
+    first[q], first[p] = axis[p], -axis[q]
+    length = 1.0 / math.sqrt(axis[p] * axis[p] + axis[q] * axis[q])
+    for k in range(3):
+        first[k] *= length
+    second[0] = axis[1] * first[2] - axis[2] * first[1]
+    second[1] = axis[2] * first[0] - axis[0] * first[2]
+    second[2] = axis[0] * first[1] - axis[1] * first[0]
+    ax = xx * first[0] + xy * first[1] + xz * first[2]
+    ay = xy * first[0] + yy * first[1] + yz * first[2]
+    az = xz * first[0] + yz * first[1] + zz * first[2]
+    off = ax * second[0] + ay * second[1] + az * second[2]
+    own = ax * first[0] + ay * first[1] + az * first[2]
+    half = own - 0.5 * (middle + largest)
+    size = math.sqrt(half * half + off * off)
+    if size > 0.0:
+        # of half of the angle, from where nothing cancels
+        cosine = math.sqrt(0.5 * (1.0 + abs(half) / size))
+        sine = 0.5 * off / (size * cosine)
+        if half < 0.0:
+            cosine, sine = abs(sine), math.copysign(cosine, off)
+        for k in range(3):
+            along, across = first[k], second[k]
+            first[k] = cosine * along + sine * across
+            second[k] = cosine * across - sine * along
+    return bool(middle > WIDE * largest)
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def _turn_offsets(
+    x: FloatsOut, y: FloatsOut, z: FloatsOut, count: int, share: float, axes: Table
+) -> None:
+    """Offsets along the rows of ``axes`` (3, 3), times a share."""
+    ux, uy, uz = share * axes[0, 0], share * axes[0, 1], share * axes[0, 2]
+    vx, vy, vz = share * axes[1, 0], share * axes[1, 1], share * axes[1, 2]
+    wx, wy, wz = share * axes[2, 0], share * axes[2, 1], share * axes[2, 2]
+    for c in range(count):
+        dx, dy, dz = x[c], y[c], z[c]
+        x[c] = ux * dx + uy * dy + uz * dz
+        y[c] = vx * dx + vy * dy + vz * dz
+        z[c] = wx * dx + wy * dy + wz * dz
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def _sum_terms(
+    u: Floats, v: Floats, w: Floats, count: int, gram: TableOut, side: FloatsOut
+) -> None:
+    """Products of the terms 1, u, v, u^2, u v, v^2 with each other, the lower half, and with w."""
+    u1 = v1 = u2 = uv = v2 = u3 = u2v = uv2 = v3 = u4 = u3v = u2v2 = uv3 = v4 = 0.0
+    w1 = uw = vw = u2w = uvw = v2w = 0.0
+    for c in range(count):
+        uu, mixed, vv = u[c] * u[c], u[c] * v[c], v[c] * v[c]
+        u1 += u[c]
+        v1 += v[c]
+        u2 += uu
+        uv += mixed
+        v2 += vv
+        u3 += uu * u[c]
+        u2v += uu * v[c]
+        uv2 += vv * u[c]
+        v3 += vv * v[c]
+        u4 += uu * uu
+        u3v += uu * mixed
+        u2v2 += uu * vv
+        uv3 += vv * mixed
+        v4 += vv * vv
+        w1 += w[c]
+        uw += u[c] * w[c]
+        vw += v[c] * w[c]
+        u2w += uu * w[c]
+        uvw += mixed * w[c]
+        v2w += vv * w[c]
+    gram[0, 0], gram[1, 0], gram[2, 0] = count, u1, v1
+    gram[1, 1], gram[2, 1], gram[2, 2] = u2, uv, v2
+    gram[3, 0], gram[4, 0], gram[5, 0] = u2, uv, v2
+    gram[3, 1], gram[4, 1], gram[5, 1] = u3, u2v, uv2
+    gram[3, 2], gram[4, 2], gram[5, 2] = u2v, uv2, v3
+    gram[3, 3], gram[4, 3], gram[5, 3] = u4, u3v, u2v2
+    gram[4, 4], gram[5, 4], gram[5, 5] = u2v2, uv3, v4
+    side[0], side[1], side[2], side[3], side[4], side[5] = w1, uw, vw, u2w, uvw, v2w
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def _solve_terms(gram: Table, side: FloatsOut, ridge: float, factor: TableOut) -> float:
+    """Solve for (6,) in place; returns the first element of the inverse.
+
+    ``gram``: (6, 6) of which the lower half counts; ``ridge`` is added to its diagonal.
+    ``factor``: (7, 6) for Cholesky's, and the solution of it for the first unit vector.
+    """
     for i in range(6):
-        mean[i] = side[2, i] = 0.0
-        for j in range(6):
-            gram[i, j] = 0.0
-    for i in range(3):
-        for j in range(3):
-            matrix[i, j] = 0.0
-    for c in range(count):
-        for i in range(3):
-            mean[i] += near[c, i] / count
-    for c in range(count):
-        for i in range(3):
-            for j in range(3):
-                matrix[i, j] += (near[c, i] - mean[i]) * (near[c, j] - mean[j])
-    principal_axes(matrix, axes)
-    low, high = 0, 0
-    for k in range(1, 3):
-        low = k if matrix[k, k] < matrix[low, low] else low
-        high = k if matrix[k, k] >= matrix[high, high] else high
-    middle = 3 - low - high
-    sum_u = sum_v = 0.0
-    for c in range(count):
-        u = v = w = 0.0
-        for i in range(3):
-            u += near[c, i] * axes[i, high] / radius
-            v += near[c, i] * axes[i, middle] / radius
-            w += near[c, i] * axes[i, low] / radius
-        near[c, 0], near[c, 1], near[c, 2] = u, v, w
-        sum_u, sum_v = sum_u + u, sum_v + v
-        _put_terms(u, v, terms)
-        for i in range(6):
-            side[2, i] += terms[i] * w
-            for j in range(i + 1):
-                gram[i, j] += terms[i] * terms[j]
-    # Cholesky's factor; `mean` becomes the solution of it for the first unit vector
-    for i in range(6):
-        gram[i, i] += ridge
         for j in range(i + 1):
-            rest = gram[i, j]
+            rest = gram[i, j] + (ridge if i == j else 0.0)
             for k in range(j):
-                rest -= gram[i, k] * gram[j, k]
-            gram[i, j] = math.sqrt(rest) if i == j else rest / gram[j, j]
-        mean[i] = 1.0 if i == 0 else 0.0
+                rest -= factor[i, k] * factor[j, k]
+            factor[i, j] = math.sqrt(rest) if i == j else rest / factor[j, j]
+        first = 1.0 if i == 0 else 0.0
         for k in range(i):
-            mean[i] -= gram[i, k] * mean[k]
-            side[2, i] -= gram[i, k] * side[2, k]
-        mean[i] /= gram[i, i]
-        side[2, i] /= gram[i, i]
+            first -= factor[i, k] * factor[6, k]
+            side[i] -= factor[i, k] * side[k]
+        factor[6, i] = first / factor[i, i]
+        side[i] /= factor[i, i]
     inverse = 0.0
     for i in range(5, -1, -1):
-        inverse += mean[i] * mean[i]
+        inverse += factor[6, i] * factor[6, i]
         for k in range(i + 1, 6):
-            side[2, i] -= gram[k, i] * side[2, k]
-        side[2, i] /= gram[i, i]
-    left = 0.0
-    for c in range(count):
-        _put_terms(near[c, 0], near[c, 1], terms)
-        apart = near[c, 2]
-        for i in range(6):
-            apart -= terms[i] * side[2, i]
-        left += apart * apart
-    is_wide = matrix[middle, middle] > WIDE * matrix[high, high]
-    found[2] = -side[2, 0]
-    for i in range(3):
-        found[3 + i] = axes[i, low]
-    found[6], found[7] = math.sqrt(left / max(count - 6.0, 1.0)), inverse
-    found[8] = math.hypot(sum_u, sum_v) / count if is_wide else -1.0
-
-
-@compiled(is_inlined=True)
-def _put_terms(u: float, v: float, terms: FloatsOut) -> None:
-    terms[0], terms[1], terms[2], terms[3], terms[4], terms[5] = 1.0, u, v, u * u, u * v, v * v
+            side[i] -= factor[k, i] * side[k]
+        side[i] /= factor[i, i]
+    return inverse

@@ -119,6 +119,28 @@ def _meet_alone(along: Floats, across: Floats, surface: Floats, gain: TableOut) 
         gain[a, 2] = 0.0
 
 
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def _add_rows(shares: Floats, rows: Floats, width: int, moved: FloatsOut) -> None:
+    """Weighted sum (``width``,) of rows that begin every `N_SENSOR` numbers, three at a time.
+
+    One at a time, each would wait for the sums of the one before to be written.
+    """
+    for d in range(width):
+        moved[d] = 0.0
+    whole = len(shares) - len(shares) % 3
+    for c in range(0, whole, 3):
+        one, two, three = shares[c], shares[c + 1], shares[c + 2]
+        first = rows[N_SENSOR * c : N_SENSOR * c + width]
+        second = rows[N_SENSOR * (c + 1) : N_SENSOR * (c + 1) + width]
+        third = rows[N_SENSOR * (c + 2) : N_SENSOR * (c + 2) + width]
+        for d in range(width):
+            moved[d] += one * first[d] + two * second[d] + three * third[d]
+    for c in range(whole, len(shares)):
+        row = rows[N_SENSOR * c : N_SENSOR * c + width]
+        for d in range(width):
+            moved[d] += shares[c] * row[d]
+
+
 @compiled(error_model="numpy", fastmath=FUSED)
 def _covariance_of_distances(
     own: Floats, covariance: Floats, moved: FloatsOut, found: TableOut
@@ -128,13 +150,7 @@ def _covariance_of_distances(
     ``own``: (41,) derivatives by the sensor. ``covariance``: (1024,) of its parameters. ``moved``:
     (32,) is written to.
     """
-    for d in range(N_SENSOR):
-        moved[d] = 0.0
-    for c in range(N_CAMERA):
-        share = own[ACROSS + c]
-        row = covariance[N_SENSOR * c : N_SENSOR * c + N_SENSOR]
-        for d in range(N_SENSOR):
-            moved[d] += share * row[d]
+    _add_rows(own[ACROSS : ACROSS + N_CAMERA], covariance, N_SENSOR, moved)
     both = beside = sheet = 0.0
     for d in range(N_CAMERA):
         both += moved[d] * own[ACROSS + d]
@@ -146,13 +162,8 @@ def _covariance_of_distances(
     found[0, 1] = found[1, 0] = beside
     found[0, 2] = found[2, 0] = sheet
     # of the other two distances only what is not known yet
-    for d in range(24):
-        moved[8 + d] = 0.0
-    for c in range(N_SECOND):
-        share = own[RIGHT + c]
-        row = covariance[N_SENSOR * (17 + c) + 8 : N_SENSOR * (17 + c) + 32]
-        for d in range(24):
-            moved[8 + d] += share * row[d]
+    from_sheet = N_SENSOR * (N_CAMERA + N_SHEET) + N_CAMERA - 1
+    _add_rows(own[RIGHT : RIGHT + N_SECOND], covariance[from_sheet:], 24, moved[8:])
     both = sheet = 0.0
     for d in range(N_SECOND):
         both += moved[17 + d] * own[RIGHT + d]
@@ -160,13 +171,8 @@ def _covariance_of_distances(
         sheet += moved[9 + d] * own[SHEET + d]
     found[1, 1] = both
     found[1, 2] = found[2, 1] = sheet
-    for d in range(N_SHEET):
-        moved[d] = 0.0
-    for c in range(N_SHEET):
-        share = own[SHEET + c]
-        row = covariance[N_SENSOR * (9 + c) + 9 : N_SENSOR * (9 + c) + 17]
-        for d in range(N_SHEET):
-            moved[d] += share * row[d]
+    from_sheet = N_SENSOR * N_CAMERA + N_CAMERA
+    _add_rows(own[SHEET : SHEET + N_SHEET], covariance[from_sheet:], N_SHEET, moved)
     both = 0.0
     for d in range(N_SHEET):
         both += moved[d] * own[SHEET + d]

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measured points on grids: what a voxel adds up (weighted places, covariances, normals, counts),
-sums over cells that are numbered by one integer and found by hashing, and the heights of nodes.
+sums over cells that are numbered by one integer and found by hashing, points sorted into bins, and
+the heights of nodes.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ NOTHING = 1e-15
 """Off-diagonals below this part of the diagonal are rounding."""
 SPREAD = 0x2545F4914F6CDD1D
 """Odd multiplier of a linear congruential step (L'Ecuyer 1999): neighbouring numbers land apart."""
+BIN_BITS = 21
+"""Of the number of a bin along an axis, counted from 1 so that a neighbour has one as well."""
 JACOBI_SWEEPS = 6
 """Sweeps of a symmetric 3 x 3 matrix; three leave nothing but rounding (Golub and Van Loan 8.5)."""
 
@@ -289,3 +292,124 @@ def add_heights(
                     height = dx * normals[row, 0] + dy * normals[row, 1] + dz * normals[row, 2]
                     heights[node] += weight * height
                     totals[node] += weight
+
+
+@compiled()
+def first_in_cells(
+    points: Table,
+    exposure: Ints,
+    low: Floats,
+    size: float,
+    slots: IntsOut,
+    keys: IntsOut,
+    rows: IntsOut,
+) -> int:
+    """Rows of the first point of each cell of each exposure, rising.
+
+    ``points``: (N, 3), none below ``low`` (3,). ``exposure``: (N,). ``size``: Width of a cell.
+    ``slots``: (S,) of -1, S a power of two of at least 2 N. ``keys``: (N,) for what is found.
+    ``rows``: (N,) output. Returns how many rows there are.
+    """
+    mask, count = len(slots) - 1, 0
+    for n in range(len(points)):
+        key = 0
+        for k in range(3):
+            key = key << BIN_BITS | int((points[n, k] - low[k]) / size)
+        mixed = (key + exposure[n] * SPREAD) * SPREAD
+        slot = (mixed ^ (mixed >> 29)) & mask
+        row = slots[slot]
+        while row >= 0 and (keys[row] != key or exposure[rows[row]] != exposure[n]):
+            slot = (slot + 1) & mask
+            row = slots[slot]
+        if row < 0:
+            slots[slot] = count
+            keys[count], rows[count] = key, n
+            count += 1
+    return count
+
+
+@compiled()
+def sort_into_bins(
+    cells: Table,
+    low: Floats,
+    size: float,
+    slots: IntsOut,
+    bin_keys: IntsOut,
+    starts: IntsOut,
+    ordered: TableOut,
+) -> None:
+    """Put means of cells, or points, bin by bin, in their order within each bin.
+
+    Parameters
+    ----------
+    cells
+        (M, 3) places, or (M, K) with more numbers behind them.
+    low, size
+        (3,) lowest corner of all, and the width of a bin.
+    slots
+        (S,) of -1, becomes the hash table: row of the bin, S a power of two of at least 2 M.
+    bin_keys, starts
+        (M,) number of each bin, and (M + 1,) first of its means; the bins that there are.
+    ordered
+        (M, K) the same rows.
+    """
+    mask = len(slots) - 1
+    member = np.zeros(len(cells), np.int64)
+    count = 0
+    for m in range(len(cells)):
+        key = 0
+        for k in range(3):
+            key = key << BIN_BITS | int((cells[m, k] - low[k]) / size) + 1
+        slot = slot_of(key, slots, bin_keys, mask)
+        if slots[slot] < 0:
+            slots[slot] = count
+            bin_keys[count] = key
+            starts[count] = 0
+            count += 1
+        member[m] = slots[slot]
+        starts[slots[slot]] += 1
+    first = 0
+    for b in range(count):
+        size_of_bin = starts[b]
+        starts[b] = first
+        first += size_of_bin
+    for m in range(len(cells)):
+        row = starts[member[m]]
+        starts[member[m]] += 1
+        for k in range(cells.shape[1]):
+            ordered[row, k] = cells[m, k]
+    for b in range(count, 0, -1):
+        starts[b] = starts[b - 1]
+    starts[0] = 0
+
+
+@compiled(is_inlined=True)
+def slot_of(key: int, slots: Ints, keys: Ints, mask: int) -> int:
+    """Place of a number in a hash table, or the free one where it would go."""
+    mixed = key * SPREAD
+    slot = (mixed ^ (mixed >> 29)) & mask
+    while slots[slot] >= 0 and keys[slots[slot]] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@compiled()
+def drop_hidden(
+    asked: Table, first: Ints, stop: Ints, places: Table, looked_at: int, nearest: FloatsOut
+) -> None:
+    """Infinite distances of places that as many of their own exposure, or more, are nearer to.
+
+    ``asked``: (S, 4). ``first``, ``stop``: (S,) rows of its own exposure in ``places`` (M, 4).
+    ``looked_at``: The place itself is counted. ``nearest``: (S,) of `nearest_others`.
+    """
+    columns = np.ascontiguousarray(places.T)
+    for s in range(len(asked)):
+        nearer, square = 0, nearest[s] * nearest[s]
+        x, y, z = asked[s, 0], asked[s, 1], asked[s, 2]
+        span = slice(first[s], stop[s])
+        u, v, w = columns[0, span], columns[1, span], columns[2, span]
+        for m in range(len(u)):
+            dx, dy, dz = u[m] - x, v[m] - y, w[m] - z
+            nearer += 1 if dx * dx + dy * dy + dz * dz < square else 0
+        if nearer >= looked_at:
+            nearest[s] = math.inf

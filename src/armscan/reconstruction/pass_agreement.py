@@ -17,7 +17,8 @@ import numpy as np
 
 from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray, extents
 from armscan.geometry.least_squares import robust_sigma
-from armscan.kernels.faces import first_in_cells, quadric_offsets
+from armscan.kernels.faces import quadric_offsets
+from armscan.kernels.grids import first_in_cells
 from armscan.reconstruction.place import NeighbourBins, free_slots, spacings_mm
 
 PAUSE_PERIODS = 4.0

@@ -16,13 +16,9 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.shapes import fit_plane
-from armscan.kernels.faces import (
-    drop_hidden,
-    nearest_others,
-    sort_into_bins,
-    tangent_normals,
-)
+from armscan.kernels.faces import nearest_others, tangent_normals
 from armscan.kernels.fusing import carry_fused
+from armscan.kernels.grids import drop_hidden, sort_into_bins
 from armscan.kernels.placing import carry_stripe, propagate_points
 from armscan.models.calibration import (
     ArmNoise,
@@ -612,7 +608,7 @@ class NeighbourBins:
     cells
         (M, 3) means, bin by bin, or (M, K) with more numbers behind them.
     slots, keys, starts
-        As `armscan.kernels.faces.sort_into_bins` makes them.
+        As `armscan.kernels.grids.sort_into_bins` makes them.
     """
 
     low_mm: FloatArray

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from armscan.kernels.chains import middle_of_squares
 from armscan.kernels.stripe import column_runs, columns
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.records.profile import Profile
@@ -183,7 +184,7 @@ def test_means_along_chains_are_those_of_a_plain_sum() -> None:
     values, weight = rng.normal(size=(2, 40)), rng.random((2, 40)) + 0.1
     weight[0, 5:9], values[0, 5:9] = 0.0, np.nan
     start, mean = np.array([0, 17, 40]), np.zeros((2, 40))
-    columns.mean_along(values, weight, start, 3, mean)
+    column_runs.mean_along(values, weight, start, 3, mean)
     for row in range(2):
         for i in range(40):
             first, stop = (0, 17) if i < 17 else (17, 40)
@@ -200,28 +201,30 @@ def test_smoothing_is_a_local_quadratic_with_its_variance_slope_and_bend() -> No
     weights[0, :4], weights[1] = quadratic_weights(3)[3:], quadratic_weights(7)[7:]
     norm = (quadratic_weights(7) ** 2).sum()
     inflation = np.ones(2)
-    result = np.zeros((columns.SMOOTH_ROWS, 60))
+    result = np.zeros((column_runs.SMOOTH_ROWS, 60))
     given = (centre, np.full(60, 0.01), np.array([0, 60]), halves, weights, inflation)
-    columns.smooth_stretches(*given, 2.2, result)
-    np.testing.assert_allclose(result[columns.SMOOTHED], centre, atol=1e-9)
-    inner = slice(columns.TANGENT_HALF, 60 - columns.TANGENT_HALF)
-    np.testing.assert_allclose(result[columns.SLOPE, inner], (0.3 + 0.008 * x)[inner], atol=1e-9)
-    np.testing.assert_allclose(result[columns.BEND, inner], 0.008, atol=1e-9)
-    assert result[columns.SMOOTH_VARIANCE, 30] == pytest.approx(0.01 * norm)
-    assert result[columns.SMOOTH_VARIANCE, 1] == pytest.approx(0.01)
+    column_runs.smooth_stretches(*given, 2.2, result)
+    np.testing.assert_allclose(result[column_runs.SMOOTHED], centre, atol=1e-9)
+    inner = slice(column_runs.TANGENT_HALF, 60 - column_runs.TANGENT_HALF)
+    np.testing.assert_allclose(
+        result[column_runs.SLOPE, inner], (0.3 + 0.008 * x)[inner], atol=1e-9
+    )
+    np.testing.assert_allclose(result[column_runs.BEND, inner], 0.008, atol=1e-9)
+    assert result[column_runs.SMOOTH_VARIANCE, 30] == pytest.approx(0.01 * norm)
+    assert result[column_runs.SMOOTH_VARIANCE, 1] == pytest.approx(0.01)
 
     noisy = centre + np.random.default_rng(0).normal(0.0, 0.1, 60)
-    columns.smooth_stretches(noisy, *given[1:], 100.0, result)
+    column_runs.smooth_stretches(noisy, *given[1:], 100.0, result)
     fitted = np.polyval(np.polyfit(x[23:38], noisy[23:38], 2), 30.0)
-    assert result[columns.SMOOTHED, 30] == pytest.approx(fitted, abs=1e-9)
+    assert result[column_runs.SMOOTHED, 30] == pytest.approx(fitted, abs=1e-9)
 
 
 def test_a_bend_is_known_as_well_as_it_is_said() -> None:
     rng = np.random.default_rng(3)
-    half = columns.TANGENT_HALF
+    half = column_runs.TANGENT_HALF
     x = np.arange(-half, half + 1.0)
     bends = [2.0 * np.polyfit(x, rng.normal(size=len(x)), 2)[0] for _ in range(3000)]
-    assert np.var(bends) == pytest.approx(columns.BEND_VARIANCE, rel=0.1)
+    assert np.var(bends) == pytest.approx(column_runs.BEND_VARIANCE, rel=0.1)
 
 
 def test_faint_reflections_are_left_out() -> None:
@@ -239,15 +242,15 @@ def test_points_beside_worse_ones_do_not_state_their_own_variance_alone() -> Non
     weights = np.zeros((1, 4))
     weights[0] = quadratic_weights(3)[3:]
     variance = np.where(np.arange(40) < 20, 0.01, 1.0)
-    result = np.zeros((columns.SMOOTH_ROWS, 40))
+    result = np.zeros((column_runs.SMOOTH_ROWS, 40))
     stretch = np.array([0, 40])
-    columns.smooth_stretches(
+    column_runs.smooth_stretches(
         np.zeros(40), variance, stretch, np.array([3]), weights, np.ones(1), 2.2, result
     )
     full = quadratic_weights(3) ** 2
     for i in (10, 18, 19, 20, 30):
         expected = (full * variance[i - 3 : i + 4]).sum()
-        assert result[columns.SMOOTH_VARIANCE, i] == pytest.approx(expected)
+        assert result[column_runs.SMOOTH_VARIANCE, i] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("is_turned", [False, True])
@@ -272,3 +275,133 @@ def test_what_lacks_the_laser_colour_is_left_out() -> None:
     found = profile.points_px[profile.is_accepted, 1]
     assert len(found) > 280
     assert (found < 120.0).all()
+
+
+def drawn(rows: int, n: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.5, 4.0, (rows, n))
+
+
+def drawn_points(n: int) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    points = np.zeros((n, column_runs.POINT_COLUMNS), np.int32)
+    points[:, column_runs.POINT_COLUMN] = np.cumsum(rng.integers(1, 9, n))
+    points[:, column_runs.POINT_LOW] = rng.integers(10, 20, n)
+    points[:, column_runs.POINT_HIGH] = points[:, column_runs.POINT_LOW] + rng.integers(2, 15, n)
+    points[:, column_runs.POINT_BELOW] = rng.integers(1, 30, n)
+    points[:, column_runs.POINT_ABOVE] = rng.integers(1, 30, n)
+    points[:, column_runs.POINT_CHAIN] = np.arange(n) // 17
+    return points
+
+
+def test_sides_are_weighed_and_replaced_as_numpy_does() -> None:
+    n = 200
+    points, sigma, base = drawn_points(n), *drawn(2, n, 2)
+    first = drawn(columns.FIRST_ROWS, n, 3)
+    first[columns.N_SIDES, ::5] = 0.0
+    first[columns.AMPLITUDE, ::7] = 0.0
+    middle = 0.5 * (points[:, column_runs.POINT_LOW] + points[:, column_runs.POINT_HIGH])
+    first[columns.CENTRE] = middle + np.linspace(-9.0, 9.0, n)
+    weight = np.zeros((3, n))
+    columns.weigh_sides(first, points, sigma, 3.0, weight)
+    has_sides = first[columns.N_SIDES] > 0.0
+    np.testing.assert_array_equal(weight[0], first[columns.AMPLITUDE] ** 2)
+    for row, side in ((1, column_runs.POINT_BELOW), (2, column_runs.POINT_ABOVE)):
+        np.testing.assert_array_equal(weight[row], has_sides & (points[:, side] > 3.0 * sigma))
+    mean, height = drawn(3, n, 4), np.full(n, 7.0)
+    mean[0, ::3] = mean[1, ::4] = mean[2, ::6] = np.nan
+    found = first.copy()
+    columns.keep_means(mean, points, sigma, base, height, np.array([1.0, 3.0, 2.0]), found)
+    other = np.where(np.isnan(mean[2]), base, mean[2])
+    low_side = np.where(np.isnan(mean[1]), other, mean[1])
+    own = np.where(np.isfinite(mean[0]), np.clip(mean[0], 1.0, 3.0), sigma)
+    np.testing.assert_array_equal(found[columns.SIGMA], own)
+    np.testing.assert_array_equal(found[columns.LOW_SIDE], low_side)
+    expected = np.where(np.isnan(mean[2]), low_side, mean[2])
+    np.testing.assert_array_equal(found[columns.HIGH_SIDE], expected)
+    is_lost = (np.abs(first[columns.CENTRE] - middle) > 2.0 * sigma) | (first[0] == 0.0)
+    assert 0 < is_lost.sum() < n
+    expected = np.where(is_lost, middle, first[columns.CENTRE])
+    np.testing.assert_array_equal(found[columns.CENTRE], expected)
+    np.testing.assert_array_equal(found[columns.AMPLITUDE], np.where(is_lost, 7.0, first[0]))
+
+
+def test_near_lines_and_flags_are_those_of_numpy() -> None:
+    n = 400
+    points, fits, first = drawn_points(n), drawn(8, n, 5), drawn(6, n, 6)
+    steep, longest = drawn(1, n, 7)[0], 3.0 * drawn(1, n, 8)[0]
+    dips = (np.arange(n) % 11 == 0).astype(np.uint8)
+    near = np.zeros(n, np.uint8)
+    given = (fits, points, steep, longest, dips, np.array([6.0, 1.5, 1.1, 1.6]))
+    count = columns.mark_near(*given, near)
+    sigma = fits[columns.SIGMA]
+    length = points[:, column_runs.POINT_HIGH] - points[:, column_runs.POINT_LOW] + 1.0
+    sides = points[:, [column_runs.POINT_BELOW, column_runs.POINT_ABOVE]]
+    gap = sides.min(axis=1)
+    expected = ((gap <= sigma) | (gap + length < 6.0 * sigma)) & (fits[columns.AMPLITUDE] > 1.5)
+    expected |= (length > longest) | (sigma > 1.6 * 1.1 * steep) | (dips > 0)
+    np.testing.assert_array_equal(near, expected)
+    assert 0 < count == expected.sum() < n
+    fits[columns.N_CLIPPED, ::2] = 0.0
+    leans, flags = 20.0 * drawn(2, n, 9), np.zeros(n, np.int64)
+    limits, bits = np.array([0.4, 0.3, 0.5, 0.7, 2.0]), np.array([1, 2, 4, 8])
+    columns.flag_points(fits, first, leans, near, limits, bits, flags)
+    lean = np.abs(leans[0] - 0.3 * leans[1])
+    step = np.abs(first[columns.HIGH_SIDE] - first[columns.LOW_SIDE])
+    told = (
+        fits[columns.N_CLIPPED] > 0.0,
+        step > 0.4 * fits[columns.AMPLITUDE],
+        near > 0,
+        (lean > 2.0 * np.sqrt(leans[1])) & (lean > np.maximum(0.5, 0.7 / sigma) * leans[1]),
+    )
+    for bit, is_set in zip(bits, told, strict=True):
+        assert 0 < is_set.sum() < n
+        np.testing.assert_array_equal((flags & bit) > 0, is_set)
+
+
+@pytest.mark.parametrize("down", [0, 1])
+def test_smoothed_centres_become_points_as_in_numpy(down: int) -> None:
+    n = 120
+    rows = np.flatnonzero(np.arange(n) % 4 != 1)
+    smoothed, fits, variance = drawn(4, len(rows), 10), drawn(8, n, 11), drawn(1, len(rows), 12)[0]
+    found, slope, sigma, length = fits.copy(), *drawn(3, n, 13)
+    columns.keep_smoothed(rows, smoothed, 0.1 * variance, 1.5, found, slope, sigma, length)
+    bend, steep = smoothed[column_runs.BEND], smoothed[column_runs.SLOPE] ** 2
+    certain = np.maximum(1.0 - 0.1 * variance * column_runs.BEND_VARIANCE / bend**2, 0.0)
+    gain = (fits[columns.BEND_GAIN] * fits[columns.SIGMA] ** 2)[rows]
+    pull = 0.5 * gain * certain * bend * steep / (1.0 + steep) ** 2
+    expected = fits[columns.CENTRE].copy()
+    expected[rows] = smoothed[column_runs.SMOOTHED] - pull
+    np.testing.assert_allclose(found[columns.CENTRE], expected, rtol=1e-13)
+    np.testing.assert_allclose(sigma[rows] ** 2, smoothed[column_runs.SMOOTH_VARIANCE])
+    alike = np.maximum(0.15 * variance / smoothed[column_runs.SMOOTH_VARIANCE], 1.0)
+    np.testing.assert_allclose(length[rows], alike)
+    points = drawn_points(n)
+    at, normals, measures = (
+        np.zeros((len(rows), 2)),
+        np.zeros((len(rows), 2)),
+        drawn(3, len(rows), 1),
+    )
+    segment = np.zeros(len(rows), np.int64)
+    scales = np.array([1.0, 2.0, 3.0, 5.0])
+    given = (rows, points, found, slope, sigma, down, scales)
+    columns.write_points(*given, at, normals, measures, segment)
+    column, across = points[rows, column_runs.POINT_COLUMN], 1.0 / np.hypot(1.0, slope[rows])
+    np.testing.assert_array_equal(at[:, 1 - down], column)
+    np.testing.assert_array_equal(at[:, down], found[columns.CENTRE, rows])
+    np.testing.assert_allclose(normals[:, 1 - down], -slope[rows] * across)
+    np.testing.assert_allclose(normals[:, down], across)
+    np.testing.assert_allclose(measures[0], 2.0 * np.maximum(sigma[rows] * across, 1.0))
+    np.testing.assert_allclose(measures[1], 2.0 * found[columns.SIGMA, rows] * across)
+    np.testing.assert_allclose(measures[2], 3.0 * found[columns.AMPLITUDE, rows])
+    is_new = (np.diff(points[rows, column_runs.POINT_CHAIN]) != 0) | (np.diff(column) > 5)
+    np.testing.assert_array_equal(np.diff(segment), is_new)
+
+
+def test_the_middle_of_squares_is_that_of_sorted_values() -> None:
+    rng = np.random.default_rng(14)
+    for n in (1, 2, 3, 10, 501, 4000):
+        for values in (rng.uniform(0.0, 9.0, n), rng.integers(0, 4, n) + 0.5, rng.pareto(2.0, n)):
+            order = np.sort(values)
+            weight = np.cumsum(order * order)
+            expected = order[np.searchsorted(weight, 0.5 * weight[-1])]
+            assert middle_of_squares(np.array(values)) == expected

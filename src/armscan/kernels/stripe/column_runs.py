@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of lit pixels down the columns of an image, and the chains that they form."""
+"""Runs of lit pixels down the columns of an image, the chains that they form, and what holds along
+these: means, slopes, local quadratics.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,12 +16,14 @@ from numba.extending import intrinsic
 from armscan.kernels.arrays import (
     Bytes,
     BytesOut,
+    Floats,
     FloatsOut,
     Image,
     Ints,
     IntsOut,
     MapOut,
     Mask,
+    Table,
     TableOut,
     compiled,
 )
@@ -352,3 +357,203 @@ def measure_runs(
                     if points[m, POINT_CHAIN] == points[i, POINT_CHAIN]:
                         measured[RUN_DIPS, m] = 1.0
                 break
+
+
+@compiled(error_model="numpy")
+def mean_along(values: Table, weight: Table, start: Ints, half: int, mean: TableOut) -> None:
+    """Weighted means over the neighbours within ``half`` places of the same chain.
+
+    ``values``, ``weight``: (M, N); values of weight 0 may be NaN. ``start``: (C + 1,) of
+    `gather_chains`. ``mean``: (M, N) output, NaN where the weights sum to 0.
+    """
+    for row in range(values.shape[0]):
+        own, weights = values[row], weight[row]
+        for c in range(start.shape[0] - 1):
+            first, stop = start[c], start[c + 1]
+            total = norm = 0.0
+            for i in range(first, min(first + half, stop)):
+                total += weights[i] * own[i] if weights[i] > 0.0 else 0.0
+                norm += weights[i]
+            for i in range(first, stop):
+                ahead, behind = i + half, i - half - 1
+                if ahead < stop:
+                    total += weights[ahead] * own[ahead] if weights[ahead] > 0.0 else 0.0
+                    norm += weights[ahead]
+                if behind >= first:
+                    total -= weights[behind] * own[behind] if weights[behind] > 0.0 else 0.0
+                    norm -= weights[behind]
+                mean[row, i] = total / norm if norm > 1e-9 else np.nan
+
+
+@compiled(error_model="numpy")
+def slopes_along(centre: Floats, points: MapOut, start: Ints, half: int, slope: FloatsOut) -> None:
+    """Rows a column (N,) by which chains run, over ``half`` places to both sides.
+
+    ``centre``: (N,). ``points``: (N, 6). ``start``: (C + 1,) of `gather_chains`.
+    """
+    for c in range(start.shape[0] - 1):
+        for i in range(start[c], start[c + 1]):
+            low, high = max(i - half, start[c]), min(i + half, start[c + 1] - 1)
+            run = points[high, POINT_COLUMN] - points[low, POINT_COLUMN]
+            slope[i] = (centre[high] - centre[low]) / run if run > 0 else 0.0
+
+
+@compiled()
+def cut_stretches(points: MapOut, is_used: Bytes, rows: IntsOut, start: IntsOut) -> int:
+    """Rows of the points that are used, and where stretches of neighbouring columns begin.
+
+    ``points``: (N, 6). ``is_used``: (N,). ``rows``: (N,) output, of which as many count as are
+    used. ``start``: (N + 1,) output, one more than there are stretches.
+
+    Returns count of stretches.
+    """
+    n = count = 0
+    for i in range(points.shape[0]):
+        if is_used[i] == 0:
+            continue
+        is_next = n > 0 and rows[n - 1] == i - 1
+        if is_next:
+            is_next = points[i, POINT_COLUMN] == points[i - 1, POINT_COLUMN] + 1
+            is_next &= points[i, POINT_CHAIN] == points[i - 1, POINT_CHAIN]
+        if not is_next:
+            start[count] = n
+            count += 1
+        rows[n] = i
+        n += 1
+    start[count] = n
+    return count
+
+
+@compiled(error_model="numpy")
+def score_middles(
+    centre: Floats, variance: Floats, start: Ints, weights: Floats, score: FloatsOut
+) -> int:
+    """How many sigmas (N,) centres lie off what their neighbours alone say.
+
+    ``centre``, ``variance``, ``start``: As for `smooth_stretches`. ``weights``: (half + 1,) of a
+    local quadratic, from the middle on. ``score``: (N,) output; -1 where a stretch ends too near.
+    Returns count of the others.
+    """
+    half = weights.shape[0] - 1
+    share = 1.0 - weights[0]
+    total = 0.0
+    for way in range(1, half + 1):
+        total += 2.0 * weights[way] * weights[way]
+    count = 0
+    score[:] = -1.0
+    for s in range(start.shape[0] - 1):
+        for i in range(start[s] + half, start[s + 1] - half):
+            others = 0.0
+            for way in range(1, half + 1):
+                others += weights[way] * (centre[i + way] + centre[i - way])
+            spread = variance[i] * (1.0 + total / (share * share))
+            score[i] = abs(centre[i] - others / share) / math.sqrt(spread)
+            count += 1
+    return count
+
+
+SMOOTHED, SLOPE, BEND, SMOOTH_VARIANCE = range(4)
+TANGENT_HALF = 8
+"""Places to both sides by which the slope and the bend of a line are told."""
+_SPAN = 2.0 * TANGENT_HALF + 1.0
+BEND_VARIANCE = 720.0 / (_SPAN * (_SPAN**2 - 1.0) * (_SPAN**2 - 4.0))
+"""Of such a bend, over the variance of a centre."""
+SMOOTH_ROWS = 4
+"""Of smoothed stretches: centre, its slope and second derivative by the column, and variance."""
+
+
+@compiled(error_model="numpy", fastmath=True)
+def add_shifted(
+    values: Floats,
+    first: int,
+    stop: int,
+    way: int,
+    weight: float,
+    even: float,
+    total: FloatsOut,
+) -> None:
+    """Add ``weight`` times both neighbours at a distance to each of some totals.
+
+    ``even``: 1, or -1 where the one before is taken off the one after.
+    """
+    ahead, behind = values[first + way : stop + way], values[first - way : stop - way]
+    own = total[first:stop]
+    for k in range(own.shape[0]):
+        own[k] += weight * (ahead[k] + even * behind[k])
+
+
+@compiled(error_model="numpy")
+def smooth_stretches(
+    centre: Floats,
+    variance: Floats,
+    start: Ints,
+    halves: Ints,
+    weights: Table,
+    inflation: Floats,
+    confidence: float,
+    result: TableOut,
+) -> None:
+    """Local quadratics over columns that follow each other, as wide as their estimates agree.
+
+    The window grows while the intervals of ``confidence`` sigmas about the estimates of all smaller
+    ones have a place in common (Katkovnik 1999). Where a stretch ends nearer than a window reaches,
+    that window is left out.
+
+    ``centre``, ``variance``: (N,) of points; stretches are consecutive. ``start``: (S + 1,) where
+    each stretch begins. ``halves``: (K,) half windows, increasing. ``weights``: (K, H + 1) of the
+    quadratic's value, from the middle on. ``inflation``: (K,) variance that the estimate has over
+    that of points which err on their own. ``result``: (4, N) output.
+    """
+    n_windows, n = halves.shape[0], centre.shape[0]
+    total, spread, sums = np.zeros((n_windows, n)), np.zeros((n_windows, n)), np.zeros((2, n))
+    middle = TANGENT_HALF * (TANGENT_HALF + 1.0) / 3.0
+    for s in range(start.shape[0] - 1):
+        for k in range(n_windows):
+            half = halves[k]
+            first, stop = start[s] + half, start[s + 1] - half
+            if stop <= first:
+                break
+            for i in range(first, stop):
+                total[k, i] = weights[k, 0] * centre[i]
+                spread[k, i] = weights[k, 0] * weights[k, 0] * variance[i]
+            for way in range(1, half + 1):
+                share = weights[k, way]
+                add_shifted(centre, first, stop, way, share, 1.0, total[k])
+                add_shifted(variance, first, stop, way, share * share, 1.0, spread[k])
+        first, stop = start[s] + TANGENT_HALF, start[s + 1] - TANGENT_HALF
+        for way in range(1, TANGENT_HALF + 1):
+            if stop > first:
+                add_shifted(centre, first, stop, way, float(way), -1.0, sums[0])
+                add_shifted(centre, first, stop, way, way * way - middle, 1.0, sums[1])
+    norm = middle * (2.0 * TANGENT_HALF + 1.0)
+    bend_norm = middle * middle
+    for way in range(1, TANGENT_HALF + 1):
+        bend_norm += 2.0 * (way * way - middle) ** 2
+    for s in range(start.shape[0] - 1):
+        first, stop = start[s], start[s + 1]
+        for i in range(first, stop):
+            room = min(i - first, stop - 1 - i)
+            best, own = centre[i], variance[i]
+            low, high = -np.inf, np.inf
+            for k in range(n_windows):
+                if halves[k] > room:
+                    break
+                square = spread[k, i] * inflation[k]
+                reach = confidence * math.sqrt(square)
+                low, high = max(low, total[k, i] - reach), min(high, total[k, i] + reach)
+                if low > high:
+                    break
+                best, own = total[k, i], square
+            result[SMOOTHED, i] = best
+            result[SMOOTH_VARIANCE, i] = own
+            if room >= TANGENT_HALF:
+                result[SLOPE, i] = sums[0, i] / norm
+                result[BEND, i] = 2.0 * (sums[1, i] - middle * centre[i]) / bend_norm
+            else:
+                slope = lever = 0.0
+                low_end, high_end = max(i - TANGENT_HALF, first), min(i + TANGENT_HALF, stop - 1)
+                place = 0.5 * (low_end + high_end)
+                for m in range(low_end, high_end + 1):
+                    slope += (m - place) * centre[m]
+                    lever += (m - place) ** 2
+                result[SLOPE, i] = slope / lever if lever > 0.0 else 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stripe centres column by column: weighted sums across lines, and quadratics along them.
+"""Stripe centres column by column: weighted sums across lines, and what becomes of their results.
 
 Sixteen neighbouring columns of a chain are looked at together: their pixels lie beside each other
 in every row of the image, so that a row is read as a whole. Lines that run rather up and down are
@@ -18,6 +18,7 @@ from numba.extending import intrinsic
 
 from armscan.kernels.arrays import (
     Bytes,
+    BytesOut,
     Floats,
     FloatsOut,
     Image,
@@ -32,10 +33,17 @@ from armscan.kernels.arrays import (
     compiled,
 )
 from armscan.kernels.stripe.column_runs import (
+    BEND,
+    BEND_VARIANCE,
+    POINT_ABOVE,
+    POINT_BELOW,
     POINT_CHAIN,
     POINT_COLUMN,
     POINT_HIGH,
     POINT_LOW,
+    SLOPE,
+    SMOOTH_VARIANCE,
+    SMOOTHED,
 )
 from armscan.kernels.stripe.ridge import IS_PLAIN
 
@@ -163,34 +171,51 @@ MOST_WIDER = 4.0
 """Of a line's variance over that of the bell it is looked at through."""
 
 
-@compiled(error_model="numpy")
-def keep_moments(
-    sums: Row, lane: int, centre: float, sigma: float, base: float, i: int, result: TableOut
-) -> None:
-    """A line's amplitude, centre and sigma from its moments under a bell.
+@compiled(error_model="numpy", is_inlined=True)
+def weigh_moments(sums: Row, given: Floats, told: FloatsOut) -> None:
+    """Amplitude, centre and sigma of `LANES` lines from their moments under a bell.
 
     A Gaussian times the bell has the variance 1 / (1 / V + 1 / W), and its mean lies as far from
     the bell's middle as V / (V + W) of the line's centre: so the first steps of an iteration to the
     centre are left out. What the bell's own moments are over the pixels is in ``sums``.
+
+    ``given``: (3 `LANES`,) middle, sigma and background of the bells. ``told``: (6 `LANES`,)
+    output, rows of `FIRST_ROWS`.
     """
-    own, norm = float(sums[lane]), float(sums[3 * LANES + lane])
-    result[:, i] = 0.0
-    if own > 0.0 and norm > 0.0:
-        mean = sums[LANES + lane] / own
-        seen = sums[2 * LANES + lane] / own - mean * mean
-        bell = sums[4 * LANES + lane] / norm
+    one = np.float32(1.0)
+    for k in range(LANES):
+        is_lit = (sums[k] > 0.0) & (sums[3 * LANES + k] > 0.0)
+        own = sums[k] if is_lit else one
+        norm = sums[3 * LANES + k] if is_lit else one
+        mean = sums[LANES + k] / own
+        seen = sums[2 * LANES + k] / own - mean * mean
+        bell = sums[4 * LANES + k] / norm if is_lit else one
         line = seen * bell / max(bell - seen, bell / (1.0 + MOST_WIDER))
         line = max(line, 1.0 / MOST_WIDER)
-        result[CENTRE, i] = centre + sigma * mean * (bell + line) / bell
-        result[SIGMA, i] = sigma * math.sqrt(line)
-        result[AMPLITUDE, i] = own / (norm * math.sqrt(line / (bell + line)))
-    n_low, n_high = sums[5 * LANES + lane], sums[7 * LANES + lane]
-    result[LOW_SIDE, i] = base + sums[6 * LANES + lane] / n_low if n_low > 0.0 else np.nan
-    result[HIGH_SIDE, i] = base + sums[8 * LANES + lane] / n_high if n_high > 0.0 else np.nan
-    result[N_SIDES, i] = min(n_low, n_high)
+        centre = given[k] + given[LANES + k] * mean * (bell + line) / bell
+        height = own / (norm * math.sqrt(line / (bell + line)))
+        told[AMPLITUDE * LANES + k] = height if is_lit else 0.0
+        told[CENTRE * LANES + k] = centre if is_lit else 0.0
+        told[SIGMA * LANES + k] = given[LANES + k] * math.sqrt(line) if is_lit else 0.0
+    for k in range(LANES):
+        base = given[2 * LANES + k]
+        n_low, n_high = sums[5 * LANES + k], sums[7 * LANES + k]
+        low_side = base + sums[6 * LANES + k] / max(n_low, one)
+        high_side = base + sums[8 * LANES + k] / max(n_high, one)
+        told[LOW_SIDE * LANES + k] = low_side if n_low > 0.0 else np.nan
+        told[HIGH_SIDE * LANES + k] = high_side if n_high > 0.0 else np.nan
+        told[N_SIDES * LANES + k] = min(n_low, n_high)
 
 
-@compiled()
+@compiled(is_inlined=True)
+def keep_lanes(told: Floats, shift: int, n: int, first: int, result: TableOut) -> None:
+    """Take the numbers (R `LANES`,) of ``n`` lanes from one on to points of a table (R, N)."""
+    for row in range(result.shape[0]):
+        for k in range(n):
+            result[row, first + k] = told[row * LANES + shift + k]
+
+
+@compiled(error_model="numpy")
 def look_across(
     raw: Mask,
     image: Image,
@@ -210,6 +235,7 @@ def look_across(
     height, width = raw.shape if has_bytes else image.shape
     levels, lanes = np.zeros(LANES, np.float32), np.zeros(3 * LANES, np.float32)
     sums = np.zeros(N_FIRST_SUMS * LANES, np.float32)
+    given, told = np.zeros(3 * LANES), np.zeros(FIRST_ROWS * LANES)
     first = 0
     while first < points.shape[0]:
         n = count_lanes(points, first)
@@ -225,10 +251,12 @@ def look_across(
         top, bottom = max(math.floor(low), 0), min(math.ceil(high), height - 1)
         for lane in range(LANES):
             i = min(max(first + lane - shift, first), first + n - 1)
-            middle = 0.5 * (points[i, POINT_LOW] + points[i, POINT_HIGH])
-            lanes[lane] = np.float32(middle - top)
-            lanes[LANES + lane] = np.float32(1.0 / sigma[i])
-            lanes[2 * LANES + lane] = np.float32(base[i])
+            given[lane] = 0.5 * (points[i, POINT_LOW] + points[i, POINT_HIGH])
+            given[LANES + lane], given[2 * LANES + lane] = sigma[i], base[i]
+        for lane in range(LANES):
+            lanes[lane] = np.float32(given[lane] - top)
+            lanes[LANES + lane] = np.float32(1.0 / given[LANES + lane])
+            lanes[2 * LANES + lane] = np.float32(given[2 * LANES + lane])
         sums[:] = np.float32(0.0)
         for y in range(top, bottom + 1):
             if has_bytes:
@@ -236,11 +264,60 @@ def look_across(
             else:
                 copy_levels(image, y, left, levels)
             add_moments(levels, np.float32(y - top), lanes, sums)
-        for k in range(n):
-            i = first + k
-            middle = 0.5 * (points[i, POINT_LOW] + points[i, POINT_HIGH])
-            keep_moments(sums, k + shift, middle, sigma[i], base[i], i, result)
+        weigh_moments(sums, given, told)
+        keep_lanes(told, shift, n, first, result)
         first += n
+
+
+@compiled(error_model="numpy")
+def weigh_sides(
+    first: Table, points: MapOut, sigma: Floats, clear_sigmas: float, weight: TableOut
+) -> None:
+    """Weights (3, N) by which width and sides of `look_across` are averaged along the line.
+
+    ``first``: (6, N) of `look_across`. ``points``: (N, 6). ``sigma``: (N,) of the line, of which
+    so many must be free before another run, or a side has no weight.
+    """
+    for i in range(points.shape[0]):
+        height = max(first[AMPLITUDE, i], 0.0)
+        room = clear_sigmas * sigma[i]
+        has_sides = first[N_SIDES, i] > 0.0
+        weight[0, i] = height * height
+        weight[1, i] = 1.0 if has_sides and points[i, POINT_BELOW] > room else 0.0
+        weight[2, i] = 1.0 if has_sides and points[i, POINT_ABOVE] > room else 0.0
+
+
+@compiled(error_model="numpy")
+def keep_means(
+    mean: Table,
+    points: MapOut,
+    sigma: Floats,
+    base: Floats,
+    height: Floats,
+    limits: Floats,
+    first: TableOut,
+) -> None:
+    """Replace width and sides of points by what they are along the line, and what was not found.
+
+    A side that another line lights up takes the value of the other one.
+
+    ``mean``: (3, N) of sigma and sides, NaN where none counts. ``points``: (N, 6). ``sigma``,
+    ``base``, ``height``: (N,) expected sigma, background, and height of the runs. ``limits``: (3,)
+    least and largest sigma, and how far in sigmas a centre may lie from its run's middle.
+    ``first``: (6, N) of `look_across`, changed.
+    """
+    for i in range(points.shape[0]):
+        own, low_side, high_side = mean[0, i], mean[1, i], mean[2, i]
+        is_told = math.isfinite(own)
+        first[SIGMA, i] = min(max(own, limits[0]), limits[1]) if is_told else sigma[i]
+        other = base[i] if math.isnan(high_side) else high_side
+        low_side = other if math.isnan(low_side) else low_side
+        first[LOW_SIDE, i] = low_side
+        first[HIGH_SIDE, i] = low_side if math.isnan(high_side) else high_side
+        middle = 0.5 * (points[i, POINT_LOW] + points[i, POINT_HIGH])
+        is_off = abs(first[CENTRE, i] - middle) > limits[2] * sigma[i]
+        if is_off or first[AMPLITUDE, i] <= 0.0:
+            first[AMPLITUDE, i], first[CENTRE, i] = max(height[i], 1.0), middle
 
 
 @compiled(is_inlined=True)
@@ -252,20 +329,20 @@ def count_unclipped(clipped: Mask, y: int, x: int, counts: RowOut) -> None:
         counts[k] = zero if own[k] > 0 else one
 
 
-@compiled(is_inlined=True)
-def count_below(levels: Row, clip: np.float32, counts: RowOut) -> None:
-    """1 or 0 for each of `LANES` levels, of which those from ``clip`` on saturated."""
-    one, zero = np.float32(1.0), np.float32(0.0)
-    for k in range(LANES):
-        counts[k] = one if levels[k] < clip else zero
-
-
 @compiled(fastmath=True, error_model="numpy", is_inlined=True)
 def add_weighted(
-    levels: Row, counts: Row, y: np.float32, noise: Row, lanes: Row, sums: RowOut
+    levels: Row,
+    counts: Row,
+    clip: np.float32,
+    y: np.float32,
+    noise: Row,
+    lanes: Row,
+    sums: RowOut,
 ) -> None:
     """Add a row's pixels to the weighted sums of a Gauss-Newton step of centre and amplitude.
 
+    ``counts``: (`LANES`,) 0 for pixels that saturated, else 1. ``clip``: Level from which pixels
+    did so, too: asked apart, it would be written one by one, and reading the row would wait.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``lanes``: (5 `LANES`,) centre, 1 over sigma,
     amplitude, background at the centre, its rise a row. ``sums``: (10 `LANES`,) products of the
     derivatives by centre and log amplitude as 00 01 11, their right-hand side, residual times the
@@ -283,7 +360,8 @@ def add_weighted(
         behind = lanes[3 * LANES + k] + d * lanes[4 * LANES + k]
         r = levels[k] - behind - m
         is_line = one if uu < reach else zero
-        w = is_line * counts[k] / (square * m * m + linear * max(m + behind, zero) + constant)
+        count = counts[k] if levels[k] < clip else zero
+        w = is_line * count / (square * m * m + linear * max(m + behind, zero) + constant)
         j = m * u
         wj = w * j
         wm = w * m
@@ -297,46 +375,46 @@ def add_weighted(
         sums[6 * LANES + k] += wq * j
         sums[7 * LANES + k] += wq * j * (uu - three)
         sums[8 * LANES + k] += wj * m * uu * u
-        sums[9 * LANES + k] += is_line * (one - counts[k])
+        sums[9 * LANES + k] += is_line * (one - count)
 
 
 MOST_STEP = 0.7
 """Of a line's sigma, by which the second pass moves a centre at most: farther off it failed."""
 
 
-@compiled(error_model="numpy")
-def keep_step(sums: Row, lane: int, given: Table, i: int, result: TableOut) -> None:
-    """Take the step of one lane to point ``i``; variance 0 where it fails.
+@compiled(error_model="numpy", is_inlined=True)
+def take_step(sums: Row, given: Floats, told: FloatsOut) -> None:
+    """Steps of `LANES` lines; variance 0 where one fails.
 
-    ``given``, ``result``: As for `fit_columns`.
+    ``given``: (5 `LANES`,) amplitude, centre, sigma and sides. ``told``: (8 `LANES`,) output, rows
+    of `SECOND_ROWS`.
     """
-    h00, h01 = float(sums[lane]), float(sums[LANES + lane])
-    h11, b0 = float(sums[2 * LANES + lane]), float(sums[3 * LANES + lane])
-    b1, q0 = float(sums[4 * LANES + lane]), float(sums[6 * LANES + lane])
-    determinant = h00 * h11 - h01 * h01
-    result[:, i] = 0.0
-    sigma = given[SIGMA, i]
-    result[AMPLITUDE, i], result[CENTRE, i], result[SIGMA, i] = (
-        given[AMPLITUDE, i],
-        given[CENTRE, i],
-        sigma,
-    )
-    result[N_CLIPPED, i] = sums[9 * LANES + lane]
-    if not determinant > 0.0:
-        return
-    step = (h11 * b0 - h01 * b1) / determinant
-    if not abs(step) < MOST_STEP:
-        return
-    grown = (h00 * b1 - h01 * b0) / determinant
-    result[CENTRE, i] = given[CENTRE, i] + sigma * step
-    result[AMPLITUDE, i] = given[AMPLITUDE, i] * (1.0 + min(max(grown, -0.5), 1.0))
-    result[VARIANCE, i] = sigma * sigma * h11 / determinant
-    result[LEAN, i] = sums[5 * LANES + lane] - q0 / h00 * b0
-    result[LEAN_NORM, i] = max(sums[7 * LANES + lane] - q0 * q0 / h00, 0.0)
-    result[BEND_GAIN, i] = sums[8 * LANES + lane] / h00
+    one = np.float32(1.0)
+    for k in range(LANES):
+        h00, h01 = sums[k], sums[LANES + k]
+        h11, b0 = sums[2 * LANES + k], sums[3 * LANES + k]
+        b1, q0 = sums[4 * LANES + k], sums[6 * LANES + k]
+        height, centre, sigma = given[k], given[LANES + k], given[2 * LANES + k]
+        product = h00 * h11 - h01 * h01
+        is_definite = product > 0.0
+        determinant, own = product if is_definite else one, h00 if is_definite else one
+        step = (h11 * b0 - h01 * b1) / determinant
+        is_sound = is_definite & (abs(step) < MOST_STEP)
+        grown = (h00 * b1 - h01 * b0) / determinant
+        grown = height * (1.0 + min(max(grown, -0.5), 1.0))
+        lean = sums[5 * LANES + k] - q0 / own * b0
+        norm = max(sums[7 * LANES + k] - q0 * q0 / own, 0.0)
+        told[AMPLITUDE * LANES + k] = grown if is_sound else height
+        told[CENTRE * LANES + k] = centre + sigma * step if is_sound else centre
+        told[SIGMA * LANES + k] = sigma
+        told[VARIANCE * LANES + k] = sigma * sigma * h11 / determinant if is_sound else 0.0
+        told[LEAN * LANES + k] = lean if is_sound else 0.0
+        told[LEAN_NORM * LANES + k] = norm if is_sound else 0.0
+        told[BEND_GAIN * LANES + k] = sums[8 * LANES + k] / own if is_sound else 0.0
+        told[N_CLIPPED * LANES + k] = sums[9 * LANES + k]
 
 
-@compiled()
+@compiled(error_model="numpy")
 def fit_columns(
     raw: Mask,
     image: Image,
@@ -360,9 +438,10 @@ def fit_columns(
     has_bytes, has_mask = raw.shape[0] > 1, clipped.shape[0] > 1
     height, width = raw.shape if has_bytes else image.shape
     share, limit = np.float32(1.0 / unit), np.float32(clip)
-    levels, counts = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
+    levels, counts = np.zeros(LANES, np.float32), np.ones(LANES, np.float32)
     lanes = np.zeros(5 * LANES, np.float32)
     sums = np.zeros(N_SECOND_SUMS * LANES, np.float32)
+    own, told = np.zeros(5 * LANES), np.zeros(SECOND_ROWS * LANES)
     first = 0
     while first < points.shape[0]:
         n = count_lanes(points, first)
@@ -375,13 +454,16 @@ def fit_columns(
         top, bottom = max(math.floor(low), 0), min(math.ceil(high), height - 1)
         for lane in range(LANES):
             i = min(max(first + lane - shift, first), first + n - 1)
-            sides = given[HIGH_SIDE, i] - given[LOW_SIDE, i]
-            lanes[lane] = np.float32(given[CENTRE, i] - top)
-            lanes[LANES + lane] = np.float32(1.0 / given[SIGMA, i])
-            lanes[2 * LANES + lane] = np.float32(given[AMPLITUDE, i])
-            lanes[3 * LANES + lane] = np.float32(given[LOW_SIDE, i] + 0.5 * sides)
-            apart = (SIDE_FROM + SIDE_TO) * given[SIGMA, i]
-            lanes[4 * LANES + lane] = np.float32(sides / apart)
+            for row in range(N_SIDES):
+                own[row * LANES + lane] = given[row, i]
+        for lane in range(LANES):
+            low_side, sigma = own[LOW_SIDE * LANES + lane], own[SIGMA * LANES + lane]
+            sides = own[HIGH_SIDE * LANES + lane] - low_side
+            lanes[lane] = np.float32(own[CENTRE * LANES + lane] - top)
+            lanes[LANES + lane] = np.float32(1.0 / sigma)
+            lanes[2 * LANES + lane] = np.float32(own[AMPLITUDE * LANES + lane])
+            lanes[3 * LANES + lane] = np.float32(low_side + 0.5 * sides)
+            lanes[4 * LANES + lane] = np.float32(sides / ((SIDE_FROM + SIDE_TO) * sigma))
         sums[:] = np.float32(0.0)
         for y in range(top, bottom + 1):
             if has_bytes:
@@ -390,71 +472,73 @@ def fit_columns(
                 copy_levels(image, y, left, levels)
             if has_mask:
                 count_unclipped(clipped, y, left, counts)
-            else:
-                count_below(levels, limit, counts)
-            add_weighted(levels, counts, np.float32(y - top), noise, lanes, sums)
-        for k in range(n):
-            keep_step(sums, k + shift, given, first + k, result)
+            add_weighted(levels, counts, limit, np.float32(y - top), noise, lanes, sums)
+        take_step(sums, own, told)
+        keep_lanes(told, shift, n, first, result)
         first += n
 
 
 @compiled(error_model="numpy")
-def mean_along(values: Table, weight: Table, start: Ints, half: int, mean: TableOut) -> None:
-    """Weighted means over the neighbours within ``half`` places of the same chain.
+def mark_near(
+    fits: Table,
+    points: MapOut,
+    steep: Floats,
+    length: Floats,
+    dips: Bytes,
+    limits: Floats,
+    near: BytesOut,
+) -> int:
+    """Mark points that another line is so near to that it pulls the centre, or runs into this one.
 
-    ``values``, ``weight``: (M, N); values of weight 0 may be NaN. ``start``: (C + 1,) of
-    `gather_chains`. ``mean``: (M, N) output, NaN where the weights sum to 0.
+    ``fits``: (8, N) of `fit_columns`. ``points``: (N, 6). ``steep``, ``length``: (N,) length of the
+    line a column, and longest run of a line alone. ``dips``: (N,) of `measure_runs`. ``limits``:
+    (4,) sigmas that other runs must be away, least height of lines that noise does not part,
+    typical sigma across lines, and how many times as wide one may be. ``near``: (N,) output.
+    Returns count of them.
     """
-    for row in range(values.shape[0]):
-        own, weights = values[row], weight[row]
-        for c in range(start.shape[0] - 1):
-            first, stop = start[c], start[c + 1]
-            total = norm = 0.0
-            for i in range(first, min(first + half, stop)):
-                total += weights[i] * own[i] if weights[i] > 0.0 else 0.0
-                norm += weights[i]
-            for i in range(first, stop):
-                ahead, behind = i + half, i - half - 1
-                if ahead < stop:
-                    total += weights[ahead] * own[ahead] if weights[ahead] > 0.0 else 0.0
-                    norm += weights[ahead]
-                if behind >= first:
-                    total -= weights[behind] * own[behind] if weights[behind] > 0.0 else 0.0
-                    norm -= weights[behind]
-                mean[row, i] = total / norm if norm > 1e-9 else np.nan
-
-
-@compiled(error_model="numpy", fastmath=True)
-def add_shifted(
-    values: Floats,
-    first: int,
-    stop: int,
-    way: int,
-    weight: float,
-    even: float,
-    total: FloatsOut,
-) -> None:
-    """Add ``weight`` times both neighbours at a distance to each of some totals.
-
-    ``even``: 1, or -1 where the one before is taken off the one after.
-    """
-    ahead, behind = values[first + way : stop + way], values[first - way : stop - way]
-    own = total[first:stop]
-    for k in range(own.shape[0]):
-        own[k] += weight * (ahead[k] + even * behind[k])
+    count = 0
+    for i in range(points.shape[0]):
+        sigma = fits[SIGMA, i]
+        own = points[i, POINT_HIGH] - points[i, POINT_LOW] + 1.0
+        gap = min(points[i, POINT_BELOW], points[i, POINT_ABOVE])
+        # runs of faint lines fall apart by noise
+        is_beside = (gap <= sigma) | (gap + own < limits[0] * sigma)
+        is_beside &= fits[AMPLITUDE, i] > limits[1]
+        is_wide = (own > length[i]) | (sigma > limits[3] * (limits[2] * steep[i]))
+        is_near = is_beside | is_wide | (dips[i] > 0)
+        near[i] = is_near
+        count += 1 if is_near else 0
+    return count
 
 
 @compiled(error_model="numpy")
-def slopes_along(centre: Floats, points: MapOut, start: Ints, half: int, slope: FloatsOut) -> None:
-    """Rows a column (N,) by which chains run, over ``half`` places to both sides.
+def flag_points(
+    fits: Table,
+    first: Table,
+    leans: Table,
+    near: Bytes,
+    limits: Floats,
+    bits: Ints,
+    flags: IntsOut,
+) -> None:
+    """Set the flags (N,) of each point by itself.
 
-    ``centre``: (N,). ``points``: (N, 6). ``start``: (C + 1,) of `gather_chains`.
+    ``fits``: (8, N) of `fit_columns`. ``first``: (6, N) of the first pass. ``leans``: (2, N) sums
+    along the line of the skew's score and norm. ``near``: (N,) of `mark_near`. ``limits``: (5,)
+    step of the background over the amplitude, skew that all sections have in common, least skew,
+    the same times sigma, and how many sigmas are significant. ``bits``: (4,) of saturated, step,
+    neighbour, skew.
     """
-    for c in range(start.shape[0] - 1):
-        for i in range(start[c], start[c + 1]):
-            low, high = max(i - half, start[c]), min(i + half, start[c + 1] - 1)
-            run = points[high, POINT_COLUMN] - points[low, POINT_COLUMN]
-            slope[i] = (centre[high] - centre[low]) / run if run > 0 else 0.0
+    for i in range(flags.shape[0]):
+        step = abs(first[HIGH_SIDE, i] - first[LOW_SIDE, i])
+        norm = max(leans[1, i], 1e-12)
+        lean = abs(leans[0, i] - norm * limits[1])
+        least = max(limits[2], limits[3] / fits[SIGMA, i]) * norm
+        own = bits[0] if fits[N_CLIPPED, i] > 0.0 else 0
+        own |= bits[1] if step > limits[0] * fits[AMPLITUDE, i] else 0
+        own |= bits[2] if near[i] > 0 else 0
+        own |= bits[3] if (lean > limits[4] * math.sqrt(norm)) & (lean > least) else 0
+        flags[i] = own
 
 
 STEEPEST = 1.05
@@ -500,142 +584,73 @@ def mark_ends(
                 i += way
 
 
-@compiled()
-def cut_stretches(points: MapOut, is_used: Bytes, rows: IntsOut, start: IntsOut) -> int:
-    """Rows of the points that are used, and where stretches of neighbouring columns begin.
-
-    ``points``: (N, 6). ``is_used``: (N,). ``rows``: (N,) output, of which as many count as are
-    used. ``start``: (N + 1,) output, one more than there are stretches.
-
-    Returns count of stretches.
-    """
-    n = count = 0
-    for i in range(points.shape[0]):
-        if is_used[i] == 0:
-            continue
-        is_next = n > 0 and rows[n - 1] == i - 1
-        if is_next:
-            is_next = points[i, POINT_COLUMN] == points[i - 1, POINT_COLUMN] + 1
-            is_next &= points[i, POINT_CHAIN] == points[i - 1, POINT_CHAIN]
-        if not is_next:
-            start[count] = n
-            count += 1
-        rows[n] = i
-        n += 1
-    start[count] = n
-    return count
-
-
 @compiled(error_model="numpy")
-def score_middles(
-    centre: Floats, variance: Floats, start: Ints, weights: Floats, score: FloatsOut
-) -> int:
-    """How many sigmas (N,) centres lie off what their neighbours alone say.
-
-    ``centre``, ``variance``, ``start``: As for `smooth_stretches`. ``weights``: (half + 1,) of a
-    local quadratic, from the middle on. ``score``: (N,) output; -1 where a stretch ends too near.
-    Returns count of the others.
-    """
-    half = weights.shape[0] - 1
-    share = 1.0 - weights[0]
-    total = 0.0
-    for way in range(1, half + 1):
-        total += 2.0 * weights[way] * weights[way]
-    count = 0
-    score[:] = -1.0
-    for s in range(start.shape[0] - 1):
-        for i in range(start[s] + half, start[s + 1] - half):
-            others = 0.0
-            for way in range(1, half + 1):
-                others += weights[way] * (centre[i + way] + centre[i - way])
-            spread = variance[i] * (1.0 + total / (share * share))
-            score[i] = abs(centre[i] - others / share) / math.sqrt(spread)
-            count += 1
-    return count
-
-
-SMOOTHED, SLOPE, BEND, SMOOTH_VARIANCE = range(4)
-TANGENT_HALF = 8
-"""Places to both sides by which the slope and the bend of a line are told."""
-_SPAN = 2.0 * TANGENT_HALF + 1.0
-BEND_VARIANCE = 720.0 / (_SPAN * (_SPAN**2 - 1.0) * (_SPAN**2 - 4.0))
-"""Of such a bend, over the variance of a centre."""
-SMOOTH_ROWS = 4
-"""Of smoothed stretches: centre, its slope and second derivative by the column, and variance."""
-
-
-@compiled(error_model="numpy")
-def smooth_stretches(
-    centre: Floats,
+def keep_smoothed(
+    rows: Ints,
+    smoothed: Table,
     variance: Floats,
-    start: Ints,
-    halves: Ints,
-    weights: Table,
-    inflation: Floats,
-    confidence: float,
-    result: TableOut,
+    alike: float,
+    fits: TableOut,
+    slope: FloatsOut,
+    sigma: FloatsOut,
+    noise_length: FloatsOut,
 ) -> None:
-    """Local quadratics over columns that follow each other, as wide as their estimates agree.
+    """Take over what `smooth_stretches` gave, and take out the pull of bends (see `find_pulls`).
 
-    The window grows while the intervals of ``confidence`` sigmas about the estimates of all smaller
-    ones have a place in common (Katkovnik 1999). Where a stretch ends nearer than a window reaches,
-    that window is left out.
+    Bends are shrunk towards zero by their own noise, so that straight lines are not disturbed.
 
-    ``centre``, ``variance``: (N,) of points; stretches are consecutive. ``start``: (S + 1,) where
-    each stretch begins. ``halves``: (K,) half windows, increasing. ``weights``: (K, H + 1) of the
-    quadratic's value, from the middle on. ``inflation``: (K,) variance that the estimate has over
-    that of points which err on their own. ``result``: (4, N) output.
+    ``rows``: (M,) points that were smoothed. ``smoothed``: (4, M). ``variance``: (M,) of centres.
+    ``alike``: Neighbours that err as one. ``fits``: (8, N) of `fit_columns`, ``slope``, ``sigma``,
+    ``noise_length``: (N,), changed.
     """
-    n_windows, n = halves.shape[0], centre.shape[0]
-    total, spread, sums = np.zeros((n_windows, n)), np.zeros((n_windows, n)), np.zeros((2, n))
-    middle = TANGENT_HALF * (TANGENT_HALF + 1.0) / 3.0
-    for s in range(start.shape[0] - 1):
-        for k in range(n_windows):
-            half = halves[k]
-            first, stop = start[s] + half, start[s + 1] - half
-            if stop <= first:
-                break
-            for i in range(first, stop):
-                total[k, i] = weights[k, 0] * centre[i]
-                spread[k, i] = weights[k, 0] * weights[k, 0] * variance[i]
-            for way in range(1, half + 1):
-                share = weights[k, way]
-                add_shifted(centre, first, stop, way, share, 1.0, total[k])
-                add_shifted(variance, first, stop, way, share * share, 1.0, spread[k])
-        first, stop = start[s] + TANGENT_HALF, start[s + 1] - TANGENT_HALF
-        for way in range(1, TANGENT_HALF + 1):
-            if stop > first:
-                add_shifted(centre, first, stop, way, float(way), -1.0, sums[0])
-                add_shifted(centre, first, stop, way, way * way - middle, 1.0, sums[1])
-    norm = middle * (2.0 * TANGENT_HALF + 1.0)
-    bend_norm = middle * middle
-    for way in range(1, TANGENT_HALF + 1):
-        bend_norm += 2.0 * (way * way - middle) ** 2
-    for s in range(start.shape[0] - 1):
-        first, stop = start[s], start[s + 1]
-        for i in range(first, stop):
-            room = min(i - first, stop - 1 - i)
-            best, own = centre[i], variance[i]
-            low, high = -np.inf, np.inf
-            for k in range(n_windows):
-                if halves[k] > room:
-                    break
-                square = spread[k, i] * inflation[k]
-                reach = confidence * math.sqrt(square)
-                low, high = max(low, total[k, i] - reach), min(high, total[k, i] + reach)
-                if low > high:
-                    break
-                best, own = total[k, i], square
-            result[SMOOTHED, i] = best
-            result[SMOOTH_VARIANCE, i] = own
-            if room >= TANGENT_HALF:
-                result[SLOPE, i] = sums[0, i] / norm
-                result[BEND, i] = 2.0 * (sums[1, i] - middle * centre[i]) / bend_norm
-            else:
-                slope = lever = 0.0
-                low_end, high_end = max(i - TANGENT_HALF, first), min(i + TANGENT_HALF, stop - 1)
-                place = 0.5 * (low_end + high_end)
-                for m in range(low_end, high_end + 1):
-                    slope += (m - place) * centre[m]
-                    lever += (m - place) ** 2
-                result[SLOPE, i] = slope / lever if lever > 0.0 else 0.0
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        bend, steep = smoothed[BEND, k], smoothed[SLOPE, k] * smoothed[SLOPE, k]
+        square = max(bend * bend, 1e-30)
+        certain = max(1.0 - variance[k] * BEND_VARIANCE / square, 0.0)
+        gain = fits[BEND_GAIN, i] * (fits[SIGMA, i] * fits[SIGMA, i])
+        flat = 1.0 + steep
+        pull = 0.5 * gain * certain * bend * steep / (flat * flat)
+        fits[CENTRE, i] = smoothed[SMOOTHED, k] - pull
+        slope[i] = smoothed[SLOPE, k]
+        sigma[i] = math.sqrt(smoothed[SMOOTH_VARIANCE, k])
+        noise_length[i] = max(variance[k] * alike / smoothed[SMOOTH_VARIANCE, k], 1.0)
+
+
+@compiled(error_model="numpy")
+def write_points(
+    rows: Ints,
+    points: MapOut,
+    fits: Table,
+    slope: Floats,
+    sigma: Floats,
+    down: int,
+    scales: Floats,
+    places: TableOut,
+    normals: TableOut,
+    measures: TableOut,
+    segment: IntsOut,
+) -> None:
+    """Points of a profile from centres in columns.
+
+    ``rows``: (M,) points that are kept. ``points``: (N, 6). ``fits``: (8, N) of `fit_columns`.
+    ``slope``, ``sigma``: (N,). ``down``: Axis of the image along which centres were sought, 1 for
+    columns. ``scales``: (4,) least sigma, binning, grey levels a level, and columns that may lack
+    within a segment. ``places``, ``normals``: (M, 2) output. ``measures``: (3, M) output: sigma,
+    width and intensity. ``segment``: (M,) output.
+    """
+    number = 0
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        across = 1.0 / math.sqrt(1.0 + slope[i] * slope[i])
+        places[k, 1 - down], places[k, down] = points[i, POINT_COLUMN], fits[CENTRE, i]
+        normals[k, 1 - down], normals[k, down] = -slope[i] * across, across
+        measures[0, k] = max(sigma[i] * across, scales[0]) * scales[1]
+        measures[1, k] = fits[SIGMA, i] * across * scales[1]
+        measures[2, k] = max(fits[AMPLITUDE, i], 0.0) * scales[2]
+        if k > 0:
+            before = rows[k - 1]
+            is_new = points[i, POINT_CHAIN] != points[before, POINT_CHAIN]
+            is_new |= points[i, POINT_COLUMN] - points[before, POINT_COLUMN] > scales[3]
+            number += 1 if is_new else 0
+        segment[k] = number

@@ -15,10 +15,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, given_away
 from armscan.kernels.stripe.column_runs import (
     BACK,
     CELL_PX,
-    POINT_ABOVE,
-    POINT_BELOW,
     POINT_CHAIN,
-    POINT_COLUMN,
     POINT_COLUMNS,
     POINT_HIGH,
     POINT_LOW,
@@ -26,41 +23,38 @@ from armscan.kernels.stripe.column_runs import (
     RUN_HEIGHT,
     RUN_LENGTH,
     RUN_ROWS,
+    SMOOTH_ROWS,
+    cut_stretches,
     find_column_runs,
     gather_chains,
     link_columns,
+    mean_along,
     measure_runs,
+    score_middles,
+    slopes_along,
+    smooth_stretches,
     sort_by_column,
 )
 from armscan.kernels.stripe.columns import (
     AMPLITUDE,
-    BEND,
-    BEND_GAIN,
-    BEND_VARIANCE,
     CENTRE,
     FIRST_ROWS,
     HIGH_SIDE,
     LEAN,
     LEAN_NORM,
-    LOW_SIDE,
-    N_CLIPPED,
-    N_SIDES,
     SECOND_ROWS,
     SIGMA,
-    SLOPE,
-    SMOOTH_ROWS,
-    SMOOTH_VARIANCE,
-    SMOOTHED,
     STEEPEST,
     VARIANCE,
-    cut_stretches,
     fit_columns,
+    flag_points,
+    keep_means,
+    keep_smoothed,
     look_across,
     mark_ends,
-    mean_along,
-    score_middles,
-    slopes_along,
-    smooth_stretches,
+    mark_near,
+    weigh_sides,
+    write_points,
 )
 from armscan.kernels.stripe.section import (
     BACKGROUND_STEP,
@@ -210,6 +204,16 @@ NORMAL_MEDIAN = 0.6745
 """Median of the size of a normal number of variance 1."""
 LEAST_SIGMA_PX = 0.002
 """What pixel locking and the shape of the profile leave without any noise."""
+SINGLE_FLAGS = np.array(
+    [
+        StripeFlag.SATURATED,
+        StripeFlag.BACKGROUND_STEP,
+        StripeFlag.NEIGHBOUR,
+        StripeFlag.ASYMMETRIC,
+    ],
+    dtype=np.int64,
+)
+"""Flags of a point by itself, in the order of `flag_points`."""
 MOST_MEASURED = 4000
 """Points of which what all have in common is told: width, skew, scatter, correlation."""
 
@@ -231,21 +235,6 @@ class ColumnPoints:
     sigma: FloatArray
     noise_length: FloatArray
     flags: IntArray
-
-    def select(self, keep: BoolArray) -> ColumnPoints:
-        """The points where ``keep`` (N,) is True."""
-        if keep.all():
-            return self
-        at = np.flatnonzero(keep)
-        return ColumnPoints(
-            points=self.points[at],
-            table=self.table[:, at],
-            slope=self.slope[at],
-            trend=self.trend[at],
-            sigma=self.sigma[at],
-            noise_length=self.noise_length[at],
-            flags=self.flags[at],
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -358,23 +347,11 @@ def _look(pixels: Pixels, level: ImageLevel, chains: _Chains) -> tuple[FloatArra
     sigma = np.clip(sigma, low, high * np.hypot(1.0, STEEPEST))
     first = np.zeros((FIRST_ROWS, n))
     look_across(*_read(pixels), chains.points, sigma, base, first)
-    height, room = np.maximum(first[AMPLITUDE], 0.0), CLEAR_SIGMAS * sigma
-    has_sides = first[N_SIDES] > 0.0
     weight = np.zeros((3, n))
-    weight[0] = height * height
-    weight[1] = (chains.points[:, POINT_BELOW] > room) & has_sides
-    weight[2] = (chains.points[:, POINT_ABOVE] > room) & has_sides
-    own, low_side, high_side = chains.mean(first[SIGMA : HIGH_SIDE + 1], weight, MEAN_HALF)
-    first[SIGMA] = np.where(np.isfinite(own), np.clip(own, low, 2.0 * high), sigma)
-    # a side that another line lights up takes the value of the other one
-    other = np.where(np.isnan(high_side), base, high_side)
-    first[LOW_SIDE] = np.where(np.isnan(low_side), other, low_side)
-    first[HIGH_SIDE] = np.where(np.isnan(high_side), first[LOW_SIDE], high_side)
-    middle = 0.5 * (chains.points[:, POINT_LOW] + chains.points[:, POINT_HIGH])
-    is_off = np.abs(first[CENTRE] - middle) > MOST_OFF_SIGMAS * sigma
-    is_lost = np.flatnonzero((height == 0.0) | is_off)
-    first[AMPLITUDE, is_lost] = np.maximum(measured[RUN_HEIGHT, is_lost], 1.0)
-    first[CENTRE, is_lost] = middle[is_lost]
+    weigh_sides(first, chains.points, sigma, CLEAR_SIGMAS, weight)
+    mean = chains.mean(first[SIGMA : HIGH_SIDE + 1], weight, MEAN_HALF)
+    limits = np.array([low, 2.0 * high, MOST_OFF_SIGMAS])
+    keep_means(mean, chains.points, sigma, base, measured[RUN_HEIGHT], limits, first)
     return first, measured[RUN_DIPS] > 0.0
 
 
@@ -383,18 +360,15 @@ def _is_near_another(
 ) -> BoolArray:
     """(N,) True where another line is so near that it pulls the centre, or runs into this one."""
     points, sigma = chains.points, table[SIGMA]
-    length = points[:, POINT_HIGH] - points[:, POINT_LOW] + 1.0
-    gap = np.minimum(points[:, POINT_BELOW], points[:, POINT_ABOVE])
-    # runs of faint lines fall apart by noise
-    near = (gap <= sigma) | (gap + length < NEIGHBOUR_SIGMAS * sigma)
-    near &= table[AMPLITUDE] > CLEAR_RATIO * rise
     steep = np.sqrt(1.0 + slope * slope)
     some = slice(None, None, max(len(sigma) // MOST_MEASURED, 1))
-    own = float(np.median(sigma[some] / steep[some])) * steep
+    typical = float(np.median(sigma[some] / steep[some]))
     ratio = np.maximum(table[AMPLITUDE] / rise, LEAST_RATIO)
-    near |= length > MERGED_SHARE * 2.0 * own * np.sqrt(2.0 * np.log(ratio)) + MERGED_PX
-    near |= (sigma > WIDER_SHARE * own) | dips
-    if near.any():
+    longest = MERGED_SHARE * 2.0 * (typical * steep) * np.sqrt(2.0 * np.log(ratio)) + MERGED_PX
+    near = np.zeros(len(points), np.bool_)
+    limits = np.array([NEIGHBOUR_SIGMAS, CLEAR_RATIO * rise, typical, WIDER_SHARE])
+    given = (table, points, steep, longest, dips.view(np.uint8), limits)
+    if mark_near(*given, near.view(np.uint8)):
         near = close_gaps(near, points[:, POINT_CHAIN].astype(np.int64), MERGED_SIGMAS * sigma)
     return np.asarray(near)
 
@@ -404,23 +378,13 @@ def _flag(chains: _Chains, table: FloatArray, first: FloatArray, near: BoolArray
 
     ``first``: (6, N) of the first pass. ``near``: (N,) of `_is_near_another`.
     """
-    sigma = table[SIGMA]
     flags = np.zeros(table.shape[1], np.int64)
-    step = np.abs(first[HIGH_SIDE] - first[LOW_SIDE])
     leans = table[LEAN : LEAN_NORM + 1]
-    lean, norm = (2 * LEAN_HALF + 1) * chains.mean(leans, np.ones(leans.shape), LEAN_HALF)
-    norm = np.maximum(norm, 1e-12)
+    sums = (2 * LEAN_HALF + 1) * chains.mean(leans, np.ones(leans.shape), LEAN_HALF)
     # what all sections have in common is the line's own
-    lean = np.abs(lean - norm * _typical_lean(table))
-    least = np.maximum(LEAST_SKEW, SKEW_PX / sigma) * norm
-    for flag, is_set in (
-        (StripeFlag.SATURATED, table[N_CLIPPED] > 0.0),
-        (StripeFlag.BACKGROUND_STEP, step > BACKGROUND_STEP * table[AMPLITUDE]),
-        (StripeFlag.NEIGHBOUR, near),
-        (StripeFlag.ASYMMETRIC, (lean > SIGNIFICANT * np.sqrt(norm)) & (lean > least)),
-    ):
-        if is_set.any():
-            flags[is_set] |= int(flag)
+    common = _typical_lean(table)
+    limits = np.array([BACKGROUND_STEP, common, LEAST_SKEW, SKEW_PX, SIGNIFICANT])
+    flag_points(table, first, sums, near.view(np.uint8), limits, SINGLE_FLAGS, flags)
     return flags
 
 
@@ -444,7 +408,10 @@ def _typical_lean(table: FloatArray) -> float:
 
 
 def _smooth(chains: _Chains, found: ColumnPoints, smoothing_px: float) -> ColumnPoints:
-    """The points with their centres smoothed along the chains, and the sigma that this leaves."""
+    """The points with their centres smoothed along the chains, and the sigma that this leaves.
+
+    Fits and slopes are written over.
+    """
     points, table, flags = chains.points, found.table, found.flags.copy()
     variance = np.maximum(table[VARIANCE], LEAST_SIGMA_PX**2)
     is_used = ((flags & int(REJECTING)) == 0) & (table[VARIANCE] > 0.0)
@@ -470,20 +437,14 @@ def _smooth(chains: _Chains, found: ColumnPoints, smoothing_px: float) -> Column
         correlation = WHITE
     alike = max(1.0 + 2.0 * float(correlation[1:].sum()) / correlation[0], 1.0)
     sigma, noise_length = np.sqrt(variance * correlation[0]), np.full(len(points), alike)
-    slope, table = found.slope.copy(), table.copy()
     if smoothing_px > 0.0:
         halves, weights = _half_windows(max(smoothing_px, 1.0))
         inflation = np.array([inflation_of(correlation, one) for one in halves])
         smoothed = np.zeros((SMOOTH_ROWS, len(rows)))
         own = own * correlation[0]
         smooth_stretches(centre, own, start, halves, weights, inflation, CONFIDENCE, smoothed)
-        table[CENTRE, chosen] = smoothed[SMOOTHED] - _pull(table, chosen, smoothed, own)
-        slope[chosen] = smoothed[SLOPE]
-        sigma[chosen] = np.sqrt(smoothed[SMOOTH_VARIANCE])
-        noise_length[chosen] = np.maximum(own * alike / smoothed[SMOOTH_VARIANCE], 1.0)
-    return replace(
-        found, table=table, slope=slope, sigma=sigma, noise_length=noise_length, flags=flags
-    )
+        keep_smoothed(rows, smoothed, own, alike, table, found.slope, sigma, noise_length)
+    return replace(found, sigma=sigma, noise_length=noise_length, flags=flags)
 
 
 def _stretches(points: NDArray[np.int32], is_used: BoolArray) -> tuple[IntArray, IntArray]:
@@ -496,19 +457,6 @@ def _stretches(points: NDArray[np.int32], is_used: BoolArray) -> tuple[IntArray,
 def _all_or(rows: IntArray, n: int) -> IntArray | slice:
     """Rising rows (M,) of ``n``; a slice if they are all of them, so that nothing is copied."""
     return slice(None) if len(rows) == n else rows
-
-
-def _pull(
-    table: FloatArray, rows: IntArray | slice, smoothed: FloatArray, variance: FloatArray
-) -> FloatArray:
-    """By how much bends pull the centres (M,) of columns that cut them at a slant: `find_pulls`.
-
-    Bends are shrunk towards zero by their own noise, so that straight lines are not disturbed.
-    """
-    bend, steep = smoothed[BEND], smoothed[SLOPE] * smoothed[SLOPE]
-    certain = np.maximum(1.0 - variance * BEND_VARIANCE / np.maximum(bend * bend, 1e-30), 0.0)
-    gain = table[BEND_GAIN, rows] * table[SIGMA, rows] ** 2
-    return np.asarray(0.5 * gain * certain * bend * steep / (1.0 + steep) ** 2)
 
 
 @cache
@@ -585,38 +533,34 @@ def _to_profile(
     steep = np.abs(found.trend)
     keep = (steep < 1.0 / STEEPEST) if is_row else (steep <= STEEPEST)
     keep &= (found.table[VARIANCE] > 0.0) & (np.abs(found.slope) < MOST_SLOPE)
-    kept = found.select(keep)
-    column, slope = kept.points[:, POINT_COLUMN], kept.slope
-    across = 1.0 / np.sqrt(1.0 + slope * slope)
-    down, along = (0, 1) if is_row else (1, 0)
-    at, normals = np.zeros((len(column), 2)), np.zeros((len(column), 2))
-    at[:, along], at[:, down] = column, kept.table[CENTRE]
-    normals[:, along], normals[:, down] = -slope * across, across
-    is_new = (np.diff(kept.points[:, POINT_CHAIN]) != 0) | (np.diff(column) > BACK)
-    segment = np.zeros(len(column), np.int64)
-    np.cumsum(is_new, out=segment[1:])
-    flags = kept.flags
+    rows, down = np.flatnonzero(keep), 0 if is_row else 1
+    binning, levels = exposure.window.binning, exposure.full_scale / NORMAL_SCALE
+    at, normals = np.zeros((len(rows), 2)), np.zeros((len(rows), 2))
+    measures, segment = np.zeros((3, len(rows))), np.zeros(len(rows), np.int64)
+    scales = np.array([LEAST_SIGMA_PX, binning, levels, BACK])
+    given = (rows, found.points, found.table, found.slope, found.sigma, down, scales)
+    write_points(*given, at, normals, measures, segment)
+    flags = found.flags[rows]
     short = is_short(at, segment)
     if short.any():
-        flags = flags | np.where(short, int(StripeFlag.SHORT_SEGMENT), 0)
-    binning, levels = exposure.window.binning, exposure.full_scale / NORMAL_SCALE
+        flags |= np.where(short, int(StripeFlag.SHORT_SEGMENT), 0)
     profile = Profile(
         source=exposure.source,
         points_px=given_away(exposure.window.to_full_sensor(at)),
         normals_px=given_away(normals),
-        sigma_px=given_away(np.maximum(kept.sigma * across, LEAST_SIGMA_PX) * binning),
-        width_px=given_away(kept.table[SIGMA] * across * binning),
-        intensity=given_away(np.maximum(kept.table[AMPLITUDE], 0.0) * levels),
+        sigma_px=given_away(measures[0]),
+        width_px=given_away(measures[1]),
+        intensity=given_away(measures[2]),
         flags=given_away(flags),
         segment=given_away(segment),
-        noise_length=given_away(kept.noise_length),
+        noise_length=given_away(found.noise_length[rows]),
     )
     if plane is None or not len(at):
         return profile
-    across_px = float(np.median(kept.table[SIGMA] * across))
-    rows, keep = np.concatenate([at, normals], axis=1), np.ones(len(at), dtype=np.bool_)
+    across_px = float(np.median(measures[1])) / binning
+    lines, keep = np.concatenate([at, normals], axis=1), np.ones(len(at), dtype=np.bool_)
     if plane.gate is not None:
-        keep &= has_laser_colour(plane.gate, rows, segment, across_px)
+        keep &= has_laser_colour(plane.gate, lines, segment, across_px)
     if plane.unknown is not None:
-        keep &= is_on_known_ground(plane.unknown, rows, across_px)
+        keep &= is_on_known_ground(plane.unknown, lines, across_px)
     return profile.select(keep)

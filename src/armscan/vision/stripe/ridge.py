@@ -17,6 +17,7 @@ from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
 from armscan.kernels.chains import (
     find_neighbours,
     measure_chains,
+    middle_of_squares,
     place_points,
     span_of,
     sum_windows,
@@ -311,11 +312,7 @@ def chain_extents(points: FloatArray, chain: IntArray) -> tuple[IntArray, IntArr
 
 def strong_median(values: FloatArray) -> float:
     """Median of values (N,) >= 0 weighted by their squares: typical of the strong ones."""
-    order = np.sort(values)
-    weight = np.cumsum(order * order)
-    if not len(order) or weight[-1] <= 0.0:
-        return 0.0
-    return float(order[np.searchsorted(weight, 0.5 * weight[-1])])
+    return middle_of_squares(np.array(values)) if values.any() else 0.0
 
 
 SCALES_PX = (3.0, 8.0)

@@ -177,6 +177,12 @@ def _grid_in(
             f"write {text}, or leave the border out",
         )
     grid = _numbered(tags, target)
+    if grid is None and not len(_links(tags)[0]):
+        return FitFailure(
+            f"{exposure.source}: {len(tags.ids)} tags of {target.family} were read, no two of them "
+            "beside each other",
+            "show more of the grid, sharper and evenly lit; no other tags may be in view",
+        )
     if grid is None:
         return FitFailure(
             f"{exposure.source}: {len(tags.ids)} tags of {target.family} were read, which do not "
@@ -221,6 +227,8 @@ def _numbered(tags: Markers, target: AprilGrid) -> _Grid | None:
 
     One row of tags does not tell where the next is, nor does one column, unless the target does.
     """
+    if len(tags.ids) < MIN_TAGS:
+        return None
     first, second, turn_of = _links(tags)
     n = len(tags.ids)
     group = connected_components(
@@ -345,7 +353,8 @@ def _tag_corners(
     corners_px = _at_crossings(grey8, np.roll(grid.tags.corners_px, -grid.turn, axis=1))
     spacing = _spacing_seen(corners_px, grid.cells)
     if abs(spacing[0] - target.spacing) > max(_SAME_SPACING, _SPACING_SIGMAS * spacing[1]):
-        text = format_target(replace(target, spacing=round(spacing[0], 3), border_bits=0))
+        right = replace(target, spacing=round(spacing[0], 3), border_bits=0, order="either")
+        text = format_target(right)
         return FitFailure(
             f"{exposure.source}: tags lie {spacing[0]:.3f} of their side apart, not "
             f"{target.spacing:g}",
@@ -368,7 +377,8 @@ def _tag_corners(
             "touch no small dark square",
             "print the grid as Kalibr does, with dark squares between the corners of tags",
         )
-    chosen = touched.ravel()
+    chosen = np.argsort(number)
+    chosen = chosen[touched.ravel()[chosen]]
     number, start = number[chosen], start[chosen]
     clear = _clear_sides(target)
     steps = clear * along_x[chosen], clear * along_y[chosen]
@@ -416,11 +426,9 @@ def _with_unread(
     row, column = np.mgrid[: target.rows, : target.columns]
     every = np.stack([column.ravel(), row.ravel()], axis=-1)
     last = np.array(grey8.shape[::-1]) - 1.0 - _LEAST_INSIDE_PX
-    tried = np.zeros(0, dtype=np.int64)
     while True:
         apart = np.abs(every[:, None] - places).max(axis=-1).min(axis=1)
-        beside = np.setdiff1d(np.flatnonzero(apart == 1), tried)
-        tried = np.concatenate([tried, beside])
+        beside = np.flatnonzero(apart == 1)
         if not len(beside):
             return places, corners_px
         wanted = target.pitch * every[beside][:, None] + _CORNER_STEPS
@@ -437,6 +445,8 @@ def _with_unread(
             _shows_code(grey8, quad, _code_at(target, grid, every[k]), _border_part(target))
             for k, quad in zip(beside, found, strict=True)
         ]
+        if not any(shows):
+            return places, corners_px
         places = np.concatenate([places, every[beside[shows]]])
         corners_px = np.concatenate([corners_px, found[shows]])
 
@@ -480,8 +490,9 @@ def _spacing_seen(corners_px: FloatArray, cells: IntArray) -> tuple[float, float
             ]
             first, gap, second = (float(np.hypot(*way)) for way in np.diff(ends, axis=0))
             ratios.append(2.0 * gap / (first + second))
-    scatter = robust_sigma(np.array(ratios)) if len(ratios) > 1 else _SAME_SPACING
-    return float(np.median(ratios)), float(scatter / np.sqrt(len(ratios)))
+    middle = float(np.median(ratios))
+    scatter = robust_sigma(np.array(ratios) - middle) if len(ratios) > 1 else _SAME_SPACING
+    return middle, float(scatter / np.sqrt(len(ratios)))
 
 
 def _touches_square(

@@ -142,6 +142,8 @@ def _detect_in(
     if not asked and (_fit(own, target).n_neighbours > 0 or _first_ids(markers, target)):
         return _misfit(exposure, target, markers, fitting)
     board = (asked or [target])[0]
+    if asked and _fits_another_first(markers, board):
+        return _misfit(exposure, target, markers, [])
     if asked and _n_beyond(markers, board) >= DECISIVE:
         last = target.first_id + len(board.marker_squares) - 1
         return FitFailure(
@@ -157,6 +159,21 @@ def _detect_in(
             "show a whole row of the board in an image, or write :new or :old after the dictionary",
         )
     return view
+
+
+def _fits_another_first(markers: Markers, board: Charuco) -> bool:
+    """Whether the markers contradict the board's first number here and there, and fit another.
+
+    Where one counts from the wrong marker, all agree but those that begin and end a row.
+    """
+    own = _fit(markers.counted_from(board.first_id), board)
+    if own.n_neighbours - own.n_agreeing < DECISIVE:
+        return False
+    others = _first_ids(markers, board)
+    if not others:
+        return False
+    other = _fit(markers.counted_from(others[0].first_id), others[0])
+    return other.n_agreeing - own.n_agreeing >= DECISIVE
 
 
 def _n_beyond(markers: Markers, board: Charuco) -> int:

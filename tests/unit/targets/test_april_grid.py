@@ -260,6 +260,16 @@ def test_a_border_of_one_cell_is_told_from_one_of_two() -> None:
     assert len(found(photograph(Print(bits=1)), replace(KALIBR, border_bits=1))) == 144
 
 
+def test_of_two_grids_in_view_the_one_that_is_meant_is_taken() -> None:
+    other = replace(KALIBR, first_id=36)
+    one, two = (photograph(Print(grid)) for grid in (KALIBR, other))
+    both = Exposure(np.concatenate([one.image, two.image], axis=1), "both")
+    for grid, aside in ((KALIBR, 0), (other, SIZE_PX[0])):
+        view = found(both, grid)
+        assert len(view) == 144
+        assert np.abs(errors(view, from_grid(KALIBR, TILTED)) - [aside, 0]).max() < 0.1
+
+
 def test_one_row_is_numbered_as_the_set_tells() -> None:
     whole, seen = photograph(Print()), from_grid(KALIBR, TILTED)
     image = whole.image.copy()

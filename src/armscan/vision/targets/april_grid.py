@@ -223,7 +223,8 @@ _WAYS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 
 
 def _numbered(tags: Markers, target: AprilGrid) -> _Grid | None:
-    """The largest group of neighbours among tags; None where it does not tell how it is numbered.
+    """Neighbours among tags, the group with most of the target's numbers; None where it does not
+    tell how it is numbered.
 
     One row of tags does not tell where the next is, nor does one column, unless the target does.
     """
@@ -234,7 +235,10 @@ def _numbered(tags: Markers, target: AprilGrid) -> _Grid | None:
     group = connected_components(
         coo_array((np.ones(len(first)), (first, second)), shape=(n, n)), directed=False
     )[1]
-    is_main = group == np.argmax(np.bincount(group))
+    number = tags.ids - target.first_id
+    is_own = (number >= 0) & (number < target.columns * target.rows)
+    size = np.bincount(group, n * is_own + 1.0)
+    is_main = group == np.argmax(size)
     own = is_main[first] if len(first) else np.zeros(0, dtype=np.bool_)
     first, second, turn_of = first[own], second[own], turn_of[own]
     if not len(first):

@@ -104,7 +104,8 @@ TARGET = typer.Option(
     "--target",
     show_default=False,
     help="circle-grid:11x9:3.75, asymmetric-circle-grid:4x11:5, chessboard:11x6:13 (inner "
-    "corners, mm) or charuco:10x7:4:3:DICT_4X4_50; 13x13.1 if rows lie further apart.",
+    "corners, mm), charuco:10x7:4:3:DICT_4X4_50 or aprilgrid:6x6:88:0.3; 13x13.1 if rows lie "
+    "further apart.",
 )
 Target = Annotated[str, TARGET]
 OptionalTarget = Annotated[str | None, TARGET]

@@ -40,6 +40,7 @@ from armscan.storage.recording import read_recording, recording_tables
 from armscan.thesis.ellipse import with_printed_centres
 from armscan.vision.targets.detect import settle_target
 from armscan.vision.targets.target import (
+    AprilGrid,
     Charuco,
     Chessboard,
     CircleGrid,
@@ -158,7 +159,7 @@ def calibrate_camera_from_file(
     )
     sources = [view.source for view in found.views]
     options = replace(options, leave_out=named_by(options.leave_out, sources, "--leave-out"))
-    kinds: tuple[type[Target], ...] = (Chessboard, Charuco, CircleGrid)
+    kinds: tuple[type[Target], ...] = (Chessboard, Charuco, CircleGrid, AprilGrid)
     recorded = {kind: recorded_options(before.provenance, kind) for kind in kinds}
     targets = [kind(**values) for kind, values in recorded.items() if values]
     if not targets:

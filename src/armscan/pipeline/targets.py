@@ -18,6 +18,7 @@ from armscan.records.exposure import Exposure
 from armscan.storage.detection_cache import DetectionCache, detection_key
 from armscan.vision.targets.detect import detect_target, settle_target
 from armscan.vision.targets.target import (
+    AprilGrid,
     Charuco,
     OtherCountSeen,
     Target,
@@ -61,7 +62,7 @@ def wrong_count(found: Sequence[TargetView | FitFailure], target: Target) -> Fit
     The count that was seen instead and how to write it; None as long as the whole target was
     found once, or the images do not agree.
     """
-    if isinstance(target, Charuco) or any(_is_whole(item, target) for item in found):
+    if isinstance(target, Charuco | AprilGrid) or any(_is_whole(item, target) for item in found):
         return None
     counts = [(item.columns, item.rows) for item in found if isinstance(item, OtherCountSeen)]
     if len(counts) < ENOUGH_IMAGES:

@@ -38,7 +38,8 @@ def photograph(
     """
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     size = (board.columns, board.rows)
-    printed = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary)
+    numbers = np.arange(board.first_id, board.first_id + board.columns * board.rows // 2)
+    printed = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary, numbers)
     printed.setLegacyPattern(board.layout == "old")
     side = PX_PER_SQUARE
     drawn = printed.generateImage((side * board.columns, side * board.rows))
@@ -115,6 +116,57 @@ def test_a_part_that_fits_both_layouts_is_numbered_as_the_set_tells(layout: Char
     assert [item.source for item in found.views] == ["part", "whole"]
     assert 6 <= len(view) < len(corners_px)
     np.testing.assert_allclose(view.points_px, corners_px[view.point_index], atol=0.2)
+
+
+@pytest.mark.parametrize("board", [ODD, EVEN], ids=str)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_markers_may_begin_at_any_number(board: Charuco, layout: CharucoLayout) -> None:
+    shown = replace(board, layout=layout, first_id=31)
+    exposure, corners_px = photograph(shown)
+    view = detect_target(exposure, replace(board, first_id=31))
+    assert isinstance(view, TargetView)
+    assert len(view) >= 0.9 * len(corners_px)
+    np.testing.assert_allclose(view.points_px, corners_px[view.point_index], atol=0.2)
+    assert settle_target([exposure], replace(board, first_id=31)) == shown
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("first", [5, 31, 100])
+def test_a_wrong_first_number_is_refused_and_the_right_one_named(
+    layout: CharucoLayout, first: int
+) -> None:
+    exposure, corners_px = photograph(replace(ODD, layout=layout, first_id=first))
+    failure = detect_target(exposure, ODD)
+    assert isinstance(failure, FitFailure)
+    right = parse_target(failure.remedy.split()[-1])
+    assert isinstance(right, Charuco)
+    assert right.first_id == first
+    view = detect_target(exposure, right)
+    assert isinstance(view, TargetView)
+    np.testing.assert_allclose(view.points_px, corners_px[view.point_index], atol=0.2)
+
+
+def test_a_wrong_first_number_is_refused_of_a_part_of_the_board_too() -> None:
+    """All numbers are on the board that was asked for, and most neighbours beside each other."""
+    exposure, _ = photograph(replace(ODD, layout="new", first_id=3))
+    upper = Exposure(np.ascontiguousarray(exposure.image[:285]), "upper")
+    failure = detect_target(upper, ODD)
+    assert isinstance(failure, FitFailure)
+    assert "first=3" in failure.remedy
+    assert isinstance(detect_target(upper, replace(ODD, first_id=3)), TargetView)
+
+
+@pytest.mark.parametrize("first", [9, 18])
+def test_a_board_that_goes_on_beyond_its_numbers_is_refused(first: int) -> None:
+    """Its markers are those of another, two rows on: every neighbour lies where it should."""
+    exposure, _ = photograph(replace(ODD, layout="new", first_id=first))
+    failure = detect_target(exposure, ODD)
+    assert isinstance(failure, FitFailure)
+    assert f"{first} to {first + 26} were read" in failure.reason
+    assert f":first={first}" in failure.remedy
+    fewer_rows = detect_target(exposure, replace(ODD, rows=4, first_id=first))
+    assert isinstance(fewer_rows, FitFailure)
+    assert "goes on" in fewer_rows.reason
 
 
 def test_an_old_layout_is_described_and_an_open_one_stays_open_without_a_board() -> None:

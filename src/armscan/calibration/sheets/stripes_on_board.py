@@ -31,6 +31,7 @@ from armscan.geometry.shapes import Line, fit_line
 from armscan.models.camera import CameraModel
 from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.targets.target import (
+    AprilGrid,
     Charuco,
     Chessboard,
     CircleEdges,
@@ -74,8 +75,9 @@ def find_target_edges(
     """Edges of the target in the image in which it was found; None if they are not known.
 
     Circles have the rims that were found. The squares of a chessboard and of a ChArUco board are
-    projected, the outermost ones included. The markers inside a ChArUco board's squares are left
-    out: their cells are so many that hardly a point would be left.
+    projected, the outermost ones included, and so are the borders of an AprilGrid's tags and small
+    squares. Markers inside a ChArUco board's squares and the code inside of tags are left out:
+    their cells are so many that hardly a point would be left.
     """
     if isinstance(target, CircleGrid):
         return None if view.edges is None else _rims(view.edges)
@@ -115,15 +117,22 @@ def _rims(edges: CircleEdges) -> TargetEdges:
 
 
 def _borders(
-    target: Chessboard | Charuco, sensor_from_board: Pose[Sensor, Board], camera: CameraModel
+    target: Chessboard | Charuco | AprilGrid,
+    sensor_from_board: Pose[Sensor, Board],
+    camera: CameraModel,
 ) -> TargetEdges:
-    """Borders of all squares, corner to corner and one square beyond the inner corners."""
+    """Borders of all squares, corner to corner and one square beyond the inner corners.
+
+    Of an AprilGrid these are the tags' borders and the small squares, which lie on lines, too.
+    """
     corners = target.points_board_mm[:, :2]
-    stretch = target.stretch if isinstance(target, Chessboard) else 1.0
-    square_mm = target.square_mm * np.array([1.0, stretch])
+    if isinstance(target, AprilGrid):
+        square_mm = np.full(2, target.spacing * target.tag_mm)
+    else:
+        stretch = target.stretch if isinstance(target, Chessboard) else 1.0
+        square_mm = target.square_mm * np.array([1.0, stretch])
     low, high = corners.min(axis=0) - square_mm, corners.max(axis=0) + square_mm
-    counts = np.rint((high - low) / square_mm).astype(int)
-    x, y = (np.linspace(low[i], high[i], counts[i] + 1) for i in range(2))
+    x, y = (np.unique([low[i], *corners[:, i].round(9), high[i]]) for i in range(2))
     lines = [np.array([[value, low[1]], [value, high[1]]]) for value in x]
     lines += [np.array([[low[0], value], [high[0], value]]) for value in y]
     points, directions = [], []

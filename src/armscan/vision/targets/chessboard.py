@@ -516,7 +516,7 @@ def _measured(grey: RawGrey, target: Chessboard, numbered: NumberedCorners) -> _
 
 def fit_board_saddles(
     grey: RawGrey,
-    cells: IntArray,
+    cells: IntArray | FloatArray,
     corners_px: FloatArray,
     steps_px: Steps,
     clear_cells: float = 1.0,
@@ -555,7 +555,7 @@ def _median_sigma(saddles: Saddles) -> float:
 
 def _fit_bent_saddles(
     grey: RawGrey,
-    cells: IntArray,
+    cells: IntArray | FloatArray,
     corners_px: FloatArray,
     steps_px: Steps,
     clear_cells: float,
@@ -588,7 +588,7 @@ def _fit_bent_saddles(
 
 
 def board_lattice(
-    grey: RawGrey, cells: IntArray, saddles: Saddles, steps_px: Steps
+    grey: RawGrey, cells: IntArray | FloatArray, saddles: Saddles, steps_px: Steps
 ) -> SmoothLattice | None:
     """The lattice of the good corners (M,); none where they are too few."""
     good = saddles.is_good

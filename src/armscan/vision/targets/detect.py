@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -20,6 +19,15 @@ from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose
 from armscan.records.exposure import Exposure
+from armscan.vision.targets.april_grid import (
+    CLEARANCE,
+    MIN_CORNERS,
+    Markers,
+    detect_april_grid,
+    dictionary_of,
+    read_markers,
+    settle_order,
+)
 from armscan.vision.targets.chessboard import (
     Steps,
     board_lattice,
@@ -28,14 +36,9 @@ from armscan.vision.targets.chessboard import (
 )
 from armscan.vision.targets.circle_grid import detect_circle_grid
 from armscan.vision.targets.crossings import predict_cells
-from armscan.vision.targets.saddle import (
-    WINDOW_FRACTION,
-    Grey8,
-    RawGrey,
-    grey_channels,
-    to_grey8,
-)
+from armscan.vision.targets.saddle import WINDOW_FRACTION, RawGrey, grey_channels, to_grey8
 from armscan.vision.targets.target import (
+    AprilGrid,
     Charuco,
     Chessboard,
     CircleGrid,
@@ -44,28 +47,16 @@ from armscan.vision.targets.target import (
     format_target,
 )
 
-MIN_CORNERS = 6
-"""Fewer corners make no view: four fix a homography and leave nothing to judge it by."""
 DECISIVE = 4
 """So many more neighbours at their places prove a layout; a misread marker has none."""
-_CLEARANCE = 0.85
 _FITTING = 0.75
 """Least share of neighbours at their places: of a wrong count half may be."""
+_MOST_READ = (0.1, 0.9)
+"""Between these parts of the numbers read no marker is misread."""
 _FARTHER = 0.25
 """Part of the distance to a marker farther away by which it may lie off what one marker says."""
 _NEAR = 0.5
 """Farthest that a neighbour lies off its place, in squares; the nearest other place is at 1.4."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Markers:
-    """Markers read in an image.
-
-    ``ids``: (N,) numbers. ``corners_px``: (N, 4, 2) from the first corner, clockwise on the print.
-    """
-
-    ids: IntArray
-    corners_px: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +92,7 @@ def detect_charuco(exposure: Exposure, target: Charuco) -> TargetView | FitFailu
     """
     n_most, failure = -1, FitFailure("")
     for grey in grey_channels(exposure):
-        markers = _read_markers(to_grey8(grey, exposure.full_scale), target)
+        markers = read_markers(to_grey8(grey, exposure.full_scale), target.dictionary)
         found = _detect_in(exposure, target, grey, markers)
         if isinstance(found, TargetView):
             return found
@@ -126,28 +117,14 @@ def _lead_of_old(exposure: Exposure, target: Charuco) -> int:
     """By how many neighbours the old layout agrees better than the new; 0 if neither fits."""
     lead = 0
     for grey in grey_channels(exposure):
-        markers = _read_markers(to_grey8(grey, exposure.full_scale), target)
-        new, old = (_fit(markers, board) for board in _layouts(target))
+        markers = read_markers(to_grey8(grey, exposure.full_scale), target.dictionary)
+        own = markers.counted_from(target.first_id)
+        new, old = (_fit(own, board) for board in _layouts(target))
         seen = old.n_agreeing - new.n_agreeing if old.is_fitting or new.is_fitting else 0
         lead = max(lead, seen, key=abs)
         if abs(lead) >= DECISIVE:
             break
     return lead
-
-
-def _read_markers(grey8: Grey8, target: Charuco) -> Markers:
-    detector = cv2.aruco.ArucoDetector(_dictionary(target))
-    corners, ids, _ = detector.detectMarkers(grey8)
-    if ids is None or len(ids) == 0:
-        return Markers(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
-    return Markers(
-        np.asarray(ids, dtype=np.int64).ravel(),
-        np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2),
-    )
-
-
-def _dictionary(target: Charuco) -> cv2.aruco.Dictionary:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
 
 
 def _detect_in(
@@ -159,17 +136,58 @@ def _detect_in(
             f"{exposure.source}: no marker of {target.dictionary} in view",
             "check the dictionary's name, and that the print is neither mirrored nor blurred",
         )
-    fitting = _fitting(markers, _layouts(target))
+    own = markers.counted_from(target.first_id)
+    fitting = _fitting(own, _layouts(target))
     asked = _of_layout(fitting, target)
-    if not asked and _fit(markers, target).n_neighbours > 0:
+    if not asked and (_fit(own, target).n_neighbours > 0 or _first_ids(markers, target)):
         return _misfit(exposure, target, markers, fitting)
-    view = _corners(exposure, (asked or [target])[0], grey, markers)
+    board = (asked or [target])[0]
+    if asked and _fits_another_first(markers, board):
+        return _misfit(exposure, target, markers, [])
+    if asked and _n_beyond(markers, board) >= DECISIVE:
+        last = target.first_id + len(board.marker_squares) - 1
+        return FitFailure(
+            f"{exposure.source}: the board goes on beyond the markers {target.first_id} to {last}: "
+            f"{markers.ids.min()} to {markers.ids.max()} were read",
+            "count its rows of squares again, and give the number of its first marker, as in "
+            f"{format_target(replace(target, first_id=int(markers.ids.min())))}",
+        )
+    view = _corners(exposure, board, grey, own)
     if isinstance(view, TargetView) and len(asked) > 1:
         return FitFailure(
             f"{exposure.source}: the markers in view lie alike in OpenCV's new and old layout",
             "show a whole row of the board in an image, or write :new or :old after the dictionary",
         )
     return view
+
+
+def _fits_another_first(markers: Markers, board: Charuco) -> bool:
+    """Whether the markers contradict the board's first number here and there, and fit another.
+
+    Where one counts from the wrong marker, all agree but those that begin and end a row.
+    """
+    own = _fit(markers.counted_from(board.first_id), board)
+    if own.n_neighbours - own.n_agreeing < DECISIVE:
+        return False
+    others = _first_ids(markers, board)
+    if not others:
+        return False
+    other = _fit(markers.counted_from(others[0].first_id), others[0])
+    return other.n_agreeing - own.n_agreeing >= DECISIVE
+
+
+def _n_beyond(markers: Markers, board: Charuco) -> int:
+    """Neighbours, one on the board and one that lies where the board's rows would go on."""
+    n, above = len(board.marker_squares), board.first_id // board.columns
+    below = max(0, -(-(int(markers.ids.max()) + 1 - board.first_id - n) // board.columns))
+    first, rows = board.first_id - above * board.columns, board.rows + 2 * (above + below)
+    wide = replace(board, first_id=first, rows=rows)
+    counted = markers.counted_from(first)
+    neighbours = _neighbours(counted, wide)
+    number = counted.ids - above * board.columns
+    is_own = (number >= 0) & (number < n)
+    crosses = is_own[neighbours.first] & ~is_own[neighbours.second]
+    return int((crosses & neighbours.agrees).sum())
 
 
 def _of_layout(boards: list[Charuco], target: Charuco) -> list[Charuco]:
@@ -277,7 +295,7 @@ def _is_within(points_px: FloatArray, shape: tuple[int, ...]) -> BoolArray:
 def _clear_cells(target: Charuco) -> float:
     """Part of a square, such that the fit of a corner reaches no marker."""
     gap_mm = (target.square_mm - target.marker_mm) / np.sqrt(2.0)
-    return float(min(1.0, _CLEARANCE * gap_mm / (WINDOW_FRACTION * target.square_mm)))
+    return float(min(1.0, CLEARANCE * gap_mm / (WINDOW_FRACTION * target.square_mm)))
 
 
 def _layouts(target: Charuco) -> tuple[Charuco, ...]:
@@ -324,20 +342,49 @@ def _per_square(markers: Markers, board: Charuco) -> FloatArray:
     return np.asarray(0.5 * sides * (board.square_mm / board.marker_mm))
 
 
+def _first_ids(markers: Markers, target: Charuco) -> list[Charuco]:
+    """Boards with another first marker that the markers fit better than any other of them."""
+    low, high = np.quantile(markers.ids, _MOST_READ)
+    n_known = len(dictionary_of(target.dictionary).bytesList)
+    n = len(target.marker_squares)
+    numbers = range(max(0, int(high) - n + 1), min(int(low), n_known - n) + 1)
+    best, fits = DECISIVE - 1, list[Charuco]()
+    for first in numbers:
+        for board in _layouts(replace(target, first_id=first)):
+            fit = _fit(markers.counted_from(first), board)
+            if not fit.is_fitting or fit.n_agreeing < max(best, DECISIVE):
+                continue
+            fits = [*fits, board] if fit.n_agreeing == best else [board]
+            best = fit.n_agreeing
+    return fits
+
+
 def _misfit(
     exposure: Exposure, target: Charuco, markers: Markers, fitting: list[Charuco]
 ) -> FitFailure:
     """The markers contradict the board; say which they fit."""
     swapped = replace(target, columns=target.rows, rows=target.columns, layout="either")
-    others = fitting or _fitting(markers, _layouts(swapped))
+    own = markers.counted_from(target.first_id)
+    others = fitting or _fitting(own, _layouts(swapped))
     reason = (
         f"{exposure.source}: {len(markers.ids)} markers of {target.dictionary} were read, which do "
         f"not lie as on a board of {target.columns} x {target.rows} squares"
     )
+    if target.first_id:
+        reason += f" and markers from {target.first_id} on"
     if fitting:
         reason += f" in OpenCV's {target.layout} layout"
     if not others:
-        return FitFailure(reason, "check columns, rows and lengths of the board")
+        firsts = _first_ids(markers, target)
+        if not firsts:
+            return FitFailure(reason, "check columns, rows and lengths of the board")
+        others, swapped = firsts, replace(firsts[0], layout="either")
+        if len({board.first_id for board in firsts}) > 1:
+            numbers = ", ".join(str(k) for k in sorted({board.first_id for board in firsts}))
+            return FitFailure(
+                f"{reason}, but as on one whose first marker is one of {numbers}",
+                f"give the first marker's number, as in {format_target(swapped)}",
+            )
     right = others[0] if len(others) == 1 else swapped
     text = format_target(right)
     return FitFailure(f"{reason}, but as on {text}", f"write {text}")
@@ -370,14 +417,19 @@ def detect_target(exposure: Exposure, target: Target) -> TargetView | FitFailure
         return detect_circle_grid(exposure, target)
     if isinstance(target, Chessboard):
         return detect_chessboard(exposure, target)
-    return detect_charuco(exposure, target)
+    if isinstance(target, Charuco):
+        return detect_charuco(exposure, target)
+    return detect_april_grid(exposure, target)
 
 
 def settle_target(exposures: Iterable[Exposure], target: Target) -> Target:
     """The target with what its name leaves open, told by the first exposures that show it.
 
-    That is the layout of a ChArUco board; the target as it is where none of the exposures tells.
+    That is the layout of a ChArUco board, and border and order of rows of an AprilGrid; the target
+    as it is where none of the exposures tells.
     """
+    if isinstance(target, AprilGrid):
+        return settle_order(exposures, target)
     return settle_layout(exposures, target) if isinstance(target, Charuco) else target
 
 

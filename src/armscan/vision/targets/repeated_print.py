@@ -26,7 +26,14 @@ from armscan.geometry.poses import Board, Pose
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.image import less_noise, local_moments
-from armscan.vision.targets.target import Charuco, Chessboard, CircleGrid, Target, TargetView
+from armscan.vision.targets.target import (
+    AprilGrid,
+    Charuco,
+    Chessboard,
+    CircleGrid,
+    Target,
+    TargetView,
+)
 
 Floats32: TypeAlias = NDArray[np.float32]
 
@@ -104,7 +111,7 @@ MOST_STRETCHED = 0.1
 
 def does_repeat(target: Target) -> bool:
     """Whether a target's print is the same in cells enough to be told from them."""
-    if isinstance(target, Charuco) or abs(target.stretch - 1.0) > MOST_STRETCHED:
+    if isinstance(target, Charuco | AprilGrid) or abs(target.stretch - 1.0) > MOST_STRETCHED:
         return False
     return bool(min(np.bincount(_kinds(target))) >= LEAST_CELLS)
 

@@ -94,7 +94,10 @@ first square of the board is dark, in the old one that of the last row. Either: 
 
 @dataclass(frozen=True, slots=True)
 class Charuco:
-    """ChArUco board, counted in squares; its points are the inner corners."""
+    """ChArUco board, counted in squares; its points are the inner corners.
+
+    Its markers bear the numbers from ``first_id`` on.
+    """
 
     columns: int
     rows: int
@@ -102,6 +105,7 @@ class Charuco:
     marker_mm: float
     dictionary: str
     layout: CharucoLayout = "either"
+    first_id: int = 0
     symmetric_turns: ClassVar[tuple[int, ...]] = ()
 
     @property
@@ -129,7 +133,78 @@ class Charuco:
         return self.square_mm
 
 
-Target: TypeAlias = CircleGrid | Chessboard | Charuco
+RowOrder = Literal["either", "up", "down"]
+"""Whether the numbers of an AprilGrid's tags, which grow to the right, go on in the row above
+(Kalibr's print) or below. Either: the image tells."""
+KALIBR_SPACING = 0.3
+APRIL_FAMILIES = {
+    "tag36h11": "DICT_APRILTAG_36h11",
+    "tag36h10": "DICT_APRILTAG_36h10",
+    "tag25h9": "DICT_APRILTAG_25h9",
+    "tag16h5": "DICT_APRILTAG_16h5",
+}
+"""OpenCV's names of the families of AprilTags, the usual one first."""
+BORDER_BITS = (2, 1)
+"""Widths of a tag's black border, in cells of its code: Kalibr prints two."""
+
+
+@dataclass(frozen=True, slots=True)
+class AprilGrid:
+    """Grid of AprilTags, dark squares between their corners; counted in tags.
+
+    Its points are the corners of the tags' black borders, each of which touches that of a small
+    square, so that four sectors alternate as on a chessboard.
+
+    Parameters
+    ----------
+    columns, rows
+        Count of tags.
+    tag_mm
+        Side of a tag, border included.
+    spacing
+        Way from a tag to the next, in sides of a tag: the side of the small squares.
+    family, first_id
+        Code of the tags, and the smallest number: tags are numbered row by row.
+    border_bits
+        Width of their border, in cells of the code; 0 where the image tells.
+    order
+        Where the next row of numbers is.
+    """
+
+    columns: int
+    rows: int
+    tag_mm: float
+    spacing: float = KALIBR_SPACING
+    family: str = "tag36h11"
+    first_id: int = 0
+    border_bits: int = 0
+    order: RowOrder = "either"
+    symmetric_turns: ClassVar[tuple[int, ...]] = ()
+
+    @property
+    def pitch(self) -> float:
+        """From a tag to the next, in sides of a tag."""
+        return 1.0 + self.spacing
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4 * columns * rows, 2) corners of tags in sides of a tag, row by row from the top."""
+        j, i = np.mgrid[: 2 * self.rows, : 2 * self.columns]
+        cell = np.stack([i, j], axis=-1).reshape(-1, 2)
+        return np.asarray(self.pitch * (cell // 2) + cell % 2, dtype=np.float64)
+
+    @property
+    def points_board_mm(self) -> FloatArray:
+        """(4 * columns * rows, 3) corners of tags in the Board frame, row by row from the top."""
+        return np.pad(self.corners * self.tag_mm, ((0, 0), (0, 1)))
+
+    @property
+    def size_mm(self) -> float:
+        """The length whose wrong value scales every result."""
+        return self.tag_mm
+
+
+Target: TypeAlias = CircleGrid | Chessboard | Charuco | AprilGrid
 
 
 EXAMPLES = {
@@ -137,6 +212,7 @@ EXAMPLES = {
     "asymmetric-circle-grid": "asymmetric-circle-grid:4x11:5",
     "chessboard": "chessboard:11x6:13",
     "charuco": "charuco:10x7:4:3:DICT_4X4_50",
+    "aprilgrid": "aprilgrid:6x6:88:0.3",
 }
 """A right specification of each kind of target."""
 
@@ -144,7 +220,16 @@ SMALLEST_UNASKED_MM = 0.1
 """A smaller length without a unit is asked about: it was likely meant in metres."""
 _UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 MOST_STRETCH = 2.0
-_MIN_COUNT = {"circle-grid": 3, "asymmetric-circle-grid": 2, "chessboard": 3, "charuco": 3}
+_UNEVEN = 1e-3
+LEAST_SPACING = 0.05
+"""Of an AprilGrid: between tags that are nearer to each other no corner is seen by itself."""
+_MIN_COUNT = {
+    "circle-grid": 3,
+    "asymmetric-circle-grid": 2,
+    "chessboard": 3,
+    "charuco": 3,
+    "aprilgrid": 2,
+}
 
 
 def parse_target(text: str) -> Target:
@@ -154,11 +239,13 @@ def parse_target(text: str) -> Target:
     ----------
     text
         ``circle-grid:COLSxROWS:PITCH_MM``, ``asymmetric-circle-grid:COLSxROWS:PITCH_MM``,
-        ``chessboard:COLSxROWS:SQUARE_MM`` (inner corners) or
-        ``charuco:COLSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY`` (squares), which ``:old`` or ``:new``
-        may follow. A length is in mm unless it bears a unit: ``13``, ``13mm``, ``1.3cm``,
-        ``0.013m``. A print that came out longer one way than the other has two: ``13x13.1`` is
-        from column to column and from row to row; not of a ChArUco board.
+        ``chessboard:COLSxROWS:SQUARE_MM`` (inner corners),
+        ``charuco:COLSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY`` (squares), which ``:first=ID``,
+        ``:old`` or ``:new`` may follow, or ``aprilgrid:COLSxROWS:TAG_MM:SPACING`` (tags), which
+        ``:first=ID``, ``:border=BITS``, ``:family=NAME``, ``:up`` or ``:down`` may follow.
+        A length is in mm unless it bears a unit: ``13``, ``13mm``, ``1.3cm``, ``0.013m``.
+        A print that came out longer one way than the other has two: ``13x13.1`` is
+        from column to column and from row to row; not of a board with markers.
 
     Raises
     ------
@@ -172,13 +259,15 @@ def parse_target(text: str) -> Target:
             where=f"target '{text}'",
             remedy=f"write for example {EXAMPLES['chessboard']}",
         )
-    n_fields = 4 if kind == "charuco" else 2
-    has_layout = kind == "charuco" and len(fields) == n_fields + 1
-    if len(fields) != n_fields and not has_layout:
+    n_fields = {"charuco": 4, "aprilgrid": 3}.get(kind, 2)
+    may_have_more = kind in ("charuco", "aprilgrid")
+    if len(fields) < n_fields or (len(fields) > n_fields and not may_have_more):
         raise _wrong(text, kind, f"needs {n_fields} fields after '{kind}', has {len(fields)}")
     columns, rows = _counts(text, kind, fields[0])
     if kind == "charuco":
         return _charuco(text, columns, rows, fields)
+    if kind == "aprilgrid":
+        return _april_grid(text, columns, rows, fields)
     name = "square" if kind == "chessboard" else "pitch"
     lengths = [
         _length_mm(text, kind, name, part) for part in re.split("[xX]", fields[1], maxsplit=1)
@@ -206,7 +295,14 @@ def format_target(target: Target) -> str:
     if isinstance(target, Charuco):
         text = f"charuco:{counts}:{target.square_mm:.12g}:{target.marker_mm:.12g}"
         layout = "" if target.layout == "either" else f":{target.layout}"
-        return f"{text}:{target.dictionary}{layout}"
+        first = f":first={target.first_id}" if target.first_id else ""
+        return f"{text}:{target.dictionary}{first}{layout}"
+    if isinstance(target, AprilGrid):
+        more = {"family": target.family, "first": target.first_id, "border": target.border_bits}
+        usual = {"family": "tag36h11", "first": 0, "border": 0}
+        options = [f":{name}={value}" for name, value in more.items() if value != usual[name]]
+        options += [] if target.order == "either" else [f":{target.order}"]
+        return f"aprilgrid:{counts}:{target.tag_mm:.12g}:{target.spacing:.12g}{''.join(options)}"
     if isinstance(target, CircleGrid):
         kind = "asymmetric-circle-grid" if target.is_asymmetric else "circle-grid"
         return f"{kind}:{counts}:{_pitches(target)}"
@@ -227,11 +323,13 @@ def as_two_lengths(points_board_mm: FloatArray, stretch: float) -> str:
         counts.append(len(lines))
         pitches.append(float(np.diff(lines).min()))
     x, y = pitches[0], pitches[1] * (1.0 + stretch)
-    if counts[0] == counts[1] or not MOST_STRETCH**-1 < y / x < MOST_STRETCH:
+    ways = np.diff(np.unique(points_board_mm[:, 0].round(6)))
+    is_even = float(np.ptp(ways)) < _UNEVEN * pitches[0]
+    if counts[0] == counts[1] or not is_even or not MOST_STRETCH**-1 < y / x < MOST_STRETCH:
         return "print another"
     return (
-        f"give both lengths, {x:.6g}x{y:.5g} for its pitch or square (of ChArUco, which has one, "
-        "print another)"
+        f"give both lengths, {x:.6g}x{y:.5g} for its pitch or square (of a board with markers, "
+        "which has one, print another)"
     )
 
 
@@ -243,6 +341,10 @@ def describe_target(target: Target) -> str:
         return f"{target.columns} x {target.rows} circles, first to last centre {size}"
     less = 1 if isinstance(target, Charuco) else 0
     counts = f"{target.columns - less} x {target.rows - less}"
+    if isinstance(target, AprilGrid):
+        last = target.first_id + target.columns * target.rows - 1
+        numbers = f"{target.family}, {target.first_id} to {last}"
+        return f"{counts} tags of {numbers}, first to last corner {size}"
     is_old = isinstance(target, Charuco) and target.layout == "old"
     layout = ", old layout (OpenCV before 4.6)" if is_old else ""
     return f"{counts} inner corners, first to last {size}{layout}"
@@ -259,22 +361,89 @@ def _charuco(text: str, columns: int, rows: int, fields: list[str]) -> Charuco:
     code = getattr(cv2.aruco, name, None)
     if not isinstance(code, int):
         raise _wrong(text, kind, f"'{fields[3]}' is no ArUco dictionary")
-    n_markers = columns * rows // 2
+    options = _options(text, kind, fields[4:], {"first": "", "layout": "old new"})
+    first = _first_id(text, kind, options, name, columns * rows // 2)
+    layout: CharucoLayout = "either"
+    if "layout" in options:
+        layout = "old" if options["layout"] == "old" else "new"
+    return Charuco(columns, rows, square_mm, marker_mm, name, layout, first)
+
+
+def _april_grid(text: str, columns: int, rows: int, fields: list[str]) -> AprilGrid:
+    kind = "aprilgrid"
+    tag_mm = _length_mm(text, kind, "tag", fields[1])
+    spacing = _spacing(text, tag_mm, fields[2])
+    known = {"first": "", "border": "1 2", "family": "", "order": "up down"}
+    options = _options(text, kind, fields[3:], known)
+    family = options.get("family", "tag36h11").lower()
+    family = family if family.startswith("tag") else f"tag{family}"
+    if family not in APRIL_FAMILIES:
+        families = ", ".join(APRIL_FAMILIES)
+        raise _wrong(text, kind, f"'{options['family']}' is no family; known are {families}")
+    first = _first_id(text, kind, options, APRIL_FAMILIES[family], columns * rows)
+    order: RowOrder = "either"
+    if "order" in options:
+        order = "up" if options["order"] == "up" else "down"
+    bits = int(options.get("border", 0))
+    return AprilGrid(columns, rows, tag_mm, spacing, family, first, bits, order)
+
+
+def _spacing(text: str, tag_mm: float, field: str) -> float:
+    """Of an AprilGrid: a part of the tag's side as of Kalibr, or a length with a unit."""
+    kind = "aprilgrid"
+    is_bare = re.fullmatch(r"\d+\.?\d*|\.\d+", field) is not None
+    spacing = float(field) if is_bare else _length_mm(text, kind, "spacing", field) / tag_mm
+    if is_bare and spacing >= 1.0:
+        raise OptionError(
+            f"a spacing of {field} times the tag's side: is it mm",
+            where=f"target '{text}'",
+            remedy=f"write {field}mm, or {spacing / tag_mm:.4g}, its part of the tag's side",
+        )
+    if not LEAST_SPACING <= spacing < 1.0:
+        raise _wrong(
+            text, kind, f"a spacing of {spacing:.3g} times the tag's side: {LEAST_SPACING} to 1"
+        )
+    return spacing
+
+
+def _first_id(text: str, kind: str, options: dict[str, str], name: str, n_markers: int) -> int:
+    """The number of the first marker; the dictionary of that name must have the last one, too."""
+    field = options.get("first", "0")
+    if not re.fullmatch(r"\d{1,4}", field):
+        raise _wrong(text, kind, f"'{field}' is no number of a marker")
+    first = int(field)
+    code = int(getattr(cv2.aruco, name))
     n_known = len(cv2.aruco.getPredefinedDictionary(code).bytesList)
-    if n_markers > n_known:
-        raise _wrong(text, kind, f"the board needs {n_markers} markers, {name} has {n_known}")
-    return Charuco(columns, rows, square_mm, marker_mm, name, _layout(text, fields[4:]))
+    if first + n_markers > n_known:
+        begin = f" from {first} on" if first else ""
+        raise _wrong(
+            text, kind, f"the board needs {n_markers} markers{begin}, {name} has {n_known}"
+        )
+    return first
 
 
-def _layout(text: str, fields: list[str]) -> CharucoLayout:
-    match [field.lower() for field in fields]:
-        case []:
-            return "either"
-        case ["old"]:
-            return "old"
-        case ["new"]:
-            return "new"
-    raise _wrong(text, "charuco", f"'{fields[0]}' is no layout: old or new, or leave it out")
+def _options(text: str, kind: str, fields: list[str], known: dict[str, str]) -> dict[str, str]:
+    """What follows a specification: ``name=value``, or a word that tells by itself what it is.
+
+    ``known``: Names, with the values that each may have, blanks between; any where there are none.
+    """
+    words = {word: name for name, values in known.items() for word in values.split()}
+    options: dict[str, str] = {}
+    for field in fields:
+        name, equals, value = field.lower().partition("=")
+        if not equals:
+            name, value = ("" if name.isdigit() else words.get(name, "")), name
+        if name not in known or name in options:
+            usual = [f"{name}=" for name in known if name not in words.values()]
+            usual += [word if word.isalpha() else f"{words[word]}={word}" for word in words]
+            raise _wrong(
+                text, kind, f"'{field}' may not follow; {', '.join(usual)} may, each kind once"
+            )
+        if known[name] and value not in known[name].split():
+            allowed = known[name].replace(" ", " or ")
+            raise _wrong(text, kind, f"'{value}' is no {name}: {allowed}, or leave it out")
+        options[name] = value
+    return options
 
 
 def _counts(text: str, kind: str, field: str) -> tuple[int, int]:

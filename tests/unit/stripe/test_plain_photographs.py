@@ -9,7 +9,7 @@ from armscan.records.exposure import Exposure, SensorWindow
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import is_thresholded, lit_plane, mono_plane
 from armscan.vision.stripe.ridge import find_candidates, find_line_sigma, measure_level
-from rigs.stripe_image import StripeScene
+from rigs.stripe_image import StripeNoise, StripeScene
 from rigs.stripe_scenes import line
 
 
@@ -141,3 +141,13 @@ def test_what_a_camera_saw_in_black_and_white_is_no_threshold() -> None:
         assert not is_thresholded(scene.expose(1))
     assert not is_thresholded(StripeScene((), 320, 240).expose(1))
     assert not is_thresholded(Exposure(np.zeros((240, 320), np.uint8), "dark"))
+
+
+@pytest.mark.parametrize("peak", [7.0, 14.0, 22.0])
+@pytest.mark.parametrize("side_px", [1, 9, 60])
+def test_a_dim_line_beside_something_white_is_no_threshold(side_px: int, peak: float) -> None:
+    """A hot pixel, a glint, a window: nothing lies between white and what is less than a tenth."""
+    scene = StripeScene((line(0.5, peak=peak),), 320, 240, noise=StripeNoise(0.05, 0.0), bits=12)
+    bright = scene.expose(1).image.copy()
+    bright[20 : 20 + side_px, 30 : 30 + side_px] = 4095
+    assert not is_thresholded(Exposure(bright, "dim", bits_used=12))

@@ -106,10 +106,10 @@ def extract_stripes(
         If the background's size or window differs from the exposure's.
     """
     options = options or StripeOptions()
-    if background is not None:
-        check_background(exposure, background)
     if exposure.is_colourless and (background is None or background.is_colourless):
         exposure, background = exposure.as_mono(), background and background.as_mono()
+    if background is not None:
+        check_background(exposure, background)
     if background is not None:
         background = laid_under(background, exposure)
     elif is_thresholded(exposure):

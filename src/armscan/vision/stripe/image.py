@@ -270,6 +270,9 @@ DIM, BRIGHT, LEAST_BETWEEN = 0.1, 0.9, 0.02
 """Of full scale. A lens and a sensor leave 40 to 100 % of the pixels that are not dark between the
 two (photographs of ten strangers, over-exposed ones among them), a threshold none."""
 FEW_PX = 32
+BLACK, BLOCK_PX, LEAST_GREY, LEAST_WHITE_PX = 0.03, 8, 0.001, 40
+"""What a threshold made black stays so, but for the ripples of JPEG in the blocks beside white: not
+so a dim line beside a glint or a window. Less white than a line's is some hot pixels."""
 SOFT_PX = 1.0
 ROUNDED_PX = math.sqrt(1.0 / 24.0)
 """Scatter of the mean of two edges, each rounded to a whole pixel."""
@@ -280,13 +283,21 @@ def is_thresholded(exposure: Exposure) -> bool:
 
     Of others a few rows and columns tell.
     """
-    image = exposure.image
+    image, full_scale = exposure.image, exposure.full_scale
     if image.ndim > 2:
         return False
     few = (image[::FEW_PX], image[:, ::FEW_PX])
-    return _is_black_and_white(few, exposure.full_scale) and _is_black_and_white(
-        (image,), exposure.full_scale, least=1
-    )
+    is_so = _is_black_and_white(few, full_scale)
+    is_so = is_so and _is_black_and_white((image,), full_scale, LEAST_WHITE_PX)
+    return is_so and _is_black_elsewhere(image, full_scale)
+
+
+def _is_black_elsewhere(image: ImageArray, full_scale: int) -> bool:
+    """Whether what is far from white pixels is black."""
+    is_white = (image >= int(BRIGHT * full_scale)).view(np.uint8)
+    near = cv2.dilate(is_white, np.ones((2 * BLOCK_PX + 1, 2 * BLOCK_PX + 1), np.uint8))
+    n_grey = np.count_nonzero((image > int(BLACK * full_scale)) & (near == 0))
+    return bool(n_grey <= LEAST_GREY * np.count_nonzero(is_white))
 
 
 def _is_black_and_white(parts: Sequence[ImageArray], full_scale: int, least: int = 0) -> bool:

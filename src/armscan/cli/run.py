@@ -30,6 +30,13 @@ def give_kernels_a_folder(package: Path, temporary: Path | None = None) -> None:
 
     Without one, numba refuses every kernel. What a folder holds is run as code, so that one that
     another user made, or may write, is not taken.
+
+    Parameters
+    ----------
+    package
+        The installed package, beside whose kernels numba keeps them where it can.
+    temporary
+        Folder for temporary files; that of the system if None.
     """
     if VARIABLE in os.environ:
         return
@@ -105,6 +112,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 means done, 1 that a check was made and not passed, 2 that the input or the disk stood in the
     way (one sentence on standard error says what to do), 130 that a person interrupted, 143 that
     another program asked it to end, 70 a bug.
+
+    Parameters
+    ----------
+    arguments
+        Words after ``armscan``; those of the process if None.
     """
     gc.set_threshold(YOUNG_OBJECTS)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")

@@ -228,10 +228,20 @@ class SessionSettings:
     ----------
     rig
         The rig that fills it: path of ``rig.toml``, or ``twin:HEAD?seed=1``; empty for none.
+    target
+        Specification of the calibration target.
+    n_cameras
+        Cameras of the head.
     ball_mm
         Certified diameter of the reference ball.
+    part
+        Model of the part that scans are compared with; empty for none.
     tolerance
         As of ``armscan inspect cad``; empty for none.
+    needs_latency
+        Camera and arm have no trigger in common.
+    seeing
+        In place of what the rig's description says; None for that.
     """
 
     rig: str = ""

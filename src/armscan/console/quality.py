@@ -169,8 +169,16 @@ def deviations_mm(
 ) -> tuple[Pose[Cad, Part], FloatArray]:
     """Signed distances of a cloud from the model of its part, positive outside.
 
-    ``pose``: where they lie on it; None to lay them as
-    `armscan.inspection.cad.alignment.align_best`.
+    Parameters
+    ----------
+    part
+        The model.
+    points_mm
+        (N, 3) points.
+    pose
+        Where they lie on it; None to lay them as `armscan.inspection.cad.alignment.align_best`.
+    progress
+        Not told.
 
     Returns
     -------
@@ -178,6 +186,11 @@ def deviations_mm(
         As given or found.
     deviation
         (N,) mm; nan beyond 5 mm, as of a table beside the part.
+
+    Raises
+    ------
+    ArmscanError
+        If the model is unreadable, or the points do not fit it.
     """
     surface = _surface(str(part), part.stat().st_mtime_ns)
     if pose is None:

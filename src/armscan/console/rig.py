@@ -191,7 +191,7 @@ class _HandCamera:
     def stop(self) -> None:
         """Deliver no more than what is being rendered now."""
         with self.hand.exposing:
-            """That is out."""
+            pass
 
     def close(self) -> None:
         """Nothing to give back."""

@@ -175,8 +175,22 @@ class Bench(Protocol):
 class ScanRecorder(LiveRecorder):
     """Records a live scan to one file, and knows what came with which frame.
 
-    ``keeps_times``: times are the devices' own, of one clock: a simulated hand arrives as fast as
-    its images are rendered, and this computer's time says nothing of it.
+    Parameters
+    ----------
+    path, rig
+        As of `LiveRecorder`.
+    keeps_times
+        Times are the devices' own, of one clock: a simulated hand arrives as fast as its images are
+        rendered, and this computer's time says nothing of it.
+
+    Attributes
+    ----------
+    pose_of
+        The tool's pose by the instant's number.
+    latest_joints_rad
+        (J,) angles of the arm, where it gives them.
+    n_left_out
+        Exposures that were taken back.
     """
 
     def __init__(self, path: Path, rig: Rig, *, keeps_times: bool = False) -> None:

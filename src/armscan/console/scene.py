@@ -47,8 +47,20 @@ STEEP_DEG = 60.0
 class ShownPoints:
     """Points to show, whatever they come from.
 
-    ``incidence_deg`` (N,) is the angle of normal and line of sight, ``deviation_mm`` (N,) from the
-    part's model; None where not known. Colours end at ``limit_mm``.
+    Parameters
+    ----------
+    points_mm
+        (N, 3) in their frame.
+    sheet
+        (N,) index of the sheet.
+    sigma_mm
+        (N,) standard deviation.
+    incidence_deg
+        (N,) angle between normal and line of sight; None where not known.
+    deviation_mm
+        (N,) from the model of the part; None where not compared.
+    limit_mm
+        At which deviation the colours end.
     """
 
     points_mm: FloatArray

@@ -86,7 +86,17 @@ def cells_of(numbers: IntArray) -> IntArray:
 
 @dataclass(slots=True, eq=False)
 class CellSums:
-    """Sums of K values over cells; past ``most_bytes`` runs go into a folder, if there is one."""
+    """Sums of K values over cells.
+
+    Parameters
+    ----------
+    n_values
+        K.
+    folder
+        Where runs go; None keeps all in memory however many cells there are.
+    most_bytes
+        Memory before a run is written.
+    """
 
     n_values: int
     folder: Path | None = None

@@ -193,10 +193,24 @@ def levenberg_marquardt(
 ) -> Minimum[S, DenseSystem] | None:
     """Minimise the sum of squared residuals over a state.
 
-    ``linearise`` gives whitened residuals (N,) at a state and their derivative (N, K) by a step
-    from it, or None where the state is impossible, as the start may be; ``retract`` the state after
-    a step (K,). It ends where a step lowers chi2 by less than the part ``settled``, or after
-    ``max_steps`` evaluations.
+    Parameters
+    ----------
+    start
+        Where to begin.
+    linearise
+        Whitened residuals (N,) at a state and their derivative (N, K) by a step from it, or None
+        where the state is impossible.
+    retract
+        The state after a step (K,).
+    settled
+        Part of chi2 by which a step must lower it.
+    max_steps
+        Most evaluations.
+
+    Returns
+    -------
+    Minimum
+        None if the start is impossible.
     """
 
     def evaluate(state: S) -> tuple[float, DenseSystem] | None:

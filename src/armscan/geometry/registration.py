@@ -38,9 +38,14 @@ it would be uncertain by more than a tenth of a radian."""
 
 
 class PointPairs(RowRecord):
-    """The same N points in two frames, A and B, each with its covariance (N, 3, 3).
+    """The same N points in two frames, A and B, each with its covariance.
 
-    These are independent between points and lists; their sum is positive definite.
+    Parameters
+    ----------
+    points_a_mm, points_b_mm
+        (N, 3).
+    covariance_a_mm2, covariance_b_mm2
+        (N, 3, 3), independent between points and lists; their sum is positive definite.
     """
 
     points_a_mm: FloatArray = floats("N", 3)

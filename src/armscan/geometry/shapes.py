@@ -66,7 +66,15 @@ class Plane(ArrayRecord, kw_only=False):
 
 
 def fit_line(points: FloatArray, weights: FloatArray | None = None) -> Line | FitFailure:
-    """Fit a line to (N, D) points: least squared distances, weighted by 1 / variance (N,)."""
+    """Fit a line to (N, D) points: least sum of squared distances.
+
+    Parameters
+    ----------
+    points
+        (N, D) points.
+    weights
+        (N,) one over variance, or None for equal ones.
+    """
     points = np.asarray(points, dtype=np.float64)
     w = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
     if int((w > 0.0).sum()) < 2:

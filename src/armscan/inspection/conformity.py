@@ -331,6 +331,15 @@ def check_exposures_off(
 ) -> Check | None:
     """Count exposures that show the standard somewhere else than the fit has it.
 
+    Parameters
+    ----------
+    cloud
+        All points.
+    found
+        The fit.
+    within
+        (N,) points in the region that was asked for.
+
     Returns
     -------
     Check

@@ -132,7 +132,22 @@ class FeatureInspection(ArrayRecord):
 def inspect_feature(
     cloud: PointCloud, wanted: WantedFeature, options: InspectionOptions | None = None
 ) -> FeatureInspection | FitFailure:
-    """Find a feature in a cloud, fit it, and say how well it is known."""
+    """Find a feature in a cloud, fit it, and say how well it is known.
+
+    Parameters
+    ----------
+    cloud
+        Points in any frame; other faces may be among them.
+    wanted
+        What is looked for.
+    options
+        Which points belong to it; the default if None.
+
+    Raises
+    ------
+    InputError
+        If there are too few points.
+    """
     selection = select(cloud, wanted.region, options)
     sample = sample_of(selection)
     start = find_shape(sample, wanted)

@@ -40,9 +40,24 @@ def inspect_plane(
 ) -> PlaneInspection | FitFailure:
     """Inspect a flat face.
 
-    ``reference``: the plane to be met, in the same frame; without it the plane that most points lie
-    near is looked for, and only the fitted reference is reported. ``reference_text``: where it came
-    from, for the definitions.
+    Parameters
+    ----------
+    cloud
+        Points in any frame.
+    reference
+        The plane to be met, in the same frame; without it the plane that most points lie near is
+        looked for, and only the fitted reference is reported.
+    reference_text
+        Where it came from, for the definitions.
+    region
+        Only points inside are looked at.
+    options
+        What belongs to the face; the default if None.
+
+    Raises
+    ------
+    InputError
+        If there are too few points.
     """
     selection = select(cloud, region, options)
     points = selection.points_mm

@@ -102,9 +102,22 @@ class RecipeStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recipe:
-    """What is done with every part; ``features``, ``relations`` and ``steps`` after the alignment.
+    """What is done with every part.
 
-    Without a ``surface`` features alone are measured, in the cloud's own frame.
+    Parameters
+    ----------
+    title
+        Of the inspection.
+    surface
+        Of the part's model; None to measure features alone, in the cloud's own frame.
+    align, datums
+        How the cloud is laid on it, and what that rests on.
+    options
+        Tolerances of the faces.
+    cleaning
+        Filters before all else; None for none.
+    features, relations, steps
+        What is measured after the alignment.
     """
 
     title: str = ""
@@ -163,8 +176,25 @@ class PartQuantity:
 class FollowedRecipe:
     """What a recipe found on one part.
 
-    ``placed`` is the cloud where features were measured, in Cad or its own frame; ``quantities``
-    are in the recipe's order, then the faces that have a tolerance.
+    Parameters
+    ----------
+    cloud
+        After cleaning, in the cloud's own frame.
+    cleaning
+        What the filters took; None without filters.
+    errors_known
+        True if the cloud's covariances were used.
+    comparison
+        With the model; None without one.
+    placed
+        The same cloud where the features were measured: in Cad, or its own frame.
+    features
+        Those that were found, by name.
+    quantities
+        Each value: features, relations and steps as in the recipe, then the faces that have a
+        tolerance.
+    notes
+        What was not found, and why.
     """
 
     cloud: PointCloud

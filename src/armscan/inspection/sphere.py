@@ -41,7 +41,24 @@ def inspect_sphere(
     region: Box | None = None,
     options: InspectionOptions | None = None,
 ) -> SphereInspection | FitFailure:
-    """Find a ball of known diameter anywhere in a cloud and inspect it."""
+    """Find a ball of known diameter anywhere in a cloud and inspect it.
+
+    Parameters
+    ----------
+    cloud
+        Points in any frame; other objects may be among them.
+    diameter_mm
+        Of the standard ball.
+    region
+        Only points inside are looked at.
+    options
+        What belongs to the ball; the default if None.
+
+    Raises
+    ------
+    InputError
+        If there are too few points or the diameter is not positive.
+    """
     if not 0.0 < diameter_mm < 1e4:
         raise InputError(f"a ball of {diameter_mm:g} mm diameter", remedy="give the diameter in mm")
     selection = select(cloud, region, options)

@@ -277,8 +277,24 @@ def inspect_step(
     height is ``d cos(e)``, with e from ``normal`` if that is given, else zero. Only e is taken
     from ``normal``: a direct projection on it would turn an error of 0.1 degrees into 0.03 mm.
 
-    ``normal``: (3,) normal of the faces in the cloud's frame, from the arm's pose and a plate; used
-    for a single exposure only.
+    Parameters
+    ----------
+    cloud
+        Points in any frame.
+    height_mm
+        Nominal height.
+    normal
+        (3,) normal of the faces in the cloud's frame, from the arm's pose and a plate; used for a
+        single exposure only.
+    region
+        Only points inside are looked at.
+    options, step_options
+        What belongs to the faces; the defaults if None.
+
+    Raises
+    ------
+    InputError
+        If there are too few points, the height is not positive, or the normal is zero.
     """
     if not 0.0 < height_mm < 1e4:
         raise InputError(f"a step {height_mm} mm high", remedy="give the height in mm")

@@ -163,9 +163,24 @@ class Artefact:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandEyeInputs:
-    """What was read: ``groups`` are the name and stripes of each recording, or of all profiles.
+    """What was read.
 
-    ``sensor`` and ``recordings`` are absent with profiles, ``plate`` for a sphere.
+    Parameters
+    ----------
+    groups
+        Name and stripes of each recording, or of all profiles.
+    sensor
+        The sensor's calibration; None with profiles.
+    plate
+        The plate; None for a sphere.
+    files
+        All files that went in.
+    warnings
+        What is odd about the recordings, in words.
+    is_simulated
+        True if any recording was rendered.
+    recordings
+        One a group; none with profiles.
     """
 
     groups: tuple[tuple[str, ObservedStripes], ...]
@@ -324,11 +339,28 @@ def calibrate_latency(
     arm: Path | None = None,
     stripe_options: StripeOptions | None = None,
 ) -> Summary:
-    """Find the time between camera and arm over a flat plate, and write the scanner's document with
-    it.
+    """Find the time between camera and arm, and write the scanner's document with it.
 
     Clocks that are not shared have a time of their own in every recording: it is told, and no
     document is written.
+
+    Parameters
+    ----------
+    job
+        Where to write the document ``NAME.json`` and its page.
+    scan
+        Recording of a flat plate, the head moved nearer and away.
+    scanner
+        The document ``scanner.json`` so far.
+    arm
+        ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
+    stripe_options
+        Of stripe extraction.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable, or the motion does not tell the time; nothing is written then.
     """
     stripe_options = stripe_options or StripeOptions()
     places = job.places(".json", beside=(".npz", ".html"))

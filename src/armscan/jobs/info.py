@@ -47,7 +47,6 @@ from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import image_format, read_exposure
 from armscan.storage.observations import read_observations
 from armscan.storage.parts.meshes import read_part
-from armscan.storage.points import COVARIANCES as MARKER_COVARIANCES
 from armscan.storage.points import read_marker_list, read_probed_points
 from armscan.storage.recording import FolderRecording, is_recording, read_arm_track, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
@@ -437,11 +436,12 @@ def _is_own_table(data: bytes) -> bool:
     return not COVARIANCE.keys().isdisjoint(heading.split(","))
 
 
-def _are_markers(data: bytes) -> bool:
-    """Whether this is a list of markers that armscan wrote: numbered, of a frame, with sigmas."""
-    lines = data[:1000].decode("utf-8", "replace").splitlines()
-    heading = next((line for line in lines if line[:1] not in ("#", "")), "")
-    return heading.startswith("id,") and not set(MARKER_COVARIANCES).isdisjoint(heading.split(","))
+def _are_markers(path: Path) -> bool:
+    """Whether this is a list of numbered markers, with sigmas or a frame."""
+    with suppress(ArmscanError):
+        found = read_marker_list(path, frame="")
+        return found.has_ids and (bool(found.markers.frame) or not found.is_sigma_assumed)
+    return False
 
 
 OWN_PAGE = b'<meta name="generator" content="armscan">'
@@ -457,7 +457,7 @@ def _text(path: Path, data: bytes) -> dict[str, Any]:
     if path.name in DESCRIBE_NAMED:
         return DESCRIBE_NAMED[path.name](path)
     if path.suffix.lower() == ".csv":
-        return describe_markers(path) if _are_markers(data) else describe_points(path)
+        return describe_markers(path) if _are_markers(path) else describe_points(path)
     if path.suffix.lower() in (".json", ".yaml", ".yml", ".xml"):
         return _camera(read_camera_calibration(path), "camera calibration of another program")
     if path.suffix.lower() == ".txt":

@@ -141,7 +141,7 @@ class Job:
         forced: Sequence[str] = (),
         is_simulated: bool = False,
     ) -> Provenance:
-        """Record of this run, as `armscan.storage.provenance.new_provenance`."""
+        """Record of this run, as `armscan.storage.documents.new_provenance`."""
         made = new_provenance(
             inputs,
             command=self.command,

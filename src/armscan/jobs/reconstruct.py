@@ -152,12 +152,37 @@ def reconstruct(
 
     With a table of poses the files are profiles that a sensor delivered, to be placed in Base.
 
-    ``job``: where to write the cloud, ``NAME.ply`` or another of `CLOUD_SUFFIXES`; ``NAME.html`` is
-    written beside it. ``volume``: part of Base to measure in a recording,
-    ``xmin,xmax,ymin,ymax,zmin,zmax``; empty for all. ``arm``: ``arm.toml`` for recordings of joint
-    angles; None to look for it in the recording. ``cluster``: whose workers extract the stripes of
-    a scan; None to do so here. ``voxel_mm``: edge of the voxels of which each gives one point of
-    the cloud in Base; None for all points.
+    Parameters
+    ----------
+    job
+        Where to write the cloud, ``NAME.ply`` or another of `CLOUD_SUFFIXES`; ``NAME.html`` is
+        written beside it.
+    calibration
+        The sensor's calibration ``sensor.json``, or a ``scanner.json``.
+    paths
+        What to read.
+    volume
+        Part of Base to measure in a recording, ``xmin,xmax,ymin,ymax,zmin,zmax``; empty for all.
+    arm
+        ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
+    poses
+        Of profiles; None for images.
+    options, image_options
+        Of stripes, depths and sheet, and how pixels are read.
+    is_profiled
+        Say what each stage of a scan took.
+    cluster
+        Whose workers extract the stripes of a scan; None to do so here.
+    voxel_mm
+        Edge of the voxels of which each gives one point of the cloud in Base; None for all points.
+    tell
+        Told a line when one of several recordings is done or failed.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable, an option is wrong or does not fit, no exposure has a pose, or
+        nothing was measured; nothing is written then.
     """
     options, image_options = options or MeasureOptions(), image_options or ImageOptions()
     box = Box.parse(volume, "--volume") if volume else None

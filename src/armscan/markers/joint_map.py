@@ -31,7 +31,15 @@ OUTLIER_LEVEL = 1e-3
 
 
 class MarkerObservations(RowRecord):
-    """Which view saw which marker where (K, 3), covariance (K, 3, 3), in the frame of the view."""
+    """Which view saw which marker where.
+
+    Parameters
+    ----------
+    view, marker
+        (K,) indices.
+    point_mm, covariance_mm2
+        (K, 3) and (K, 3, 3) in the frame of the view.
+    """
 
     view: IntArray = ints("N")
     marker: IntArray = ints("N")
@@ -77,8 +85,20 @@ def adjust_jointly(
 ) -> JointMap:
     """Solve all poses but the first and all markers; leave out sightings that do not fit.
 
-    The start is of the chain. The worst sighting is left out, and all solved again, until every one
-    fits at `OUTLIER_LEVEL`; a marker needs two other sightings for that.
+    Parameters
+    ----------
+    sightings
+        Every marker is seen at least once.
+    start
+        A pose for each view, from the chain.
+    markers_mm
+        (M, 3) start of the markers.
+
+    Returns
+    -------
+    JointMap
+        The worst sighting is left out, and all solved again, until every one fits at
+        `OUTLIER_LEVEL`; a marker needs two other sightings for that.
     """
     is_used = np.ones(len(sightings), dtype=bool)
     problem = _Problem(sightings, tuple(start), np.array(markers_mm))

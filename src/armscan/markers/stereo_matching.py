@@ -92,7 +92,16 @@ def match_rings(
     6. Two pairs in one epipolar plane whose order differs between the images contradict each
        other on an opaque surface: both are dropped.
 
-    ``calibration_covariance`` is as of `find_candidates`.
+    Parameters
+    ----------
+    left, right
+        Rings in the two images.
+    views
+        The cameras.
+    calibration_covariance
+        (24, 24) in the order of `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
+    options
+        Thresholds.
     """
     options = RingMatchOptions() if options is None else options
     pairs = find_candidates(left, right, views, calibration_covariance, options)

@@ -288,8 +288,13 @@ def ranks(
 ) -> tuple[IntArray, int]:
     """How well each pair is supported, and the count of planes.
 
-    Rank 3 on a plane of many seeds; 2 near its neighbours' plane, or as large as most markers; 1
-    not far from its neighbours' plane; 0 else.
+    Returns
+    -------
+    rank
+        (K,) 3 on a plane of many seeds; 2 near its neighbours' plane, or as large as most markers;
+        1 not far from its neighbours' plane; 0 else.
+    n_planes
+        Count of homographies found.
     """
     is_on_plane, n_planes = on_planes(pairs, seeds, left, right)
     misfit = depth_misfits(pairs, seeds, left)

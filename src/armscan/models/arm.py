@@ -109,9 +109,18 @@ def thesis_arm(
 ) -> ArmModel:
     """The nominal seven-axis arm of Table 2 (eqs. 2.7 and 2.8).
 
-    ``d_mm`` are (d_1, d_3, d_5, d_7), ``l_mm`` (l_2, l_4, l_6) as Table 2 names them, of which the
-    chain holds the negatives; ``theta_offset_rad`` (7,) the encoder offsets theta_i0. Without
-    ``flange`` Tool is the frame of axis 7.
+    Parameters
+    ----------
+    d_mm
+        (d_1, d_3, d_5, d_7).
+    l_mm
+        (l_2, l_4, l_6) as Table 2 names them: the chain holds their negatives.
+    theta_offset_rad
+        (7,) encoder offsets theta_i0.
+    flange
+        Pose of Tool after axis 7; that of the axis itself if None.
+    name
+        What reports call it.
 
     Raises
     ------

@@ -254,7 +254,15 @@ class SheetCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SecondCamera:
-    """The right camera of a stereo head (eqs. 4.15 and 4.16)."""
+    """The right camera of a stereo head (eqs. 4.15 and 4.16).
+
+    Parameters
+    ----------
+    camera
+        Its calibration.
+    right_from_sensor
+        Where the Sensor frame, that of the left camera, lies in the right camera's.
+    """
 
     camera: CameraCalibration
     right_from_sensor: Pose[CameraRight, Sensor]

@@ -267,6 +267,11 @@ class CameraModel(ArrayRecord):
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Project points, with derivatives (eqs. 2.14 to 2.18).
 
+        Parameters
+        ----------
+        points_sensor_mm
+            (N, 3) points in the camera's frame.
+
         Returns
         -------
         q_px

@@ -91,6 +91,11 @@ class LightSheet(ArrayRecord):
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Signed distance from the sheet along its normal, with derivatives.
 
+        Parameters
+        ----------
+        points_mm
+            (N, 3) points in the Sensor frame.
+
         Returns
         -------
         height_mm
@@ -138,11 +143,21 @@ class LightSheet(ArrayRecord):
         return terms, by_u, by_v
 
     def intersect(self, xy: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Points (N, 3) where the rays ``(x, y, 1)`` through the camera's centre meet the sheet.
+        """Points where the rays ``(x, y, 1)`` through the camera's centre meet the sheet.
 
-        By eq. 2.21, then Newton steps along the ray for the bow. The second value (N,) is False
-        where the ray is parallel to the sheet, meets it behind the camera, or passes by its bow
-        without meeting it; the point is zero then.
+        Parameters
+        ----------
+        xy
+            (N, 2) ideal normalised image coordinates.
+
+        Returns
+        -------
+        points_mm
+            (N, 3) in the Sensor frame (eq. 2.21, then Newton steps along the ray for the bow);
+            zero where there is none.
+        is_valid
+            (N,) False where the ray is parallel to the sheet, meets it behind the camera, or passes
+            by its bow without meeting it.
         """
         rays = homogeneous(xy)
         plane = self.plane

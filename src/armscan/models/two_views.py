@@ -60,6 +60,11 @@ class TwoViews:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Project points into the right image, with derivatives (eqs. 4.17 and 4.18).
 
+        Parameters
+        ----------
+        points_sensor_mm
+            (N, 3) points in the Sensor frame.
+
         Returns
         -------
         q_px
@@ -91,11 +96,24 @@ def epipolar_distances_px(
 ) -> tuple[FloatArray, FloatArray]:
     """Signed distances of matched points from each other's epipolar lines, in each image's pixels.
 
-    A lens bends the epipolar line of eq. 4.26 to a curve. The distance given is that from the curve
-    in the image as taken: the value of ``x_r' E x_l``, whose sign it has, over the length of its
-    gradient by the point's own pixel, correct to first order in the distance. Pixels (N, 2) are as
-    taken, row by row of one point. NaN where a pixel lies beyond what the distortion model can
-    invert, and in an epipole.
+    A lens bends the epipolar line of eq. 4.26 to a curve. The distance given is that from the
+    curve in the image as taken: the value of ``x_r' E x_l`` over the length of its gradient by the
+    point's own pixel, correct to first order in the distance.
+
+    Parameters
+    ----------
+    views
+        The cameras.
+    left_px, right_px
+        (N, 2) pixels as taken, row by row of one point.
+
+    Returns
+    -------
+    in_left_px, in_right_px
+        (N,) distance of the left point from the right point's curve in the left image, and of the
+        right point from the left point's curve in the right image. Both have the sign of
+        ``x_r' E x_l``, which swapping the cameras leaves as it is. NaN where a pixel lies beyond
+        the part of the image that the distortion model can invert, and in an epipole.
     """
     left, left_ok, left_dxy_dq, _ = views.left.undistort_with_jacobian(left_px)
     right, right_ok, right_dxy_dq, _ = views.right.undistort_with_jacobian(right_px)
@@ -320,6 +338,10 @@ class StereoCalibration(ArrayRecord):
         Root mean square over all points of both cameras of the residual vector's length.
     n_pairs, n_points
         What was used; a point that both cameras see counts once.
+    provenance
+        How it came to be.
+    diagnostics
+        Evidence for a reader; None where there is none.
     """
 
     left: CameraCalibration

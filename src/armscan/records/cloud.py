@@ -84,7 +84,15 @@ class CalibrationErrors(ArrayRecord):
     def moves_mm(
         self, points_mm: FloatArray, seen_from_mm: FloatArray, exposure: IntArray, sheet: IntArray
     ) -> Iterator[FloatArray]:
-        """(N, 3) moves of points by each error, in the cloud's frame, one error after the other."""
+        """(N, 3) moves of points by each error, in the cloud's frame, one error after the other.
+
+        Parameters
+        ----------
+        points_mm, seen_from_mm
+            (N, 3) points, and where the sensor stood at each.
+        exposure, sheet
+            (N,) of each point.
+        """
         turn = self.turns[exposure]
         seen = np.einsum("nji,nj->ni", turn, points_mm - seen_from_mm)
         powers = direction_powers(seen, self.middle[sheet], self.half_width[sheet])

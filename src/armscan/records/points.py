@@ -60,6 +60,10 @@ class MarkerSet(RowRecord):
     covariance_mm2
         (N, 3, 3) covariance of each centre, independent between markers: that of measuring its
         images. What a calibration adds is common to all markers and not in here.
+    frame
+        Name of the coordinate frame, for example ``Sensor`` or ``Base``.
+    source
+        Where they came from, for messages.
     """
 
     ids: IntArray = ints("N")

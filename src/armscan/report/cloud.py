@@ -199,7 +199,25 @@ def scan_page(
     profile: ChainProfile | None = None,
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the report; ``exposures`` by source name, those that are missing are not shown."""
+    """Lay out the report.
+
+    Parameters
+    ----------
+    scan
+        The scan.
+    digest
+        Of its points.
+    exposures
+        Images by source name; those that are missing are not shown.
+    provenance
+        How the cloud came to be.
+    warnings
+        What is odd about the recording and the scan.
+    profile
+        What the stages took; None to say nothing of it.
+    is_simulated
+        True if the images were rendered.
+    """
     size = " × ".join(f"{value:.0f}" for value in digest.high_mm - digest.low_mm)
     without = f"{len(scan.without_pose)} had no pose of the arm" if scan.without_pose else ""
     n_placed = scan.count(ExposureStatus.PLACED)

@@ -73,7 +73,22 @@ class MarkerScene:
 class RegisterReport:
     """One registration, ready for a page and a terminal.
 
-    ``residuals_are`` says what minus what; ``drift`` is the uncertainty along a chain of views.
+    Parameters
+    ----------
+    title, subtitle
+        What was joined.
+    quantities, cards
+        All that is told of it, and the key figures.
+    scans
+        Table of what was carried.
+    residuals, residuals_are
+        Of the markers, and what minus what they are.
+    scene
+        What to draw in space.
+    drift
+        Chart of the uncertainty along a chain of views; None for one step.
+    warnings
+        Sentences that a person should read first.
     """
 
     title: str

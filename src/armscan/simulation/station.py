@@ -61,8 +61,16 @@ class Target:
 class Station:
     """What stands around the arm, in Base.
 
-    The brightness of ``room`` is scaled by each exposure; ``target`` and ``markers`` are drawn
-    sharply in images under room light.
+    Parameters
+    ----------
+    things
+        Surfaces with their finish.
+    target
+        A printed target, or None.
+    room
+        Light of the room; its brightness is scaled by each exposure.
+    markers
+        Ring markers on flat faces of the things, drawn sharply in images under room light.
     """
 
     things: tuple[SceneObject, ...]
@@ -85,8 +93,15 @@ class Station:
 class ExposureSettings:
     """What the camera and the lasers do for one image.
 
-    ``room_light``: brightness of white that faces up under the room's light, as a part of full
-    scale; None for the preset's ambient light.
+    Parameters
+    ----------
+    window
+        Part of the sensor that is read.
+    lasers
+        Names of the light sources that are on.
+    room_light
+        Brightness of white that faces up under the room's light, as a part of full scale; None for
+        the preset's ambient light.
     """
 
     window: Window
@@ -367,7 +382,20 @@ class RenderRequest:
 class TwinScan:
     """One scene, in the form of any recording; see `armscan.devices.sources.ScanSource`.
 
-    From ``seed`` (K,) and the row the noise of an exposure follows.
+    Parameters
+    ----------
+    name
+        What messages and reports call it.
+    kind
+        Scan or calibration.
+    head
+        That looks.
+    shots
+        In order of time.
+    arm
+        What the arm reported, or None.
+    seed
+        (K,) numbers from which, with the row, the noise of an exposure follows.
     """
 
     name: str

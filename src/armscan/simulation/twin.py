@@ -332,9 +332,23 @@ def build_twin(
     seed: int = 1,
     part_mm: FloatArray | None = None,
 ) -> SimulatedInstrument:
-    """Draw one instrument; everything random follows from the seed.
+    """Draw one instrument.
 
-    ``part_mm`` (T, 3, 3) are triangles of a part in place of the workpiece.
+    Parameters
+    ----------
+    head
+        Kind of the head.
+    preset
+        How good it is and how kind the surroundings are.
+    seed
+        Everything random follows from it.
+    part_mm
+        (T, 3, 3) triangles of a part that stands in place of the workpiece; None for the workpiece.
+
+    Raises
+    ------
+    OptionError
+        If there is no such head or preset, or if the seed is negative.
     """
     if head not in HEADS:
         raise OptionError(

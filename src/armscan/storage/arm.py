@@ -137,8 +137,16 @@ def read_arm_table(
 ) -> ArmTable:
     """Samples of ``arm.csv``; a row is ``base_from_tool``.
 
-    Without ``form`` the columns decide how poses are written; ``arm`` turns joint angles into poses
-    and is needed for these only.
+    Parameters
+    ----------
+    table
+        The file.
+    form
+        How the poses are written; None lets the columns decide.
+    rotation
+        Convention of Euler angles.
+    arm
+        Turns joint angles into poses; needed for the form ``joints`` only.
 
     Raises
     ------

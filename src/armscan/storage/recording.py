@@ -404,7 +404,27 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
 
 
 def read_arm_track(folder: Path, arm: ArmModel | None = None) -> tuple[ArmTrack, tuple[str, ...]]:
-    """Read what the arm reported, from a folder with or without images; and what is odd."""
+    """Read what the arm reported, from a folder with or without images.
+
+    Parameters
+    ----------
+    folder
+        Holds ``arm.csv``, and as a rule ``session.toml``.
+    arm
+        Turns joint angles into poses; ``arm.toml`` of the folder if None.
+
+    Returns
+    -------
+    track
+        The samples.
+    notes
+        What is odd in the files or was assumed, in words.
+
+    Raises
+    ------
+    FileFormatError
+        If a file is missing, damaged or against a rule of the format.
+    """
     said, notes = _said(folder)
     table = read_csv(folder / ARM_FILE)
     found = _arm_table(table, said, arm if arm is not None else _own_arm_model(folder))

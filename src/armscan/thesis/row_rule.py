@@ -63,6 +63,18 @@ class RowLabeller:
     its row is within T of A's (eq. 3.6), B's if within T of B's (eq. 3.7), and where both hold,
     of the nearer (section 5.2.3). Where a column has several rows of one laser, the nearest
     counts. Points that match neither are without a name.
+
+    Parameters
+    ----------
+    sensor
+        Camera and sheets; each source has one sheet, of its name.
+    options
+        Defaults if None.
+
+    Raises
+    ------
+    InputError
+        If a source of the schedule has no sheet.
     """
 
     def __init__(self, sensor: SensorCalibration, options: RowOptions | None = None) -> None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,9 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
+from armscan.jobs.sheets import _read_scan
 from armscan.vision.targets.target import TargetView
+from rigs.drawn_arm import draw_postures
 from rigs.fan_rig import STEREO_SIGMA, FanRig, fan_rig
 from rigs.sheet_rig import placed, project
 
@@ -147,3 +151,10 @@ def test_cameras_that_saw_different_places_are_told() -> None:
 def test_an_image_of_a_camera_that_is_not_calibrated_is_refused() -> None:
     with pytest.raises(InputError, match="camera 1"):
         HeadCameras.of(RIG.stereo().left).model(1)
+
+
+def test_a_recording_of_one_camera_is_told_where_the_calibration_is_of_two(tmp_path: Path) -> None:
+    folder = tmp_path / "scan"
+    draw_postures(folder)
+    assert any("camera 0 alone" in text for text in _read_scan(folder, (), is_stereo=True).warnings)
+    assert not _read_scan(folder, (), is_stereo=False).warnings

@@ -11,14 +11,16 @@ import pytest
 
 from armscan.cli.run import main
 from armscan.errors import FileFormatError
-from armscan.jobs.info import OWN_PAGE, describe_files
+from armscan.jobs.info import OWN_PAGE, _line, describe_files
 from armscan.models.arm import thesis_arm
+from armscan.records.points import MarkerSet
 from armscan.records.recording import ArmTrack
 from armscan.report.quantity import summary_json, summary_text
 from armscan.storage.arm import ProbeTip, arm_model_toml, write_probing
 from armscan.storage.clouds import read_cloud, write_cloud
 from armscan.storage.documents import scanner_document
 from armscan.storage.parts.meshes import encoded_surface
+from armscan.storage.points import markers_csv
 from rigs.calibration_documents import scanner_calibration
 from rigs.recording_folders import ARM, EXPOSURES, lab_folder
 
@@ -106,6 +108,32 @@ def test_touches_probe_arm_and_probed_points(tmp_path: Path) -> None:
     found = described(points)
     assert found["what"] == "2 probed points, centres of the tip"
     assert found["y_range_mm"] == [-5.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "before", ["", "\ufeff", "# " + 2000 * "x" + "\n"], ids=["plain", "marked", "told of at length"]
+)
+def test_markers_are_no_probed_points(tmp_path: Path, before: str) -> None:
+    markers = MarkerSet(
+        ids=np.array([3, 7, 9]),
+        points_mm=np.arange(9.0).reshape(3, 3) ** 2,
+        covariance_mm2=np.tile(np.diag([1e-4, 4e-4, 1e-4]), (3, 1, 1)),
+        frame="Part",
+    )
+    path = tmp_path / "markers.csv"
+    path.write_text(before + markers_csv(markers, is_simulated=True).decode(), "utf-8")
+    found = described(path)
+    assert found["what"] == "3 markers" and found["frame"] == "Part" and found["simulated"]
+    assert found["median_sigma_mm"] == pytest.approx(0.02)
+    path.write_text("x_mm,y_mm,z_mm\n1,2,3\n4,5,6\n7,8,1\n")
+    assert "probed points" in str(described(path)["what"])
+
+
+def test_long_lists_are_told_by_their_ends() -> None:
+    names = [f"{k:03d}.png" for k in range(30)]
+    assert _line("exposures", names) == "exposures: 30, 000.png to 029.png"
+    assert _line("exposures", names[:2]) == "exposures: 000.png, 001.png"
+    assert _line("not_joined", []) == "not joined: none"
 
 
 def test_clouds_as_text_are_described_as_clouds(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from armscan.kernels.chains import middle_of_squares
 from armscan.kernels.stripe import column_runs, columns
 from armscan.records.exposure import Exposure, SensorWindow
-from armscan.records.profile import Profile
+from armscan.records.profile import Profile, StripeFlag
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
 from armscan.vision.stripe.ridge import measure_level
@@ -113,6 +113,18 @@ def test_an_image_of_sixteen_bits_gives_the_points_of_its_bytes() -> None:
     near = np.abs(sorted_points(a, (0, 1))[:200] - sorted_points(b, (0, 1))[:200])
     # the runs are cut at whole levels in one and not in the other
     assert np.median(near) < 0.002
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+def test_a_clipped_core_is_flagged(bits: int) -> None:
+    """The lines that are clipped all along, and no others."""
+    for peak, is_clipped in ((600.0, True), (150.0, False)):
+        stripe = line(23.0, sigma_px=2.0, peak=peak)
+        scene = StripeScene((stripe,), 320, 240, noise=StripeNoise(0.02), bits=bits)
+        flags = extract_stripes(scene.expose(1), FAST).flags
+        is_flagged = (flags & int(StripeFlag.SATURATED)) != 0
+        assert len(flags) > 200
+        assert np.mean(is_flagged == is_clipped) > 0.95
 
 
 def test_points_are_those_of_the_full_sensor() -> None:

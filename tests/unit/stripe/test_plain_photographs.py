@@ -151,3 +151,17 @@ def test_a_dim_line_beside_something_white_is_no_threshold(side_px: int, peak: f
     bright = scene.expose(1).image.copy()
     bright[20 : 20 + side_px, 30 : 30 + side_px] = 4095
     assert not is_thresholded(Exposure(bright, "dim", bits_used=12))
+
+
+def test_grey_is_grey_however_it_is_stored() -> None:
+    """A photograph and its view without laser, either of them in three channels."""
+    lit, dark = (StripeScene(lines, 320, 240).expose(1).image for lines in ((line(12.0),), ()))
+    plain = extract_stripes(Exposure(lit, "lit"), None, Exposure(dark, "dark"))
+    assert plain.is_accepted.sum() > 250
+    for one, other in ((True, False), (False, True), (True, True)):
+        images = [
+            Exposure(np.repeat(image[:, :, None], 3, axis=2) if is_wide else image, name)
+            for image, is_wide, name in ((lit, one, "lit"), (dark, other, "dark"))
+        ]
+        found = extract_stripes(images[0], None, images[1])
+        np.testing.assert_array_equal(found.points_px, plain.points_px)

@@ -248,8 +248,16 @@ def normal_equations(
 ) -> NormalEquations:
     """Sum up the points' equations in blocks.
 
-    A view may have no point. The derivatives are (N, 2, F) by the free shared unknowns and (N, 2,
-    6) by the view's pose, the weights (N,) factors of each point's chi2.
+    Parameters
+    ----------
+    observations
+        N points of V views; a view may have none.
+    predicted_px
+        (N, 2) prediction.
+    by_shared, by_pose
+        (N, 2, F) and (N, 2, 6) its derivatives by the free shared unknowns and by the view's pose.
+    weights
+        (N,) factors of each point's chi2.
     """
     whitening = observations.whitening * np.sqrt(weights)[:, None, None]
     residual = (whitening @ (observations.points_px - predicted_px)[:, :, None])[:, :, 0]
@@ -270,7 +278,13 @@ def normal_equations(
 
 
 def damped_step(equations: NormalEquations, damping: float) -> tuple[FloatArray, FloatArray] | None:
-    """Solve the damped normal equations by Schur's complement of the poses: (F,) and (V, 6)."""
+    """Solve the damped normal equations by Schur's complement of the poses.
+
+    Returns
+    -------
+    shared_step, pose_steps
+        (F,) and (V, 6), or None if the matrix is singular.
+    """
     pose = equations.pose + damping * (equations.pose * np.eye(equations.pose.shape[-1]))
     shared = equations.shared + damping * np.diag(np.diag(equations.shared))
     try:

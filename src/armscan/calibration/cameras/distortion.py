@@ -143,6 +143,12 @@ class ChosenModel:
 
     Parameters
     ----------
+    model
+        The model.
+    solution
+        Its solution.
+    cross_validation
+        Its hold-out test, None where there was none.
     reason
         Why this model, in words.
     untested

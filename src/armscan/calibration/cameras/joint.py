@@ -83,7 +83,17 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoState:
-    """Values of all unknowns: intrinsics (18,) left, then right; relative pose; U boards' poses."""
+    """Values of all unknowns.
+
+    Parameters
+    ----------
+    intrinsics
+        (18,) of the left, then of the right camera.
+    right_from_left
+        The relative pose.
+    rotations, translations_mm
+        (U, 3, 3) and (U, 3) of ``sensor_from_board``.
+    """
 
     intrinsics: FloatArray
     right_from_left: Pose[CameraRight, Sensor]
@@ -167,11 +177,15 @@ class JointProblem:
 
     Parameters
     ----------
+    observations
+        Points of both cameras.
     basis
         (24, F) directions of the shared unknowns that are free: a step is ``basis @ free_step``;
         (24, 0) solves the boards alone.
     weights
         Factors of chi2 of the left and of the right points, 0 to leave a point out.
+    prior
+        What is known of the intrinsics, or None.
     """
 
     observations: JointObservations
@@ -521,6 +535,20 @@ def hold_out_pairs(solution: JointSolution, n_folds: int, max_steps: int) -> Cro
     Each fold's pairs are left out, cameras and relative pose are solved from the rest, and each
     held-out pair gets one board pose, fitted in both images. Views of one camera alone are never
     held out, and outliers count nowhere.
+
+    Parameters
+    ----------
+    solution
+        Of all pairs; it also is the folds' starting value.
+    n_folds
+        Wanted folds; at most one a pair.
+    max_steps
+        Most iterations of each adjustment.
+
+    Returns
+    -------
+    result
+        None if too few pairs would be left to solve from, or if a fold has no solution.
     """
     boards = solution.boards
     both = np.array([k for k, board in enumerate(boards) if board.is_seen_by_both], dtype=np.int64)

@@ -221,7 +221,15 @@ def prepare_cameras(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownBow:
-    """Bow (2,) of the board in mm as each camera by itself found it; see `BoardWarp`."""
+    """Bow of the board as both cameras found it, each by itself; see `BoardWarp`.
+
+    Parameters
+    ----------
+    bow_mm
+        (2,) along x and along y.
+    covariance_mm2
+        (2, 2).
+    """
 
     bow_mm: FloatArray
     covariance_mm2: FloatArray

@@ -250,11 +250,15 @@ class CameraFit(ArrayRecord):
 
     Parameters
     ----------
+    camera
+        The solution.
     covariance
         (9, 9) in the order of `armscan.models.camera.PARAMETER_NAMES`; rows of parameters that
         were held by request are zero. Coefficients that ``auto`` left at zero count as unknown, of
         the size that lenses usually have, where the views do not say more; and all is widened if
         residuals of one view are alike (see `armscan.calibration.cameras.distortion`).
+    free_parameters
+        Names of the parameters that were solved.
     joint_covariance
         (9 + 6 V, 9 + 6 V) of the camera and of the poses of the V used views, in the order of
         ``used_views``; pose convention as in `ViewFit`.
@@ -279,14 +283,24 @@ class CameraFit(ArrayRecord):
     condition
         Condition number of the normal matrix of the camera's free parameters, scaled to unit
         diagonal, after the poses are eliminated.
+    coverage
+        Coverage of the image.
+    cross_validation
+        Hold-out test, or None if it was switched off or too few views are left for it.
     warp
         Bow of the board, if it was solved: asked for, or significant.
+    model_reason
+        Why these parameters were free.
     design_effect
         Factor that variances were given because residuals of one view are alike; 1 where they
         are not.
     stretch, stretch_sigma
         Part by which the print seems longer from row to row than is said of it, with the lengths
         from column to column taken for right, and its standard deviation; it is not solved along.
+    warnings
+        Plain sentences that a person should read.
+    options
+        The options in force.
     """
 
     camera: CameraModel

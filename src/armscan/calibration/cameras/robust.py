@@ -258,8 +258,12 @@ SAME_POINT_MM = 1e-6
 class TargetError:
     """How far the target's points miss their places.
 
-    ``sigma_mm`` is along each axis of the board, 0 where views show none; ``independent_share`` the
-    part of the residuals' variance that is new in every view.
+    Parameters
+    ----------
+    sigma_mm
+        Standard deviation along each axis of the board; 0 where views show none.
+    independent_share
+        Part of the residuals' variance that is new in every view.
     """
 
     sigma_mm: float

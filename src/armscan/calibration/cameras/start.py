@@ -128,11 +128,22 @@ _FIXED_CENTRE = (_B11, _B22, _B33)
 
 
 def constraint_rows(homography: FloatArray) -> FloatArray:
-    """Two equations (2, 6) of one view (eq. 2.34) for ``b = (B11, B12, B22, B13, B23, B33)``.
+    """Two equations of one view (eq. 2.34) for ``b = (B11, B12, B22, B13, B23, B33)``.
 
-    These are ``v12`` and ``v11 - v22``. The thesis prints ``v12 - v22`` in the second row, which is
-    wrong, and lists b as ``B11 B12 B13 B22 B23 B33``, which does not go with its own ``v_ij`` of
-    eq. 2.33; both are corrected here.
+    Parameters
+    ----------
+    homography
+        (3, 3) from board to image.
+
+    Returns
+    -------
+    rows
+        (2, 6) rows ``v12`` and ``v11 - v22``.
+
+    Notes
+    -----
+    The thesis prints ``v12 - v22`` in the second row, which is wrong, and lists b as ``B11 B12 B13
+    B22 B23 B33``, which does not go with its own ``v_ij`` of eq. 2.33; both are corrected here.
     """
 
     def v(i: int, j: int) -> FloatArray:
@@ -470,8 +481,8 @@ def mirrored_pose(pose: Pose[Sensor, Board], centre_board_mm: FloatArray) -> Pos
 def estimate_board_pose(
     view: TargetView,
     camera: CameraModel,
-    bow_mm: FloatArray | None = None,
     *,
+    bow_mm: FloatArray | None = None,
     allow_ambiguous: bool = False,
 ) -> Estimate[Pose[Sensor, Board]] | FitFailure:
     """``sensor_from_board`` in one view.
@@ -483,7 +494,7 @@ def estimate_board_pose(
     board's, as in `BoardWarp`; flat if None. There is no pose of too few points, points on a line,
     or of two poses that fit alike, of which ``allow_ambiguous`` takes the better.
     """
-    found = estimate_board_poses(view, camera, bow_mm)
+    found = estimate_board_poses(view, camera, bow_mm=bow_mm)
     if isinstance(found, FitFailure):
         return found
     if len(found) > 1 and not allow_ambiguous:
@@ -497,6 +508,7 @@ def estimate_board_pose(
 def estimate_board_poses(
     view: TargetView,
     camera: CameraModel,
+    *,
     bow_mm: FloatArray | None = None,
 ) -> tuple[Estimate[Pose[Sensor, Board]], ...] | FitFailure:
     """All poses of a board that one view does not refute, the best first.

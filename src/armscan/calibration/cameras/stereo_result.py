@@ -159,8 +159,12 @@ class StereoFit(ArrayRecord):
 
     Parameters
     ----------
+    views
+        The cameras and their relative pose.
     covariance
         (24, 24) in the order of `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
+    left, right
+        Each camera in the solution.
     pairs
         Every pair given that was not left out by request.
     rms_px
@@ -170,12 +174,20 @@ class StereoFit(ArrayRecord):
     typical_level
         Squared distance of the typical pair's own ``right_from_left`` from that of the others over
         its covariance and the degrees of freedom: about 1 where noise is all there is.
+    hold_out
+        Hold-out test over pairs, or None.
     degrees_of_freedom
         Observed coordinates minus unknowns.
     condition
         Of the normal matrix of the free shared unknowns, unit diagonal, boards eliminated.
     target_error_mm
         By how much the target's points miss their places, one standard deviation an axis.
+    is_converged
+        False if the adjustment was stopped before the minimum.
+    warnings
+        Plain sentences that a person should read.
+    options
+        The options in force.
     """
 
     views: TwoViews

@@ -132,8 +132,14 @@ class BoardHandEyeFit(ArrayRecord):
     def scanner(
         self, sensor: SensorCalibration | None, provenance: Provenance
     ) -> ScannerCalibration:
-        """Hand-eye and sensor, which has the camera given, as the looks move both; without a
-        sensor, of the camera as given.
+        """Hand-eye and sensor as the looks move both; without a sensor, of the camera as given.
+
+        Parameters
+        ----------
+        sensor
+            With the camera that was given; None if there are no light sheets yet.
+        provenance
+            Of the document.
         """
         hand_eye, follow = self.calibration, self.calibration.dhand_eye_dsensor
         if follow is None:

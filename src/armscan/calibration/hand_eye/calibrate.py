@@ -111,13 +111,25 @@ def calibrate_on_plate(
     covariance of all residuals: pose errors common to a posture, smooth flatness of the plate,
     stripe noise and the uncertainty of the probed plane. Scatter that is not given is estimated.
 
-    There is one stripe an exposure; equal postures were taken without moving the arm.
+    Parameters
+    ----------
+    stripes
+        One entry an exposure; equal postures were taken without moving the arm.
+    plate
+        The plate in Base.
+    options
+        Defaults if None.
+    sensor_covariance
+        (P, P) of the sensor's parameters, in the order of the stripes' ``dpoint_dsensor``: its
+        errors bend all stripes alike, and are not taken for something that moved. The hand-eye
+        returned belongs to the sensor as the stripes move it within this covariance
+        (`HandEyeFit.sensor_step`); ``dhand_eye_dsensor`` carries on what it may still err by. None
+        takes it as exact.
 
-    ``sensor_covariance`` (P, P) is that of the sensor's parameters, in the order of the stripes'
-    ``dpoint_dsensor``: its errors bend all stripes alike, and are not taken for something that
-    moved. The hand-eye returned belongs to the sensor as the stripes move it within this covariance
-    (`HandEyeFit.sensor_step`); ``dhand_eye_dsensor`` carries on what it may still err by. None
-    takes it as exact.
+    Returns
+    -------
+    HandEyeFit
+        The hand-eye with its covariance and evidence, or why there is none.
 
     Raises
     ------
@@ -246,7 +258,22 @@ def calibrate_on_sphere(
     residual. Hand-eye and centre are unknown. Neither the section circle nor postures that only
     shift are needed, and no side of the sheet has to be told.
 
-    Points off the sphere are rejected. ``sensor_covariance`` is as of `calibrate_on_plate`.
+    Parameters
+    ----------
+    stripes
+        Exposures with the arm's pose; points off the sphere are rejected.
+    diameter_mm
+        Of the sphere.
+    options
+        Defaults if None.
+    sensor_covariance
+        As of `calibrate_on_plate`.
+
+    Returns
+    -------
+    HandEyeFit
+        With method "sphere"; covariance from the scatter of the arm's pose (common to a posture)
+        and of the stripe, both estimated from the residuals unless given.
 
     Raises
     ------

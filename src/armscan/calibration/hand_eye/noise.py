@@ -587,8 +587,13 @@ def estimate_noise(
 class SolutionCovariance:
     """Second moments of a solution's errors, and how much longer their tails are than normal ones.
 
-    ``region_factor``, at least 1, is what the usual 95 % limit of the hand-eye's ``e' C^-1 e`` is
-    to be multiplied with so that 95 % of the errors lie within it.
+    Parameters
+    ----------
+    matrix
+        (K, K) covariance.
+    region_factor
+        What the usual 95 % limit of the hand-eye's ``e' C^-1 e`` is to be multiplied with so that
+        95 % of the errors lie within it; at least 1.
     """
 
     matrix: FloatArray

@@ -542,7 +542,15 @@ def study_repeats(
 def study_poses(
     poses: Sequence[Pose[Tool, Sensor]], covariances: Sequence[FloatArray] | None = None
 ) -> RepeatStudy | FitFailure:
-    """As `study_repeats`, from hand-eyes and their covariances (6, 6) alone.
+    """As `study_repeats`, from hand-eyes alone.
+
+    Parameters
+    ----------
+    poses
+        ``tool_from_sensor`` of each calibration.
+    covariances
+        (6, 6) of each in the order of
+        `armscan.models.calibration.HAND_EYE_PARAMETER_NAMES`, or None.
 
     Raises
     ------
@@ -586,9 +594,15 @@ def study_poses(
 def angle_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     """(6, 6) covariance of `REPEAT_NAMES` from that of the hand-eye's parameters.
 
-    With R = Rx(theta) Ry(gamma) Rz(phi) of eq. 2.69, ``rotation`` of ``tool_from_sensor``, turns of
-    the three angles act about x, about the turned y and about the twice turned z; gamma is not 90
-    degrees.
+    With R = Rx(theta) Ry(gamma) Rz(phi) of eq. 2.69, turns of the three angles act about x, about
+    the turned y and about the twice turned z.
+
+    Parameters
+    ----------
+    rotation
+        (3, 3) of ``tool_from_sensor``; gamma not 90 degrees.
+    covariance
+        (6, 6) in the order of `armscan.models.calibration.HAND_EYE_PARAMETER_NAMES`.
     """
     theta = float(np.radians(_values(Pose(rotation, np.zeros(3)))[0]))
     turned_y = np.array([0.0, np.cos(theta), np.sin(theta)])

@@ -125,8 +125,12 @@ def placed_on_plate(
     A distance is linear in the 12 entries of rotation and shift. However many there are, 13
     combinations of them, the rows of a QR factor, have their sum of squares for every state.
 
-    Points (N, 3) are in Sensor, normals (N, 3) and constants (N,) of `plate_in_tool`; or (K, ...),
-    each of the K states its own.
+    Parameters
+    ----------
+    points_mm
+        (N, 3) in the Sensor frame, or (K, N, 3) of each of the K states its own.
+    normals, constants
+        (N, 3) and (N,) of the plate in Tool (`plate_in_tool`), or (K, N, 3) and (K, N).
     """
     rows = (normals[..., :, None] * points_mm[..., None, :]).reshape(*points_mm.shape[:-1], 9)
     table = np.concatenate([rows, normals, constants[..., None]], axis=-1)

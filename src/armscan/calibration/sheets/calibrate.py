@@ -108,10 +108,22 @@ def calibrate_sheets(
     of the cameras as common unknowns of known covariance. A bow is added where the lack-of-fit
     test asks for it and the boards support it.
 
-    There is one entry an image; images of one placement share its board's pose and the error of
-    that. ``camera`` is one camera, the two of a stereo head, or those of a sensor whose sheets are
-    solved again. Of the lines of a fan, those that the boards do not determine are left out with a
-    warning.
+    Parameters
+    ----------
+    boards
+        One entry an image; images of one placement share its board's pose and the error of that.
+    camera
+        One camera, the two of a stereo head, or those of a sensor whose sheets are solved again.
+        Their covariance goes into the weights and into the result.
+    options
+        Defaults if None.
+
+    Returns
+    -------
+    LaserFit or FitFailure
+        A failure for one board, for stripes that are all one line in space, for stripes that
+        cannot be given to sheets, and where nothing usable is left. Of the lines of a fan, those
+        that the boards do not determine are left out with a warning.
 
     Raises
     ------

@@ -50,9 +50,19 @@ class PointErrors(RowRecord):
     ) -> PointErrors:
         """Errors of a cloud's points, or of some of its rows.
 
-        ``normals``: (M, 3) of the part at each of the rows, in Cad. ``rows``: (M,) rows; None for
-        all. ``kept_share``: part of the cloud's points, where they are, that was kept when it was
-        thinned; None for that of all rows.
+        Parameters
+        ----------
+        cloud
+            The points.
+        pose
+            Where they lie on the part.
+        normals
+            (M, 3) of the part at each of the rows, in Cad.
+        rows
+            (M,) rows; None for all.
+        kept_share
+            Part of the cloud's points, where they are, that was kept when it was thinned; None for
+            that of all rows.
         """
         chosen = np.arange(len(cloud)) if rows is None else rows
         covariance, axis, share = without_noise(cloud, chosen)

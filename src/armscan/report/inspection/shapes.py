@@ -606,9 +606,18 @@ def feature_view(cloud: PointCloud, rows: IntArray, deviations: Deviations) -> P
 def deviation_view(
     points_mm: FloatArray, deviations_mm: FloatArray, *, title: str, frame: str, reference: str
 ) -> Picture:
-    """(N, 3) points in mm, coloured by deviation: dark inside or below, light outside or above.
+    """Points in space, coloured by deviation: dark inside or below, light outside or above.
 
-    ``reference`` is what the deviations are counted from, in words.
+    Parameters
+    ----------
+    points_mm, deviations_mm
+        (N, 3) and (N,).
+    title
+        Of the picture.
+    frame
+        Name of the coordinate frame.
+    reference
+        What the deviations are counted from, in words.
     """
     step = max(1, math.ceil(len(points_mm) / MAX_SHOWN))
     limit = max(float(np.percentile(np.abs(deviations_mm), 98)), 1e-6)

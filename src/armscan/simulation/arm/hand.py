@@ -283,9 +283,15 @@ class ScanPass:
 
 
 class Trajectory(ArrayRecord):
-    """What the person did: joint angles over time, cubic between knots, in ns and s from the start.
+    """What the person did: joint angles over time, cubic between knots.
 
-    Knots (N,) begin a little before the pass's first exposure and end a little after its last.
+    Parameters
+    ----------
+    t_s, joints_rad
+        (N,) times of the knots from the start of the pass, from a little before its first exposure
+        to a little after its last, and (N, 7) true joint angles there.
+    exposure_t_ns
+        (M,) mid-exposure times, ns from the start of the pass.
     """
 
     t_s: FloatArray = floats("N")

@@ -49,7 +49,10 @@ _TRIES = 4000
 class MarkedPlate:
     """The plate's shapes and its markers, in its own frame.
 
-    Markers are on upward faces, no two nearer than a marker's width.
+    Parameters
+    ----------
+    markers
+        (N,) on upward faces, no two nearer than a marker's width.
     """
 
     markers: tuple[RingMarker, ...]

@@ -172,7 +172,20 @@ def _distances(data: Floats, points: Floats, away: Floats) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh(OneColour):
-    """A closed surface of (T, 3, 3) corners in its own frame, anticlockwise from outside."""
+    """A closed surface of triangles in its own frame.
+
+    Parameters
+    ----------
+    triangles_mm
+        (T, 3, 3) corners, anticlockwise as seen from outside.
+    colour
+        (3,) albedo.
+
+    Raises
+    ------
+    InputError
+        If there are no triangles, or a corner is not finite.
+    """
 
     triangles_mm: FloatArray
     colour: tuple[float, float, float] = (0.7, 0.7, 0.7)

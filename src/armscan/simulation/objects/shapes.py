@@ -132,6 +132,8 @@ class FlatPlate(HeightField):
     waves_mm
         (K, L) amplitudes of the waves ``cos(k pi x / length) cos(l pi y / width)``, counted from
         the corner; of these the best plane is taken away. None for a perfect plane.
+    colour
+        (3,) albedo.
     """
 
     size_mm: FloatArray
@@ -291,7 +293,14 @@ class Wave:
 class WavyPlate(HeightField):
     """A rectangle in x and y of its frame whose height is a sum of sines, seen from +z.
 
-    ``size_mm`` is its length along x and width along y, centred on the origin.
+    Parameters
+    ----------
+    size_mm
+        Length along x and width along y, centred on the origin.
+    waves
+        At least one.
+    colour
+        (3,) albedo.
     """
 
     size_mm: tuple[float, float]

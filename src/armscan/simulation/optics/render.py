@@ -316,6 +316,10 @@ class Imaging:
         Even light of the room during a scan on white, as a part of full scale.
     target_light
         The same while a target is photographed.
+    speckle
+        Grain of laser light.
+    detector
+        Sensor noise, halo, bits.
     gloss, texture
         Factors on the gloss and texture of everything in the scene.
     ghost_share, ghost_sigma_px

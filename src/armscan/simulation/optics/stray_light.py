@@ -29,8 +29,17 @@ _STRAY_WIDENING = 2.0
 class CentreSpot:
     """The beam that a grating leaves undiffracted, round and Gaussian; see `TracedLight`.
 
-    ``irradiance`` is in its middle, on a surface that faces it; as for
-    `armscan.simulation.optics.lasers.LineLaser`.
+    Parameters
+    ----------
+    source_mm
+        (3,) where it starts.
+    direction
+        (3,) unit.
+    sigma_mm
+        Gaussian sigma of its cross-section.
+    irradiance
+        In its middle, on a surface that faces it; as for
+        `armscan.simulation.optics.lasers.LineLaser`.
     """
 
     source_mm: FloatArray

@@ -372,7 +372,26 @@ def record_source(
     encoded: Iterable[bytes] | None = None,
     beside: Mapping[Path, bytes] | None = None,
 ) -> WriterStatus:
-    """Write a scan as a new MCAP file: what `write_recording`, whose arguments these are, does."""
+    """Write a scan as an MCAP file: what `write_recording` writes into a folder.
+
+    Parameters
+    ----------
+    output
+        Must not exist.
+    source
+        What to write.
+    progress
+        Called with images written, images in all, and the name of the latest.
+    encoded
+        (N,) the images' PNG files, where they were made already.
+    beside
+        Files that appear with it; they must not exist.
+
+    Raises
+    ------
+    OutputError
+        If the file exists or cannot be written; nothing is left then.
+    """
     check_new_file(output)
     session, rows = written_session(source), named_rows(source)
     columns, arm = exposure_columns(rows, {}), source.arm

@@ -143,7 +143,12 @@ def are_surely_metres(rotations: FloatArray, translations_mm: FloatArray) -> boo
     They do not where the tool stays within 10 mm of Base's origin and moves, while it turns about
     two axes: a stage of small travel does not turn, and a turntable turns about one axis only.
 
-    ``translations_mm`` (N, 3) is as written under the name of millimetres.
+    Parameters
+    ----------
+    rotations
+        (N, 3, 3) of ``base_from_tool``.
+    translations_mm
+        (N, 3) as written under the name of millimetres.
     """
     if len(rotations) < 3 or not are_within_reach_of_base(translations_mm):
         return False

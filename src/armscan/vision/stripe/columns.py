@@ -96,6 +96,7 @@ from armscan.vision.stripe.smooth import (
 )
 
 MaskImage = NDArray[np.uint8]
+FLOAT_MAX = float(np.finfo(np.float32).max)
 NO_BYTES = np.zeros((1, 1), np.uint8)
 NO_IMAGE = np.zeros((1, 1), np.float32)
 
@@ -129,7 +130,7 @@ class Pixels:
         """Any other plane; what is sought is stretched to eight bits."""
         unit = BRIGHTEST_SOUGHT / max(brightest, 1.0)
         sought = np.clip(plane.image * np.float32(unit), 0.0, 255.0).astype(np.uint8)
-        return cls(sought, unit, NO_BYTES, 1.0, plane.image, plane.clipped, np.inf)
+        return cls(sought, unit, NO_BYTES, 1.0, plane.image, plane.clipped, FLOAT_MAX)
 
     @property
     def transposed(self) -> Pixels:

@@ -284,7 +284,6 @@ CORRELATION = 3.0
 N_DRIFT = 3
 SLOPE_SHARE = 0.5
 """Drift from the image's middle to its rim, as a part of the drift in the middle."""
-HALF_IMAGE = 0.5
 CERTAIN_SIGMAS = 3.0
 LEAST_SHARE = 0.05
 """A stripe along the epipolar line says nothing about the offset across it."""

@@ -3,7 +3,9 @@
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
+from armscan.records.exposure import Exposure
 from armscan.records.profile import StripeFlag
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.flags import close_gaps
@@ -76,6 +78,44 @@ def test_saturation_is_flagged_but_not_rejected() -> None:
     profile = extract_stripes(StripeScene((line(10.0, peak=600.0),), 320, 240).expose(1))
     assert ((profile.flags & int(StripeFlag.SATURATED)) != 0).mean() > 0.98
     assert profile.is_accepted.mean() > 0.98
+
+
+def print_under_a_line(seed: int, sigma_px: float) -> Exposure:
+    """An over-exposed line in its glow, and an edge of print that crosses it at a slant."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:200, :400].astype(np.float64)
+    distance = y - 100.3 - 0.05 * x
+    line = 600.0 * np.exp(-0.5 * (distance / sigma_px) ** 2)
+    light = 40.0 + line + 60.0 * np.exp(-np.abs(distance) / (8.0 * sigma_px))
+    image = 8.0 + light * (0.5 + 0.5 * ndtr((distance - 0.2 * (x - 200.0)) / 1.2))
+    image += rng.normal(0.0, 1.5, image.shape) + rng.normal(0.0, 0.05, image.shape) * line
+    return Exposure(np.clip(image, 0.0, 255.0).round().astype(np.uint8), "print")
+
+
+@pytest.mark.parametrize("sigma_px", [2.0, 4.0])
+def test_a_step_widens_a_clipped_line_by_what_it_may_move_it(sigma_px: float) -> None:
+    """Errors are 13 and 27 times what the noise alone says of such points (rms)."""
+    ratio = []
+    for seed in range(3):
+        profile = extract_stripes(print_under_a_line(seed, sigma_px))
+        good = profile.select(profile.is_accepted)
+        assert len(good) > 0.85 * len(profile)
+        x, y = good.points_px.T
+        error = (y - 100.3 - 0.05 * x) / np.hypot(1.0, 0.05)
+        ratio.append(error / good.sigma_px)
+    assert np.sqrt((np.concatenate(ratio) ** 2).mean()) < 2.5
+
+
+def test_a_clipped_line_beside_a_step_keeps_its_points() -> None:
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:160, :300].astype(np.float64)
+    distance = y - 80.0 - 0.02 * x
+    image = 100.0 + 45.0 * ndtr((distance - 6.0) / 2.0) + rng.normal(0.0, 1.5, distance.shape)
+    image += 220.0 * np.exp(-0.5 * (distance / 2.6) ** 2)
+    profile = extract_stripes(Exposure(np.clip(image, 0.0, 255.0).round().astype(np.uint8), "step"))
+    error = profile.points_px @ [-0.02, 1.0] - 80.0
+    assert profile.is_accepted.mean() > 0.9
+    assert (np.abs(error) < 4.0 * profile.sigma_px).all()
 
 
 def test_close_lines_are_flagged_and_distant_lines_are_right() -> None:

@@ -520,7 +520,7 @@ def test_marks_follow_their_definitions() -> None:
     sides, side_sigma = rng.normal(0.0, 0.3, (n, 2)), rng.uniform(0.02, 0.2, n)
     neighbour = rng.uniform(0.0, 20.0, (n, 2))
     saturated = (rng.uniform(size=(40, 40)) > 0.93).astype(np.uint8)
-    marks, flags = np.zeros((n, 7)), np.zeros(n, np.int64)
+    marks, flags = np.full((n, 8), np.nan), np.zeros(n, np.int64)
     given = (points, fits, sides, side_sigma, neighbour, chain, saturated)
     mark_points(*given, np.array([1, 2, 4, 8]), marks, flags)
     across = np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
@@ -536,11 +536,18 @@ def test_marks_follow_their_definitions() -> None:
     lean, norm = near @ fits[:, 4], near @ fits[:, 5]
     sine = np.minimum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
     shape = np.stack([near @ width / near.sum(axis=1), lean / np.sqrt(norm), sine], axis=1)
-    assert marks[:, 4:] == pytest.approx(shape, rel=1e-9, abs=1e-7)
+    assert marks[:, 4:7] == pytest.approx(shape, rel=1e-9, abs=1e-7)
     lean = np.abs(lean)
+    is_clipped = maximum_filter(saturated, 3, mode="nearest")[y, x] > 0
+    is_step = step > 5.0 * side_sigma
+    share = step / fits[:, 1]
+    has_core = is_clipped & (fits[:, 6] >= fits[:, 2])
+    pull = np.where(has_core & is_step & (share <= 1.0), 0.7 * share * width, 0.0)
+    assert (pull > 0.0).sum() > 5
+    assert marks[:, 7] == pytest.approx(pull, rel=1e-12)
     definitions = (
-        maximum_filter(saturated, 3, mode="nearest")[y, x] > 0,
-        (step > 5.0 * side_sigma) & (step > 0.2 * fits[:, 1]),
+        is_clipped,
+        is_step & (share > np.where(has_core, 1.0, 0.2)),
         (lean > 5.0 * np.sqrt(norm)) & (lean / norm > np.maximum(0.1, 0.3 / width)),
         neighbour.min(axis=1) < 4.5 * width,
     )
@@ -671,10 +678,10 @@ def test_what_lies_beside_a_centre_widens_its_sigma() -> None:
     ridge[2:, 5] = 1.0
     section, width = np.array([0.1, 0.0, -0.02, 0.0]), np.array([3.0, 3.0, 2.0, 0.5])
     ground = np.array([[1.0, 0.0], [1.0, 0.0], [0.9, 0.5], [0.9, 0.5]])
-    sigma = np.full(4, 0.04)
-    widen_sigmas(ridge, section, width, ground, np.array([1, 0, 0, 1]), sigma)
+    sigma, pull = np.full(4, 0.04), np.array([0.0, 0.0, 0.0, 0.2])
+    widen_sigmas(ridge, section, width, ground, np.array([1, 0, 0, 1]), pull, sigma)
     # flanks: lean times width; edges: the blur's share, at most half of the width, times contrast
-    beside = np.array([0.3, 0.0, 0.5 * np.hypot(0.04, 0.5), 0.5 * 0.25])
+    beside = np.array([0.3, 0.0, 0.5 * np.hypot(0.04, 0.5), np.hypot(0.5 * 0.25, 0.2)])
     assert sigma == pytest.approx(np.hypot(0.04, beside), rel=1e-12)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from armscan.kernels.stripe.profile_fit import ALIKE, AMPLITUDE
 from armscan.kernels.stripe.section import (
     EDGE_BLUR_PX2,
+    MARK_PULL,
     MARK_SIGMA,
     MARK_WIDTH,
     MOST_PULL,
@@ -282,7 +283,8 @@ def to_profile(
     noise_length = np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0)
     sigma = np.hypot(sigma, np.sqrt(alike))
     on_flanks = flags & int(StripeFlag.SATURATED)
-    widen_sigmas(fits.ridge.table, fits.section, width, fits.ground, on_flanks, sigma)
+    pull = marks[:, MARK_PULL].copy()
+    widen_sigmas(fits.ridge.table, fits.section, width, fits.ground, on_flanks, pull, sigma)
     return Profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(smoothed.points),

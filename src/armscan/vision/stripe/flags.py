@@ -36,7 +36,7 @@ MARKS = (
 
 
 def mark(fits: ProfileFits, saturated: NDArray[np.uint8]) -> tuple[FloatArray, IntArray]:
-    """Fitted centres (N, 7) of `mark_points`, and the flags (N,) of each alone.
+    """Fitted centres (N, 8) of `mark_points`, and the flags (N,) of each alone.
 
     ``saturated``: (H, W) 1 where the laser's channel is; (1, 1) zero if it is nowhere.
     """

@@ -541,7 +541,7 @@ def test_marks_follow_their_definitions() -> None:
     is_clipped = maximum_filter(saturated, 3, mode="nearest")[y, x] > 0
     is_step = step > 5.0 * side_sigma
     share = step / fits[:, 1]
-    has_core = is_clipped & (fits[:, 6] >= fits[:, 2])
+    has_core = is_clipped & (2.0 * fits[:, 6] >= fits[:, 2])
     pull = np.where(has_core & is_step & (share <= 1.0), 0.7 * share * width, 0.0)
     assert (pull > 0.0).sum() > 5
     assert marks[:, 7] == pytest.approx(pull, rel=1e-12)

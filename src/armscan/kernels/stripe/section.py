@@ -466,7 +466,7 @@ def common_terms(said: Table, rounds: int, clipped_score: float, terms: FloatsOu
 SIGNIFICANT = 5.0
 BACKGROUND_STEP, STEP_BY_FLANKS = 0.2, 1.0
 """Steps from which a point is flagged, as shares of the line's amplitude: of any line, and of one
-that is clipped over its sigma, which smaller ones widen instead."""
+that is clipped over half its sigma, which smaller ones widen instead."""
 PULL_PER_STEP = 0.7
 """Sigmas of the line by which a step as high as it moves a clipped one: print beside lines of
 strangers' photographs moves them by 0.3 to 0.9 (rms)."""
@@ -554,7 +554,7 @@ def mark_points(
         step = abs(sides[i, 1] - sides[i, 0])
         if step > SIGNIFICANT * side_sigma[i]:
             share = step / fits[i, AMPLITUDE]
-            has_core = is_clipped and fits[i, CLIPPED] >= fits[i, SIGMA]
+            has_core = is_clipped and 2.0 * fits[i, CLIPPED] >= fits[i, SIGMA]
             if share > (STEP_BY_FLANKS if has_core else BACKGROUND_STEP):
                 flags[i] |= bits[1]
             elif has_core:

@@ -39,7 +39,7 @@ def test_plain_line_has_no_flags() -> None:
 
 
 def test_background_step_is_flagged() -> None:
-    scene = StripeScene((line(10.0),), 320, 240, background_step=50.0)
+    scene = StripeScene((line(10.0, peak=100.0),), 320, 240, background_step=35.0)
     assert share(scene, StripeFlag.BACKGROUND_STEP) > 0.98
 
 

@@ -22,7 +22,6 @@ from armscan.kernels.arrays import (
 from armscan.kernels.stripe.profile_fit import (
     AMPLITUDE,
     CENTRE,
-    CLIPPED,
     COUNTS,
     FARTHEST_SQUARE,
     GROUND_LEVEL,
@@ -464,16 +463,16 @@ def common_terms(said: Table, rounds: int, clipped_score: float, terms: FloatsOu
 
 
 SIGNIFICANT = 5.0
-BACKGROUND_STEP, STEP_BY_FLANKS = 0.2, 1.0
+BACKGROUND_STEP, STEP_BY_CLIPPED = 0.2, 1.0
 """Steps from which a point is flagged, as shares of the line's amplitude: of any line, and of one
-that is clipped over half its sigma, which smaller ones widen instead."""
+that is clipped at most of the neighbours, which smaller ones widen instead."""
 PULL_PER_STEP = 0.7
 """Sigmas of the line by which a step as high as it moves a clipped one: print beside lines of
 strangers' photographs moves them by 0.3 to 0.9 (rms)."""
 NEIGHBOUR_SIGMAS = 4.5
 """Another line within this many sigmas pulls the centre."""
 SHAPE_HALF = 4
-"""Neighbours over which the profile's shape is averaged."""
+"""Neighbours over which the profile's shape is averaged, and clipped ones are counted."""
 LEAST_SKEW = 0.1
 """Smallest third-order part of a profile that counts as leaning."""
 SKEW_PX = 0.3
@@ -538,33 +537,34 @@ def mark_points(
     ``flags``: (N,) output, in which the bits are set.
     """
     n = points.shape[0]
-    has_saturated = saturated.size > 1
     place_centres(points, fits, marks)
+    for i in range(n if saturated.size > 1 else 0):
+        if is_any_set(saturated, int(np.rint(marks[i, MARK_X])), int(np.rint(marks[i, MARK_Y]))):
+            flags[i] |= bits[0]
     first = stop = 0
     for i in range(n):
         if i == stop:
             first = i
             while stop < n and chain[stop] == chain[first]:
                 stop += 1
-        x, y, width = marks[i, MARK_X], marks[i, MARK_Y], marks[i, MARK_WIDTH]
-        is_clipped = has_saturated and is_any_set(saturated, int(np.rint(x)), int(np.rint(y)))
-        if is_clipped:
-            flags[i] |= bits[0]
-        marks[i, MARK_PULL] = 0.0
-        step = abs(sides[i, 1] - sides[i, 0])
-        if step > SIGNIFICANT * side_sigma[i]:
-            share = step / fits[i, AMPLITUDE]
-            has_core = is_clipped and 2.0 * fits[i, CLIPPED] >= fits[i, SIGMA]
-            if share > (STEP_BY_FLANKS if has_core else BACKGROUND_STEP):
-                flags[i] |= bits[1]
-            elif has_core:
-                marks[i, MARK_PULL] = PULL_PER_STEP * share * width
+        width = marks[i, MARK_WIDTH]
         lean = norm = mean = 0.0
+        n_clipped = 0
         low, high = max(i - SHAPE_HALF, first), min(i + SHAPE_HALF + 1, stop)
         for k in range(low, high):
             lean += fits[k, SKEW]
             norm += fits[k, SKEW_NORM]
             mean += marks[k, MARK_WIDTH]
+            n_clipped += 1 if flags[k] & bits[0] else 0
+        marks[i, MARK_PULL] = 0.0
+        step = abs(sides[i, 1] - sides[i, 0])
+        if step > SIGNIFICANT * side_sigma[i]:
+            share = step / fits[i, AMPLITUDE]
+            is_clipped = 2 * n_clipped > high - low
+            if share > (STEP_BY_CLIPPED if is_clipped else BACKGROUND_STEP):
+                flags[i] |= bits[1]
+            elif is_clipped:
+                marks[i, MARK_PULL] = PULL_PER_STEP * share * width
         norm = max(norm, 1e-12)
         marks[i, MARK_MEAN_WIDTH] = mean / (high - low)
         marks[i, MARK_LEAN] = lean / math.sqrt(norm)

@@ -10,11 +10,13 @@ import numpy as np
 
 from armscan.kernels.stripe.profile_fit import ALIKE, AMPLITUDE
 from armscan.kernels.stripe.section import (
+    BACKGROUND_STEP,
     EDGE_BLUR_PX2,
     MARK_PULL,
     MARK_SIGMA,
     MARK_WIDTH,
     MOST_PULL,
+    PULL_PER_STEP,
     widen_sigmas,
 )
 from armscan.kernels.stripe.smoothing import find_pulls, take_out_bends
@@ -269,8 +271,11 @@ def to_profile(
     flags[is_cut_off(marks, chain, plane.image.shape)] |= int(StripeFlag.END)
     flags[is_short(points, chain)] |= int(StripeFlag.SHORT_SEGMENT)
     usable = (flags & int(REJECTING)) == 0
-    # beyond a crossing a chain may follow the other line: nothing is averaged across it
-    is_new = (np.diff(chain) != 0) | (np.diff(near) != 0)
+    pull = marks[:, MARK_PULL].copy()
+    is_pulled = pull > PULL_PER_STEP * BACKGROUND_STEP * width
+    # beyond a crossing a chain may follow the other line, and a step bends it beside its own place:
+    # nothing is averaged across them
+    is_new = (np.diff(chain) != 0) | (np.diff(near) != 0) | (np.diff(is_pulled) != 0)
     stretch = np.concatenate([[0], np.cumsum(is_new)])
     alike = sigma**2 * fits.values[:, ALIKE]
     course = straighten(Polyline(points, normals, sigma, stretch, usable), fits)
@@ -283,7 +288,6 @@ def to_profile(
     noise_length = np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0)
     sigma = np.hypot(sigma, np.sqrt(alike))
     on_flanks = flags & int(StripeFlag.SATURATED)
-    pull = marks[:, MARK_PULL].copy()
     widen_sigmas(fits.ridge.table, fits.section, width, fits.ground, on_flanks, pull, sigma)
     return Profile(
         source=exposure.source,

@@ -468,7 +468,7 @@ BACKGROUND_STEP, STEP_BY_CLIPPED = 0.2, 1.0
 that is clipped at most of the neighbours, which smaller ones widen instead."""
 PULL_PER_STEP = 0.7
 """Sigmas of the line by which a step as high as it moves a clipped one: print beside lines of
-strangers' photographs moves them by 0.3 to 0.9 (rms)."""
+strangers' photographs moves them by 0.3 to 0.6 (rms)."""
 NEIGHBOUR_SIGMAS = 4.5
 """Another line within this many sigmas pulls the centre."""
 SHAPE_HALF = 4

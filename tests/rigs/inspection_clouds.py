@@ -23,7 +23,8 @@ def cloud_of(
 ) -> PointCloud:
     """A cloud with isotropic covariances and, in them, the stripe's noise along unit vectors.
 
-    As in a placed cloud, the noise's length stands beside the covariance that holds it.
+    As in a placed cloud, the noise's length stands beside the covariance that holds it. Without
+    exposures it does not tell of which light sheet its points are.
     """
     n = len(points)
     own = np.broadcast_to(
@@ -36,7 +37,7 @@ def cloud_of(
         covariance_mm2=np.eye(3) * sigma_mm**2 + own[:, :, None] * own[:, None, :],
         sigma_noise_mm=np.full(n, noise_mm),
         sheet=np.zeros(n, dtype=np.int64),
-        sheet_names=("A",),
+        sheet_names=("" if exposure is None else "A",),
         exposure=numbers,
         exposure_sources=tuple(f"e{k}.png" for k in range(int(numbers.max(initial=0)) + 1)),
         segment=np.zeros(n, dtype=np.int64),

@@ -62,7 +62,7 @@ def inspect_plane(
     selection = select(cloud, region, options)
     points = selection.points_mm
     middle = points.mean(axis=0)
-    start = reference if reference is not None else _search(points, middle)
+    start = reference if reference is not None else _search(points, middle, selection.stripe)
     if isinstance(start, FitFailure):
         return start
     if reference is None:
@@ -85,8 +85,14 @@ def inspect_plane(
     return _inspected(selection, feature, start, reference, reference_text)
 
 
-def _search(points: FloatArray, middle: FloatArray) -> Plane | FitFailure:
-    normal = dominant_flat(points - middle)
+def _search(points: FloatArray, middle: FloatArray, stripe: IntArray | None) -> Plane | FitFailure:
+    if stripe is not None and not stripe.any():
+        return FitFailure(
+            f"all {len(points)} points are of one stripe: the plane through them is that of its "
+            "light sheet, not of a face",
+            "measure more exposures of the face, or give the plane it should be",
+        )
+    normal = dominant_flat(points - middle, stripe)
     if isinstance(normal, FitFailure):
         return normal
     heights = (points - middle) @ normal

@@ -113,6 +113,18 @@ class Selection:
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
     @property
+    def stripe(self) -> IntArray | None:
+        """(N,) number of each point's stripe, which lies in one light sheet in one exposure.
+
+        None for a cloud that does not tell sheets: a fused or foreign one.
+        """
+        cloud = self.cloud
+        if cloud.is_fused or not any(cloud.sheet_names):
+            return None
+        number = cloud.exposure[self.rows] * len(cloud.sheet_names) + cloud.sheet[self.rows]
+        return np.asarray(np.unique(number, return_inverse=True)[1])
+
+    @property
     def search_band_mm(self) -> FloatArray:
         """(N,) half width of the band in which each point supports a ball.
 
@@ -209,8 +221,15 @@ MIN_SINE = 0.02
 """Flattest triangle, as height over length, that may carry a candidate."""
 
 
-def dominant_flat(points: FloatArray) -> FloatArray | FitFailure:
-    """Unit normal (D,) of the plane (D = 3) or line (D = 2) that most points (N, D) lie near."""
+def dominant_flat(points: FloatArray, stripe: IntArray | None = None) -> FloatArray | FitFailure:
+    """Unit normal (D,) of the plane (D = 3) or line (D = 2) that most points (N, D) lie near.
+
+    ``stripe``: (N,) number of each point's stripe. All points of one lie in its light sheet, which
+    is no face: of several stripes the one that has most points on a plane does not count there.
+    None, and a single stripe: all points count.
+    """
+    if stripe is not None and not stripe.any():
+        stripe = None
     rng = np.random.default_rng(0)
     n, dimension = points.shape
     drawn = points[rng.integers(0, n, (N_TRIALS, dimension))]
@@ -218,17 +237,20 @@ def dominant_flat(points: FloatArray) -> FloatArray | FitFailure:
     if not is_valid.any():
         return FitFailure("the points lie on one line", "give points that spread in a face")
     normals, start = normals[is_valid], drawn[is_valid, 0]
-    scored = points[rng.permutation(n)[:N_SCORED]]
+    chosen = rng.permutation(n)[:N_SCORED]
+    if stripe is not None:
+        chosen = chosen[np.argsort(stripe[chosen], kind="stable")]
+        first = np.flatnonzero(np.diff(stripe[chosen], prepend=-1))
+    scored = points[chosen]
     offsets = np.einsum("md,md->m", normals, start)
-    votes = np.concatenate(
-        [
-            (
-                np.abs(scored @ normals[k : k + BATCH].T - offsets[k : k + BATCH]) <= SEARCH_BAND_MM
-            ).sum(axis=0)
-            for k in range(0, len(normals), BATCH)
-        ]
-    )
-    best = int(votes.argmax())
+    votes = []
+    for k in range(0, len(normals), BATCH):
+        away = np.abs(scored @ normals[k : k + BATCH].T - offsets[k : k + BATCH])
+        is_near = (away <= SEARCH_BAND_MM).astype(np.int64)
+        votes.append(is_near.sum(axis=0))
+        if stripe is not None:
+            votes[-1] -= np.add.reduceat(is_near, first, axis=0).max(axis=0)
+    best = int(np.concatenate(votes).argmax())
     return _polished(points, normals[best], float(offsets[best]))
 
 

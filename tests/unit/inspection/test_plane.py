@@ -126,6 +126,15 @@ def test_the_largest_of_several_faces_is_found_without_a_reference() -> None:
     assert found.counts.n_feature == len(GRID) + 20
 
 
+def test_one_stripe_shows_its_light_sheet_and_no_face() -> None:
+    """Whatever it crosses, its points lie in a plane: flat to 0.000 mm, and not the part's."""
+    x = np.linspace(-30.0, 30.0, 600)
+    stripe = np.column_stack([x, 0.2 * x, 130.0 + np.where(x > 0.0, 5.0, 0.0)])
+    refused = inspect_plane(cloud_of(stripe, np.zeros(600, dtype=np.int64)))
+    assert isinstance(refused, FitFailure)
+    assert "all 600 points are of one stripe" in refused.reason
+
+
 def test_a_region_leaves_the_rest_out() -> None:
     other = GRID[:150] + np.array([0.0, 0.0, 8.0])
     cloud = cloud_of(np.concatenate([GRID, other]))

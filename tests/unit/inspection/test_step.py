@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import StepInspection
 from armscan.inspection.selection import StepOptions
 from armscan.inspection.step import inspect_step
@@ -73,6 +76,34 @@ def test_a_stripe_along_an_edge_is_half_on_the_face_only_and_takes_no_part() -> 
     pulled[along_edge, 2] -= np.linspace(0.0, 0.18, int(along_edge.sum()))
     found = inspected(inspect_step(cloud_of(pulled, exposure), HEIGHT_MM))
     assert float(np.ptp(found.heights_mm)) < 1e-6
+
+
+def test_a_light_sheet_that_holds_most_points_is_no_face() -> None:
+    """A still of two crossed lines over a block: A's points lie in its sheet, more than in a face.
+
+    On the block A has 300 points and B 250, on the floor 500 and 250: 800 lie in A's sheet, 750 on
+    the floor.
+    """
+    rng = np.random.default_rng(3)
+    parts = []
+    for turn, n_block, n_floor in ((0.7, 300, 500), (-0.7, 250, 250)):
+        along = np.concatenate([rng.uniform(-10, 10, n_block), rng.uniform(12, 30, n_floor)])
+        along[n_block::2] *= -1.0
+        z = np.where(np.arange(len(along)) < n_block, 0.0, HEIGHT_MM)
+        # each sheet leans: its stripe lies farther out on the floor
+        across = 0.3 * z
+        c, s = np.cos(turn), np.sin(turn)
+        parts.append(np.column_stack([c * along - s * across, s * along + c * across, z + 130.0]))
+    points = np.concatenate(parts) + rng.normal(0.0, 0.01, (1300, 3))
+    sheet = np.repeat([0, 1], [800, 500])
+    cloud = cloud_of(points, np.zeros(1300, dtype=np.int64), frame="Sensor")
+    cloud = replace(cloud, sheet=sheet, sheet_names=("A", "B"))
+    found = inspected(inspect_step(cloud, HEIGHT_MM))
+    assert found.height.value_mm == pytest.approx(HEIGHT_MM, abs=0.003)
+    assert found.normal == pytest.approx([0.0, 0.0, -1.0], abs=1e-3)
+    plane = inspect_plane(cloud)
+    assert not isinstance(plane, FitFailure)
+    assert abs(plane.plane.normal[2]) > 0.999
 
 
 def test_one_exposure_is_as_high_as_its_lean_lets_it_be() -> None:

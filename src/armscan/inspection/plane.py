@@ -60,9 +60,15 @@ def inspect_plane(
         If there are too few points.
     """
     selection = select(cloud, region, options)
-    points = selection.points_mm
+    points, stripe = selection.points_mm, selection.stripe
+    if stripe is not None and not stripe.any():
+        return FitFailure(
+            f"all {len(points)} points are of one stripe: they lie in its light sheet, and do not "
+            "tell how a face lies across it",
+            "measure more exposures of the face",
+        )
     middle = points.mean(axis=0)
-    start = reference if reference is not None else _search(points, middle, selection.stripe)
+    start = reference if reference is not None else _search(points, middle, stripe)
     if isinstance(start, FitFailure):
         return start
     if reference is None:
@@ -86,12 +92,6 @@ def inspect_plane(
 
 
 def _search(points: FloatArray, middle: FloatArray, stripe: IntArray | None) -> Plane | FitFailure:
-    if stripe is not None and not stripe.any():
-        return FitFailure(
-            f"all {len(points)} points are of one stripe: the plane through them is that of its "
-            "light sheet, not of a face",
-            "measure more exposures of the face, or give the plane it should be",
-        )
     normal = dominant_flat(points - middle, stripe)
     if isinstance(normal, FitFailure):
         return normal

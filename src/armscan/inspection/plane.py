@@ -61,9 +61,9 @@ def inspect_plane(
     """
     selection = select(cloud, region, options)
     points, stripe = selection.points_mm, selection.stripe
-    if stripe is not None and not stripe.any():
+    if stripe is not None and len(points) - int(np.bincount(stripe).max()) < MIN_POINTS:
         return FitFailure(
-            f"all {len(points)} points are of one stripe: they lie in its light sheet, and do not "
+            f"of {len(points)} points all but a few lie in one light sheet: one stripe does not "
             "tell how a face lies across it",
             "measure more exposures of the face",
         )

@@ -114,14 +114,17 @@ class Selection:
 
     @property
     def stripe(self) -> IntArray | None:
-        """(N,) number of each point's stripe, which lies in one light sheet in one exposure.
+        """(N,) number of the place of the light sheet in which each point lies, from 0.
 
-        None for a cloud that does not tell sheets: a fused or foreign one.
+        A sheet has one place in an exposure, and in the Sensor frame one in all of them. None for a
+        cloud that does not tell sheets: a fused or foreign one.
         """
         cloud = self.cloud
         if cloud.is_fused or not any(cloud.sheet_names):
             return None
-        number = cloud.exposure[self.rows] * len(cloud.sheet_names) + cloud.sheet[self.rows]
+        number = cloud.sheet[self.rows]
+        if cloud.frame != "Sensor":
+            number = number + cloud.exposure[self.rows] * len(cloud.sheet_names)
         return np.asarray(np.unique(number, return_inverse=True)[1])
 
     @property
@@ -225,10 +228,10 @@ def dominant_flat(points: FloatArray, stripe: IntArray | None = None) -> FloatAr
     """Unit normal (D,) of the plane (D = 3) or line (D = 2) that most points (N, D) lie near.
 
     ``stripe``: (N,) number of each point's stripe. All points of one lie in its light sheet, which
-    is no face: of several stripes the one that has most points on a plane does not count there.
-    None, and a single stripe: all points count.
+    is no face: of several stripes the one that has most points on a plane does not count there, and
+    `MIN_POINTS` of others are asked for. None, and a single stripe: all points count.
     """
-    if stripe is not None and not stripe.any():
+    if stripe is not None and int(np.ptp(stripe)) == 0:
         stripe = None
     rng = np.random.default_rng(0)
     n, dimension = points.shape
@@ -251,6 +254,15 @@ def dominant_flat(points: FloatArray, stripe: IntArray | None = None) -> FloatAr
         if stripe is not None:
             votes[-1] -= np.add.reduceat(is_near, first, axis=0).max(axis=0)
     best = int(np.concatenate(votes).argmax())
+    if stripe is not None:
+        on_it = np.abs(points @ normals[best] - offsets[best]) <= SEARCH_BAND_MM
+        counts = np.bincount(stripe[on_it])
+        if int(counts.sum() - counts.max(initial=0)) < MIN_POINTS:
+            return FitFailure(
+                "no face has points of several stripes, and one by itself lies in its light sheet, "
+                "whatever it crosses",
+                "measure more exposures of the face",
+            )
     return _polished(points, normals[best], float(offsets[best]))
 
 

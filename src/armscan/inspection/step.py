@@ -302,8 +302,7 @@ def inspect_step(
     section = _section(selection)
     if isinstance(section, FitFailure):
         return section
-    in_space = section.sheet_normal is None
-    start = dominant_flat(section.flat_mm, selection.stripe if in_space else None)
+    start = dominant_flat(section.flat_mm, selection.stripe)
     if isinstance(start, FitFailure):
         return start
     if float(start @ section.axes @ _upwards(selection)) < 0.0:

@@ -35,6 +35,8 @@ class StripeFlag(IntFlag):
     """Too few points to measure their noise: the sigma rests on an assumption."""
     GROUND_KNOWN = 512
     """What is printed under the line is part of the fit, as the view without laser shows it."""
+    PULLED = 1024
+    """A step of the background beside an over-exposed line: the sigma holds what it may do."""
 
 
 REJECTING = (
@@ -92,6 +94,11 @@ class Profile(RowRecord):
     def is_accepted(self) -> BoolArray:
         """(N,) True where no rejecting flag is set."""
         return np.asarray((self.flags & int(REJECTING)) == 0)
+
+    @property
+    def is_sure(self) -> BoolArray:
+        """(N,) True for accepted points that no step pulls."""
+        return np.asarray((self.flags & int(REJECTING | StripeFlag.PULLED)) == 0)
 
 
 class PointProfile(RowRecord):

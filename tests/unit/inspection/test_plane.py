@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from armscan.geometry.shapes import Plane, plane_from_coefficients
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection
 from armscan.inspection.selection import InspectionOptions
+from armscan.records.cloud import FUSED
 from armscan.report.inspection.shapes import plane_report
 from rigs.inspection_clouds import cloud_of, random_motion
 
@@ -135,11 +138,31 @@ def test_one_stripe_shows_its_light_sheet_and_no_face() -> None:
     x = np.linspace(-30.0, 30.0, 600)
     for z in (np.where(x > 0.0, 5.0, 0.0), rng.normal(0.0, 0.005, 600)):
         stripe = np.column_stack([x, 0.2 * x + rng.normal(0.0, 0.002, 600), z])
-        cloud = cloud_of(stripe, np.zeros(600, dtype=np.int64))
-        for reference in (None, given_plane(0.0, 0.0, 1.0, 0.0)):
-            refused = inspect_plane(cloud, reference)
-            assert isinstance(refused, FitFailure)
-            assert "all 600 points are of one stripe" in refused.reason
+        for n_stray in (0, 1, 20):
+            exposure = (np.arange(600) < n_stray).astype(np.int64)
+            stripe[:n_stray, 1] += 10.0
+            cloud = cloud_of(stripe, exposure)
+            for reference in (None, given_plane(0.0, 0.0, 1.0, 0.0)):
+                refused = inspect_plane(cloud, reference)
+                assert isinstance(refused, FitFailure)
+                assert "all but a few lie in one light sheet" in refused.reason
+
+
+def test_exposures_from_one_place_share_their_light_sheet() -> None:
+    x = np.tile(np.linspace(-30.0, 30.0, 300), 3)
+    z = np.random.default_rng(0).normal(0.0, 0.005, 900)
+    stripes = np.column_stack([x, 0.2 * x, z])
+    refused = inspect_plane(cloud_of(stripes, np.repeat([0, 1, 2], 300), frame="Sensor"))
+    assert isinstance(refused, FitFailure)
+    assert "lie in one light sheet" in refused.reason
+
+
+def test_a_cloud_that_tells_no_stripes_counts_all_points() -> None:
+    """Fused points stand for many stripes, though all bear one number."""
+    one = cloud_of(GRID, np.zeros(len(GRID), dtype=np.int64))
+    assert isinstance(inspect_plane(one), FitFailure)
+    fused = replace(one, sheet_names=(FUSED,), exposure_sources=(FUSED,))
+    assert inspected(inspect_plane(fused)).plane.normal[2] == pytest.approx(1.0)
 
 
 def test_a_region_leaves_the_rest_out() -> None:

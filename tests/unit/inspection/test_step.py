@@ -106,6 +106,20 @@ def test_a_light_sheet_that_holds_most_points_is_no_face() -> None:
     assert abs(plane.plane.normal[2]) > 0.999
 
 
+@pytest.mark.parametrize("n_stray", [1, 5, 20])
+def test_strays_of_another_stripe_make_no_face_of_a_light_sheet(n_stray: int) -> None:
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        stripe = profile(0.0, 0.005, seed)
+        strays = rng.uniform([-30.0, -20.0, 120.0], [30.0, 20.0, 160.0], (n_stray, 3))
+        cloud = cloud_of(np.vstack([stripe, strays]), np.zeros(len(stripe) + n_stray, np.int64))
+        sheet = (np.arange(len(cloud)) >= len(stripe)).astype(np.int64)
+        cloud = replace(cloud, sheet=sheet, sheet_names=("A", "B"), frame="Sensor")
+        refused = inspect_step(cloud, HEIGHT_MM)
+        assert isinstance(refused, FitFailure)
+        assert "points of several stripes" in refused.reason
+
+
 def test_one_exposure_is_as_high_as_its_lean_lets_it_be() -> None:
     """Without a normal the sheet counts as square: at 5 degrees 20 mm reads 20 / cos 5."""
     lean = np.deg2rad(5.0)

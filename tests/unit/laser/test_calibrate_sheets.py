@@ -257,11 +257,12 @@ def test_points_are_rejected_for_the_reason_that_holds() -> None:
     flags = np.zeros(len(q), dtype=np.int64)
     flags[10] = StripeFlag.NEIGHBOUR
     flags[11] = StripeFlag.SATURATED
+    flags[12] = StripeFlag.SATURATED | StripeFlag.PULLED
     boards[2] = BoardStripes(replace(profile, flags=flags), board.view, board.sensor_from_board)
     fit = calibrate_sheets(boards, rig.calibration(rig.camera))
     assert isinstance(fit, LaserFit)
     use = fit.images[2].use
-    assert use[10] == PointUse.FLAGGED
+    assert use[10] == use[12] == PointUse.FLAGGED
     assert use[11] == PointUse.USED
     assert use[50] == use[60] == PointUse.OFF_LINE
     assert (use[-2:] == PointUse.OFF_BOARD).all()

@@ -6,7 +6,7 @@ import pytest
 from scipy.special import ndtr
 
 from armscan.records.exposure import Exposure
-from armscan.records.profile import StripeFlag
+from armscan.records.profile import Profile, StripeFlag
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.flags import close_gaps
 from armscan.vision.stripe.image import StripeOptions
@@ -106,16 +106,32 @@ def test_a_step_widens_a_clipped_line_by_what_it_may_move_it(sigma_px: float) ->
     assert np.sqrt((np.concatenate(ratio) ** 2).mean()) < 2.5
 
 
-def test_a_clipped_line_beside_a_step_keeps_its_points() -> None:
+def beside_a_step(at_px: float) -> Profile:
+    """A clipped line on ground that is brighter from ``at_px`` beside it on."""
     rng = np.random.default_rng(5)
     y, x = np.mgrid[:160, :300].astype(np.float64)
     distance = y - 80.0 - 0.02 * x
-    image = 100.0 + 45.0 * ndtr((distance - 6.0) / 2.0) + rng.normal(0.0, 1.5, distance.shape)
+    image = 100.0 + 45.0 * ndtr((distance - at_px) / 2.0) + rng.normal(0.0, 1.5, x.shape)
     image += 220.0 * np.exp(-0.5 * (distance / 2.6) ** 2)
-    profile = extract_stripes(Exposure(np.clip(image, 0.0, 255.0).round().astype(np.uint8), "step"))
+    return extract_stripes(Exposure(np.clip(image, 0.0, 255.0).round().astype(np.uint8), "step"))
+
+
+def test_a_clipped_line_beside_a_step_keeps_its_points() -> None:
+    profile = beside_a_step(6.0)
     error = profile.points_px @ [-0.02, 1.0] - 80.0
     assert profile.is_accepted.mean() > 0.9
+    assert profile.is_sure.mean() < 0.1
     assert (np.abs(error) < 4.0 * profile.sigma_px).all()
+
+
+def test_what_a_step_pulls_all_points_by_does_not_average_out() -> None:
+    profile = beside_a_step(0.0)
+    error = profile.points_px @ [-0.02, 1.0] - 80.0
+    assert profile.noise_length is not None
+    variance = (profile.sigma_px**2 * profile.noise_length).sum() / len(profile) ** 2
+    assert abs(error.mean()) < 3.0 * np.sqrt(variance)
+    alone = np.sqrt((profile.sigma_px**2).sum()) / len(profile)
+    assert abs(error.mean()) > 5.0 * alone, "as if each erred on its own"
 
 
 def test_close_lines_are_flagged_and_distant_lines_are_right() -> None:

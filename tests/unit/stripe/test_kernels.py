@@ -522,7 +522,7 @@ def test_marks_follow_their_definitions() -> None:
     saturated = (rng.uniform(size=(40, 40)) > 0.93).astype(np.uint8)
     marks, flags = np.full((n, 8), np.nan), np.zeros(n, np.int64)
     given = (points, fits, sides, side_sigma, neighbour, chain, saturated)
-    mark_points(*given, np.array([1, 2, 4, 8]), marks, flags)
+    mark_points(*given, np.array([1, 2, 4, 8, 16]), marks, flags)
     across = np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
     centre = np.where(is_row[:, None], np.stack([fits[:, 0], line], 1), 0.0)
     centre += np.where(is_row[:, None], 0.0, np.stack([line, fits[:, 0]], 1))
@@ -542,14 +542,16 @@ def test_marks_follow_their_definitions() -> None:
     is_step = step > 5.0 * side_sigma
     share = step / fits[:, 1]
     mostly = near @ is_clipped.astype(np.float64) > near.sum(axis=1) / 2
-    pull = np.where(mostly & is_step & (share <= 1.0), 0.7 * share * width, 0.0)
+    pull = np.where(mostly & is_step & (share <= 0.5), 0.7 * share * width, 0.0)
     assert 5 < (pull > 0.0).sum() < (is_clipped & is_step).sum()
     assert marks[:, 7] == pytest.approx(pull, rel=1e-12)
+    is_widened = (pull > 0.0) & (share > 0.2)
     definitions = (
         is_clipped,
-        is_step & (share > np.where(mostly, 1.0, 0.2)),
+        is_step & (share > np.where(mostly, 0.5, 0.2)),
         (lean > 5.0 * np.sqrt(norm)) & (lean / norm > np.maximum(0.1, 0.3 / width)),
         neighbour.min(axis=1) < 4.5 * width,
+        is_widened,
     )
     for bit, holds in enumerate(definitions):
         assert 0 < holds.sum() < n

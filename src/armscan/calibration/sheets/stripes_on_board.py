@@ -335,10 +335,10 @@ def observe_board_stripes(
     pulled = (profile.flags & int(REJECTING) & ~int(PULLING)) == 0
     if data.on_edge is not None:
         use[data.on_edge] = PointUse.ON_EDGE
-        pulled &= data.on_edge | ~profile.is_accepted
+        pulled &= data.on_edge | ~profile.is_sure
     use[~is_within] = PointUse.OFF_BOARD
     use[~points.is_valid] = PointUse.NO_RAY
-    use[~profile.is_accepted] = PointUse.FLAGGED
+    use[~profile.is_sure] = PointUse.FLAGGED
     found = _with_stripes(image, use == PointUse.OFF_LINE, n_lines)
     if found.stripes or not pulled.any():
         return found

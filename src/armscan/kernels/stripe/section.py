@@ -463,8 +463,8 @@ def common_terms(said: Table, rounds: int, clipped_score: float, terms: FloatsOu
 
 
 SIGNIFICANT = 5.0
-BACKGROUND_STEP, STEP_BY_CLIPPED = 0.2, 1.0
-"""Steps from which a point is flagged, as shares of the line's amplitude: of any line, and of one
+BACKGROUND_STEP, STEP_BY_CLIPPED = 0.2, 0.5
+"""Steps from which a point is rejected, as shares of the line's amplitude: of any line, and of one
 that is clipped at most of the neighbours, which smaller ones widen instead."""
 PULL_PER_STEP = 0.7
 """Sigmas of the line by which a step as high as it moves a clipped one: print beside lines of
@@ -529,8 +529,9 @@ def mark_points(
     ``points``: (N, 6) ridge points, ordered along chains. ``fits``: (N, 9) of `fit_profiles`.
     ``sides``: (N, 2), ``side_sigma``: (N,) background on both sides and sigma of its difference.
     ``neighbour``: (N, 2) distance to other lines. ``chain``: (N,) numbers. ``saturated``: (H, W) 1
-    where the laser's channel is; (1, 1) zero if it is nowhere. ``bits``: (4,) that of a
-    clipped centre, of a step of the background, of a profile that leans, of a line beside it.
+    where the laser's channel is; (1, 1) zero if it is nowhere. ``bits``: (5,) that of a
+    clipped centre, of a step of the background, of a profile that leans, of a line beside it, and
+    of a step that only widens.
     ``marks``: (N, 8) output: fitted centre x, y, sigma along the normal, sigma of the line, its
     mean over the neighbours, how surely the profiles lean there, sine of the slant, and what a step
     beside a clipped line may move it by, px.
@@ -565,6 +566,7 @@ def mark_points(
                 flags[i] |= bits[1]
             elif is_clipped:
                 marks[i, MARK_PULL] = PULL_PER_STEP * share * width
+                flags[i] |= bits[4] if share > BACKGROUND_STEP else 0
         norm = max(norm, 1e-12)
         marks[i, MARK_MEAN_WIDTH] = mean / (high - low)
         marks[i, MARK_LEAN] = lean / math.sqrt(norm)

@@ -8,15 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from armscan.geometry.arrays import BoolArray, IntArray
 from armscan.kernels.stripe.profile_fit import ALIKE, AMPLITUDE
 from armscan.kernels.stripe.section import (
-    BACKGROUND_STEP,
     EDGE_BLUR_PX2,
     MARK_PULL,
     MARK_SIGMA,
     MARK_WIDTH,
     MOST_PULL,
-    PULL_PER_STEP,
     widen_sigmas,
 )
 from armscan.kernels.stripe.smoothing import find_pulls, take_out_bends
@@ -144,8 +143,8 @@ def _extract(
         ground = relative_reflectance(background, options.laser_colour)
         planes = tuple(replace(plane, reflectance=ground) for plane in planes)
     profiles = [_find_in(exposure, plane, options, threshold) for plane in planes]
-    most = max(int(profile.is_accepted.sum()) for profile in profiles)
-    return next(p for p in profiles if p.is_accepted.sum() >= NEARLY_ALL * most)
+    sure = [int(profile.is_sure.sum()) for profile in profiles]
+    return profiles[next(k for k, n in enumerate(sure) if n >= NEARLY_ALL * max(sure))]
 
 
 def _find_in(
@@ -270,12 +269,9 @@ def to_profile(
         flags |= int(StripeFlag.GROUND_KNOWN)
     flags[is_cut_off(marks, chain, plane.image.shape)] |= int(StripeFlag.END)
     flags[is_short(points, chain)] |= int(StripeFlag.SHORT_SEGMENT)
-    usable = (flags & int(REJECTING)) == 0
-    pull = marks[:, MARK_PULL].copy()
-    is_pulled = pull > PULL_PER_STEP * BACKGROUND_STEP * width
-    # beyond a crossing a chain may follow the other line, and a step bends it beside its own place:
-    # nothing is averaged across them
-    is_new = (np.diff(chain) != 0) | (np.diff(near) != 0) | (np.diff(is_pulled) != 0)
+    usable = (flags & int(REJECTING | StripeFlag.PULLED)) == 0
+    # beyond a crossing a chain may follow the other line: nothing is averaged across it
+    is_new = (np.diff(chain) != 0) | (np.diff(near) != 0)
     stretch = np.concatenate([[0], np.cumsum(is_new)])
     alike = sigma**2 * fits.values[:, ALIKE]
     course = straighten(Polyline(points, normals, sigma, stretch, usable), fits)
@@ -288,7 +284,10 @@ def to_profile(
     noise_length = np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0)
     sigma = np.hypot(sigma, np.sqrt(alike))
     on_flanks = flags & int(StripeFlag.SATURATED)
+    pull = marks[:, MARK_PULL].copy()
     widen_sigmas(fits.ridge.table, fits.section, width, fits.ground, on_flanks, pull, sigma)
+    # a step pulls all points beside it alike
+    noise_length += (_run_lengths(pull > 0.0, chain) - noise_length) * (pull / sigma) ** 2
     return Profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(smoothed.points),
@@ -300,6 +299,13 @@ def to_profile(
         segment=np.cumsum(np.diff(chain, prepend=chain[:1]) != 0),
         noise_length=noise_length,
     )
+
+
+def _run_lengths(is_alike: BoolArray, chain: IntArray) -> IntArray:
+    """(N,) how many points follow each other along a chain that are alike."""
+    is_new = (np.diff(is_alike) != 0) | (np.diff(chain) != 0)
+    run = np.concatenate([[0], np.cumsum(is_new)])
+    return np.asarray(np.bincount(run)[run])
 
 
 def straighten(course: Polyline, fits: ProfileFits) -> Polyline:

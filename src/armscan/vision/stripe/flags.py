@@ -32,6 +32,7 @@ MARKS = (
     StripeFlag.BACKGROUND_STEP,
     StripeFlag.ASYMMETRIC,
     StripeFlag.NEIGHBOUR,
+    StripeFlag.PULLED,
 )
 
 
@@ -103,7 +104,7 @@ def is_cut_off(marks: FloatArray, chain: IntArray, shape: tuple[int, ...]) -> Bo
     times the slant's tangent) and at most as far as one along the rows or columns. Ends at the
     image's border and closed loops have none.
 
-    ``marks``: (N, 7) of `mark`. ``chain``: (N,) numbers. ``shape``: Rows and columns of the image.
+    ``marks``: (N, 8) of `mark`. ``chain``: (N,) numbers. ``shape``: Rows and columns of the image.
     """
     found = np.zeros(len(chain), dtype=np.bool_)
     starts = np.flatnonzero(np.concatenate([[True], np.diff(chain) != 0]))
@@ -125,7 +126,7 @@ def _is_at_border(point: FloatArray, sigma_px: float, shape: tuple[int, ...]) ->
 
 
 def _count_cut(inwards: FloatArray, sigma_px: float) -> int:
-    """How many points from the end, of marks (N, 7) from there on, have a truncated profile."""
+    """How many points from the end, of marks (N, 8) from there on, have a truncated profile."""
     step_x, step_y = np.diff(inwards[:, 0]), np.diff(inwards[:, 1])
     arc = np.concatenate([[0.0], np.cumsum(np.sqrt(step_x**2 + step_y**2))])
     width, mean_width = inwards[:, MARK_WIDTH], inwards[:, MARK_MEAN_WIDTH]

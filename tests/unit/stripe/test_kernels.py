@@ -539,19 +539,17 @@ def test_marks_follow_their_definitions() -> None:
     assert marks[:, 4:7] == pytest.approx(shape, rel=1e-9, abs=1e-7)
     lean = np.abs(lean)
     is_clipped = maximum_filter(saturated, 3, mode="nearest")[y, x] > 0
-    is_step = step > 5.0 * side_sigma
-    share = step / fits[:, 1]
+    is_step, share = step > 5.0 * side_sigma, step / fits[:, 1]
     mostly = near @ is_clipped.astype(np.float64) > near.sum(axis=1) / 2
     pull = np.where(mostly & is_step & (share <= 0.5), 0.7 * share * width, 0.0)
     assert 5 < (pull > 0.0).sum() < (is_clipped & is_step).sum()
     assert marks[:, 7] == pytest.approx(pull, rel=1e-12)
-    is_widened = (pull > 0.0) & (share > 0.2)
     definitions = (
         is_clipped,
         is_step & (share > np.where(mostly, 0.5, 0.2)),
         (lean > 5.0 * np.sqrt(norm)) & (lean / norm > np.maximum(0.1, 0.3 / width)),
         neighbour.min(axis=1) < 4.5 * width,
-        is_widened,
+        (pull > 0.0) & (share > 0.2),
     )
     for bit, holds in enumerate(definitions):
         assert 0 < holds.sum() < n

@@ -38,15 +38,15 @@ def inspect_plane(
     region: Box | None = None,
     options: InspectionOptions | None = None,
 ) -> PlaneInspection | FitFailure:
-    """Inspect a flat face.
+    """Inspect a flat face; fails where all points but a few lie in one light sheet.
 
     Parameters
     ----------
     cloud
         Points in any frame.
     reference
-        The plane to be met, in the same frame; without it the plane that most points lie near is
-        looked for, and only the fitted reference is reported.
+        The plane to be met, in the same frame; without it the plane that most points of several
+        stripes lie near is looked for, and only the fitted reference is reported.
     reference_text
         Where it came from, for the definitions.
     region

@@ -3,12 +3,16 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
+from armscan.vision.stripe import extract
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.flags import close_gaps
+from armscan.vision.stripe.fit import ProfileFits
+from armscan.vision.stripe.flags import close_gaps, mark
 from armscan.vision.stripe.image import StripeOptions
 from armscan.vision.stripe.ridge import strong_median
 from rigs.stripe_image import SimulatedStripe, StraightCurve, StripeScene
@@ -122,6 +126,30 @@ def test_a_clipped_line_beside_a_step_keeps_its_points() -> None:
     assert profile.is_accepted.mean() > 0.9
     assert profile.is_sure.mean() < 0.1
     assert (np.abs(error) < 4.0 * profile.sigma_px).all()
+
+
+def test_pulled_points_take_no_part_in_the_smoothing_of_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Sure points are the same whether those of a shifted stretch are pulled or rejected."""
+    exposure = StripeScene((line(10.0, peak=120.0),), 320, 240).expose(3)
+    found = []
+    for flag in (StripeFlag.PULLED, StripeFlag.BACKGROUND_STEP):
+
+        def marked(
+            fits: ProfileFits, saturated: NDArray[np.uint8], flag: StripeFlag = flag
+        ) -> tuple[FloatArray, IntArray]:
+            marks, flags = mark(fits, saturated)
+            is_shifted = np.abs(marks[:, 0] - 150.0) < 20.0
+            marks[is_shifted, 1] += 0.3
+            flags[is_shifted] |= int(flag)
+            return marks, flags
+
+        monkeypatch.setattr(extract, "mark", marked)
+        profile = extract.extract_stripes(exposure)
+        found.append(profile.select(profile.is_sure))
+        assert 250 < len(found[-1]) < 290
+    assert np.array_equal(found[0].points_px, found[1].points_px)
 
 
 def test_what_a_step_pulls_all_points_by_does_not_average_out() -> None:

@@ -211,12 +211,11 @@ class PointSpool:
 
     def of_exposure(self, exposure: int) -> PointCloud:
         """All points of one exposure, numbered as appended."""
-        names = replace(
-            self.without_points(),
+        # not of `without_points`, which names all exposures
+        names = PointCloud.empty(
+            frame=self.frame,
+            sheet_names=self.sheet_names,
             exposure_sources=(self._sources[exposure],),
-            normals=None,
-            seen_from_mm=None,
-            calibration_errors=None,
         )
         owners = np.zeros(self.count(exposure), dtype=np.int64)
         return self._piece(0, np.array([exposure]), owners, names).cloud

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.records.cloud import CloudFrame, PointCloud
+from armscan.records.cloud import FIELD_POWERS, CalibrationErrors, CloudFrame, PointCloud
 
 RADIUS_MM = 17.48
 
@@ -44,6 +46,16 @@ def cloud_of(
         intensity=np.full(n, 100.0),
         normals=normals,
     )
+
+
+def seen_from(cloud: PointCloud, places_mm: FloatArray, turns: FloatArray) -> PointCloud:
+    """The cloud with where its sensor stood (E, 3) and how (E, 3, 3), and errors of size zero."""
+    modes = np.zeros((len(cloud.sheet_names), len(FIELD_POWERS), 3, 1))
+    middle = np.zeros((len(cloud.sheet_names), 2))
+    errors = CalibrationErrors(
+        turns=turns, middle=middle, half_width=middle + 1.0, modes_mm=modes, arm_mm=0.0
+    )
+    return replace(cloud, seen_from_mm=places_mm, calibration_errors=errors)
 
 
 def ball_stripes(n_stripes: int, n_points: int, half_deg: float = 70.0) -> FloatArray:

@@ -28,7 +28,7 @@ SPHERE_EXAMPLE = (
 )
 STEP_EXAMPLE = (
     "\b\nExample:\n  armscan inspect step blocks.ply --height 20 -o blocks-inspection.html\n\n"
-    "\b\nA cloud of one exposure cannot tell how far its light sheet leans on the faces;\n"
+    "\b\nPoints of one light sheet cannot tell how far it leans on the faces;\n"
     "without --normal it is taken to stand square."
 )
 VERIFY_EXAMPLE = (
@@ -103,7 +103,7 @@ def step(
     normal: Annotated[
         str,
         typer.Option(
-            help="Normal x,y,z of the faces in the cloud's frame, for a single exposure.",
+            help="Normal x,y,z of the faces in the cloud's frame, for points of one light sheet.",
             show_default=False,
         ),
     ] = "",

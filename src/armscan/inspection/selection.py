@@ -29,6 +29,8 @@ SEARCH_SIGMAS = 2.0
 """The same in the points' stated sigmas, where these are larger: 19 of 20 points lie within."""
 MIN_POINTS = 30
 """Fewest points that make a feature."""
+AT_REST_MM = 0.1
+"""What an arm at rest trembles, and less than a light sheet is thick."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,15 +118,16 @@ class Selection:
     def stripe(self) -> IntArray | None:
         """(N,) number of the place of the light sheet in which each point lies, from 0.
 
-        A sheet has one place in an exposure, and in the Sensor frame one in all of them. None for a
-        cloud that does not tell sheets: a fused or foreign one.
+        A sheet has one place in an exposure, in the Sensor frame one in all of them, and in others
+        one in those that were taken at rest. None for a cloud that does not tell sheets: a fused or
+        foreign one.
         """
         cloud = self.cloud
         if cloud.is_fused or not any(cloud.sheet_names):
             return None
         number = cloud.sheet[self.rows]
         if cloud.frame != "Sensor":
-            number = number + cloud.exposure[self.rows] * len(cloud.sheet_names)
+            number = number + standings(cloud)[cloud.exposure[self.rows]] * len(cloud.sheet_names)
         return np.asarray(np.unique(number, return_inverse=True)[1])
 
     @property
@@ -136,6 +139,31 @@ class Selection:
         """
         widest = max(SEARCH_BAND_MM, 0.5 * self.feature_mm)
         return np.clip(SEARCH_SIGMAS * self.sigma_mm, SEARCH_BAND_MM, widest)
+
+
+def standings(cloud: PointCloud) -> IntArray:
+    """(E,) number of the place of the head at each exposure, rising from 0.
+
+    Exposures that follow each other share it while no point at their distance moves by
+    `AT_REST_MM` from where the head had it at the first of them. Where the cloud does not tell how
+    the head stood, each has one of its own.
+    """
+    seen_from_mm, errors = cloud.seen_from_mm, cloud.calibration_errors
+    n = len(cloud.exposure_sources)
+    if seen_from_mm is None or errors is None or not len(cloud):
+        return np.arange(n)
+    away_mm = cloud.points_mm - seen_from_mm[cloud.exposure]
+    reach_mm = float(np.median(np.linalg.norm(away_mm, axis=1)))
+    # the head's origin and two of its axes: whatever it does, one of them moves
+    marks = reach_mm * np.eye(3)[:, [0, 0, 2]] * [0.0, 1.0, 1.0]
+    carried = errors.turns @ marks + seen_from_mm[:, :, None]
+    place, first = np.zeros(n, dtype=np.int64), 0
+    for k in range(1, n):
+        moved_mm = np.linalg.norm(carried[k] - carried[first], axis=0).max()
+        if moved_mm > AT_REST_MM:
+            first = k
+        place[k] = place[k - 1] + (first == k)
+    return place
 
 
 def select(

@@ -210,7 +210,7 @@ def _inner(flat: FloatArray, stripe: IntArray, margin_mm: float) -> BoolArray:
 
 ROUNDS = 6
 FLAT_PROFILE_MM = 0.3
-"""Points of one exposure that keep this near to a plane are one profile in one light sheet."""
+"""Points of one stripe that keep this near to a plane are one profile in one light sheet."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -271,11 +271,12 @@ def inspect_step(
 ) -> StepInspection | FitFailure:
     """Find two parallel faces a nominal height apart and measure the distance between them.
 
-    Points of many exposures determine the faces' common normal. Points of ONE exposure lie in one
-    light sheet and show two parallel lines; their distance d within the sheet is the height only
-    if the sheet stands square on the faces. How far it leans, e, no single exposure can tell: the
-    height is ``d cos(e)``, with e from ``normal`` if that is given, else zero. Only e is taken
-    from ``normal``: a direct projection on it would turn an error of 0.1 degrees into 0.03 mm.
+    Points of many stripes determine the faces' common normal. Points of one light sheet, of a
+    single exposure or of several at rest, show two parallel lines; their distance d within the
+    sheet is the height only if the sheet stands square on the faces. How far it leans, e, no single
+    sheet can tell: the height is ``d cos(e)``, with e from ``normal`` if that is given, else zero.
+    Only e is taken from ``normal``: a direct projection on it would turn an error of 0.1 degrees
+    into 0.03 mm.
 
     Parameters
     ----------
@@ -284,8 +285,8 @@ def inspect_step(
     height_mm
         Nominal height.
     normal
-        (3,) normal of the faces in the cloud's frame, from the arm's pose and a plate; used for a
-        single exposure only.
+        (3,) normal of the faces in the cloud's frame, from the arm's pose and a plate; used for
+        points of one light sheet only.
     region
         Only points inside are looked at.
     options, step_options
@@ -328,7 +329,7 @@ def _explained(failure: FitFailure, section: _Section, normal: FloatArray | None
     if section.sheet_normal is None or normal is not None:
         return failure
     return FitFailure(
-        f"{failure.reason}. These are distances within the light sheet of one exposure; in a sheet "
+        f"{failure.reason}. These are distances within one light sheet; in a sheet "
         "that leans they are larger than the height",
         "check the height, or give the faces' --normal if the sheet leans",
     )
@@ -338,7 +339,9 @@ def _section(selection: Selection) -> _Section | FitFailure:
     cloud, rows, points = selection.cloud, selection.rows, selection.points_mm
     middle = points.mean(axis=0)
     whole = _Section(np.eye(3), points - middle, None, np.zeros(len(points)))
-    if len(np.unique(cloud.exposure[rows])) > 1 or len(np.unique(cloud.sheet[rows])) > 1:
+    # foreign points may be of one profile, whatever number they bear
+    stripe = cloud.exposure[rows] if selection.stripe is None else selection.stripe
+    if int(np.ptp(stripe)) > 0:
         return whole
     fit = fit_plane(points)
     if isinstance(fit, FitFailure):
@@ -403,7 +406,7 @@ def _lean(section: _Section, upwards: FloatArray, normal: FloatArray | None) -> 
         return 0.0, "the faces' common normal, fitted to their points"
     if normal is None:
         return 0.0, (
-            "one exposure: the light sheet is taken to stand square on the faces. If it leans by "
+            "one stripe: the light sheet is taken to stand square on the faces. If it leans by "
             "an angle e, the true height is the one given here times cos(e): 0.015 % less at "
             "1 degree"
         )
@@ -414,7 +417,7 @@ def _lean(section: _Section, upwards: FloatArray, normal: FloatArray | None) -> 
     sine = sign * float(normal @ section.sheet_normal) / size
     lean = math.asin(max(-1.0, min(1.0, sine)))
     return lean, (
-        f"one exposure: the light sheet leans by {math.degrees(abs(lean)):.3f} degrees against "
+        f"one stripe: the light sheet leans by {math.degrees(abs(lean)):.3f} degrees against "
         "the given normal of the faces, which the height allows for"
     )
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box
@@ -14,10 +15,10 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Plane, plane_from_coefficients
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection
-from armscan.inspection.selection import InspectionOptions
+from armscan.inspection.selection import InspectionOptions, standings
 from armscan.records.cloud import FUSED
 from armscan.report.inspection.shapes import plane_report
-from rigs.inspection_clouds import cloud_of, random_motion
+from rigs.inspection_clouds import cloud_of, random_motion, seen_from
 
 GRID = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0), [0.0]), axis=-1).reshape(-1, 3)
 
@@ -155,6 +156,31 @@ def test_exposures_from_one_place_share_their_light_sheet() -> None:
     refused = inspect_plane(cloud_of(stripes, np.repeat([0, 1, 2], 300), frame="Sensor"))
     assert isinstance(refused, FitFailure)
     assert "lie in one light sheet" in refused.reason
+
+
+@pytest.mark.parametrize(
+    ("step_mm", "turn_mrad", "n_places"),
+    [
+        (0.0, 0.0, 1),
+        (0.009, 0.0, 1),
+        (0.06, 0.0, 5),
+        (0.2, 0.0, 10),
+        (0.0, 0.1, 1),
+        (0.0, 1.5, 10),
+    ],
+)
+def test_exposures_at_rest_have_one_place(step_mm: float, turn_mrad: float, n_places: int) -> None:
+    """Ten exposures at 100 mm: a place is left where a point there has moved by 0.1 mm."""
+    k = np.arange(10)
+    points = np.array([[0.0, y, 0.0] for y in (-1.0, 1.0)] * 10)
+    for axis in np.eye(3):
+        turns = Rotation.from_rotvec(1e-3 * turn_mrad * k[:, None] * axis).as_matrix()
+        places = np.array([0.0, 0.0, 100.0]) + step_mm * k[:, None] * axis
+        cloud = seen_from(cloud_of(points, np.repeat(k, 2)), places, turns)
+        found = standings(cloud)
+        assert (found[0], found[-1]) == (0, n_places - 1)
+        assert set(np.diff(found)) <= {0, 1}
+    assert standings(cloud_of(points, np.repeat(k, 2))).tolist() == k.tolist()
 
 
 def test_a_cloud_that_tells_no_stripes_counts_all_points() -> None:

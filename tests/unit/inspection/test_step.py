@@ -15,7 +15,7 @@ from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import StepInspection
 from armscan.inspection.selection import StepOptions
 from armscan.inspection.step import inspect_step
-from rigs.inspection_clouds import block_stripes, cloud_of, random_motion
+from rigs.inspection_clouds import block_stripes, cloud_of, random_motion, seen_from
 
 HEIGHT_MM = 20.0
 
@@ -76,6 +76,20 @@ def test_a_stripe_along_an_edge_is_half_on_the_face_only_and_takes_no_part() -> 
     pulled[along_edge, 2] -= np.linspace(0.0, 0.18, int(along_edge.sum()))
     found = inspected(inspect_step(cloud_of(pulled, exposure), HEIGHT_MM))
     assert float(np.ptp(found.heights_mm)) < 1e-6
+
+
+def test_exposures_at_rest_show_their_step_as_one_of_them_does() -> None:
+    """Twenty stills of one line: all points lie in its sheet, of which no pair of faces is told."""
+    profiles = [profile(0.0, 0.01, seed) for seed in range(20)]
+    points = np.concatenate(profiles)
+    exposure = np.repeat(np.arange(20), len(profiles[0]))
+    tremble_mm = np.random.default_rng(0).normal(0.0, 0.01, (20, 3))
+    turns = np.tile(np.eye(3), (20, 1, 1))
+    placed = seen_from(cloud_of(points + tremble_mm[exposure], exposure), tremble_mm, turns)
+    for cloud in (cloud_of(points, exposure, frame="Sensor"), placed):
+        found = inspected(inspect_step(cloud, HEIGHT_MM))
+        assert "taken to stand square" in found.normal_rule
+        assert found.height.value_mm == pytest.approx(HEIGHT_MM, abs=4 * 0.01 / np.sqrt(20 * 250))
 
 
 def test_a_light_sheet_that_holds_most_points_is_no_face() -> None:

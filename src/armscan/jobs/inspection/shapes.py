@@ -106,8 +106,8 @@ def inspect_step(
 ) -> Summary:
     """Inspect a step of a nominal height.
 
-    ``normal`` is that of the faces in the cloud's frame, for a single exposure; empty for none.
-    The rest as `inspect_plane`.
+    ``normal`` is that of the faces in the cloud's frame, for points of one light sheet; empty
+    for none. The rest as `inspect_plane`.
     """
     options, step_options = options or InspectionOptions(), step_options or StepOptions()
     job.places(".html")

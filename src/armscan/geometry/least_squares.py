@@ -35,6 +35,15 @@ HUBER_LIMIT = 1.345
 """Huber's limit in standard deviations: 95 % efficiency for normal noise (Huber 1981)."""
 
 
+LEAST_P = 1e-300
+"""Below it distributions' tails leave double precision."""
+
+
+def p_text(p_value: float) -> str:
+    """A test's p value for a sentence: no data are impossible, so that it is never 0."""
+    return f"p < {LEAST_P:.0e}" if p_value < LEAST_P else f"p = {p_value:.2g}"
+
+
 def robust_sigma(residuals: FloatArray) -> float:
     """Standard deviation of residuals about zero from their median size; 0 where there are none."""
     size = np.abs(residuals).ravel()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from armscan.errors import ArmscanError, FileFormatError
 from armscan.geometry.arrays import IntArray
+from armscan.geometry.least_squares import p_text
 from armscan.models.calibration import (
     HAND_EYE_PARAMETER_NAMES,
     CameraCalibration,
@@ -614,7 +615,7 @@ def _sensor(calibration: SensorCalibration) -> dict[str, Any]:
 def _sheet_line(sheet: SheetCalibration) -> str:
     low, high = sheet.depth_range_mm
     known = sheet.diagnostics
-    fit = f", lack of fit p = {known.final_test.p_value:.2g}" if known else ""
+    fit = f", lack of fit {p_text(known.final_test.p_value)}" if known else ""
     return (
         f"{sheet.name} (rms {sheet.rms_mm:.4f} mm, Z {low:.1f} to {high:.1f} mm, "
         f"{sheet.n_boards} boards{fit})"

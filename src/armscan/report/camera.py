@@ -12,6 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap
 
 from armscan.calibration.cameras.result import BoardWarp, CameraFit, ViewFit
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.least_squares import p_text
 from armscan.models.calibration import Provenance
 from armscan.models.camera import PARAMETER_NAMES, Lens
 from armscan.records.exposure import Exposure
@@ -431,7 +432,7 @@ def _warp_section(warp: BoardWarp) -> Section:
     facts = (
         fact("Bow along x", x),
         fact("Bow along y", y),
-        fact("F test", f"F = {warp.f_statistic:.1f}, p = {warp.p_value:.2g}"),
+        fact("F test", f"F = {warp.f_statistic:.1f}, {p_text(warp.p_value)}"),
     )
     text = Text(f"{verdict} A positive bow lifts the middle away from the camera.")
     return Section("Bow of the board", (text, Facts(facts)))

@@ -20,6 +20,7 @@ from armscan.calibration.hand_eye.result import (
 from armscan.calibration.latency import LatencyFit
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import p_text
 from armscan.geometry.shapes import Plane
 from armscan.models.calibration import (
     HandEyeCalibration,
@@ -216,7 +217,7 @@ def chi2_verdict(probability: float) -> str:
     if not np.isfinite(probability):
         return "nothing is redundant, so nothing can be tested"
     if probability < 0.001:
-        return f"larger than the noise model allows (p = {probability:.2g})"
+        return f"larger than the noise model allows ({p_text(probability)})"
     if probability > 0.999:
         return f"smaller than the noise model expects (p = {probability:.4f})"
     return f"as expected (p = {probability:.2f})"

@@ -18,6 +18,7 @@ from armscan.calibration.sheets.result import (
     SheetImage,
 )
 from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.least_squares import p_text
 from armscan.models.calibration import FTest, Provenance, SheetCalibration
 from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES
 from armscan.records.exposure import Exposure
@@ -217,7 +218,7 @@ def lack_of_fit_text(test: FTest) -> str:
         verdict = "the model does not explain the stripes"
     else:
         verdict = "weak objection" if test.p_value < WEAK_P else "no objection"
-    return f"F = {test.f_ratio:.2f}, p = {test.p_value:.2g}: {verdict}"
+    return f"F = {test.f_ratio:.2f}, {p_text(test.p_value)}: {verdict}"
 
 
 def sheet_warnings(fit: LaserFit) -> tuple[str, ...]:

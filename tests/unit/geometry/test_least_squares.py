@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -19,6 +21,7 @@ from armscan.geometry.least_squares import (
     huber_weights,
     levenberg_marquardt,
     minimise,
+    p_text,
     pseudo_inverse,
     robust_sigma,
     square_root,
@@ -188,3 +191,16 @@ def test_pseudo_inverse_is_scipys(sign: float) -> None:
     np.testing.assert_allclose(
         pseudo_inverse(matrix, 1e-10), scipy.linalg.pinvh(matrix, rtol=1e-10), atol=1e-12
     )
+
+
+def test_no_data_are_impossible() -> None:
+    """A tail that double precision cannot hold is told by what it is less than, a gap as one."""
+    told = [p_text(p) for p in (1.0, 0.0301, 1.5e-13, 2e-300, 5e-324, 0.0, math.nan)]
+    assert told == [
+        "p = 1",
+        "p = 0.03",
+        "p = 1.5e-13",
+        "p = 2e-300",
+        *["p < 1e-300"] * 2,
+        "p = nan",
+    ]

@@ -40,7 +40,7 @@ from armscan.calibration.hand_eye.search import (
 from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface
 from armscan.geometry.arrays import FloatArray, homogeneous
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.least_squares import pseudo_inverse
+from armscan.geometry.least_squares import p_text, pseudo_inverse
 from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention, euler_from_rotations, rotations_from_euler
 from armscan.models.calibration import SHEET_PARAMETER_NAMES
@@ -296,7 +296,7 @@ def plane_in_words(found: Sequence[Alternative]) -> str:
     probability = min(checks["plate"].probability, by_offset.probability)
     agrees = "contradict it" if probability < SUSPICIOUS else "agree with it"
     return (
-        f"the stripes {agrees} (p = {probability:.2g}): by themselves they put it "
+        f"the stripes {agrees} ({p_text(probability)}): by themselves they put it "
         f"{shift_mm:+.3f} ± {sigma_mm:.3f} mm along its normal; a plate that moved by less than "
         f"{3.0 * sigma_mm:.2f} mm after probing may go unnoticed"
     )

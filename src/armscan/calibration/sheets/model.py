@@ -28,7 +28,7 @@ from armscan.calibration.sheets.solve import (
 from armscan.calibration.sheets.stripes_on_board import BoardImage
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.least_squares import robust_sigma
+from armscan.geometry.least_squares import p_text, robust_sigma
 from armscan.geometry.shapes import Plane, fit_plane
 from armscan.models.calibration import FTest
 from armscan.models.light_sheet import BOW_TERMS, MAX_FAN, LightSheet
@@ -423,7 +423,7 @@ def choose_model(
         flat.sheets[0], False, noise, plane_test, plane_test, "", noise.sigma_factor, as_claimed
     )
     n_boards = len(np.unique(observations.board))
-    test = f"lack of fit F {plane_test.f_ratio:.2f}, p {plane_test.p_value:.2g}"
+    test = f"lack of fit F {plane_test.f_ratio:.2f}, {p_text(plane_test.p_value)}"
     if plane_test.p_value >= LACK_OF_FIT_P:
         decision = f"a plane is enough ({test})"
     elif n_boards < MIN_BOARDS_FOR_BOW:
@@ -447,7 +447,7 @@ def _bow_or_boards(
 ) -> SheetModel | FitFailure:
     """What a plane leaves unexplained: is the sheet bowed, or do its boards scatter?"""
     noise, plane_test = plane_model.noise, plane_model.plane_test
-    test = f"lack of fit F {plane_test.f_ratio:.2f}, p {plane_test.p_value:.2g}"
+    test = f"lack of fit F {plane_test.f_ratio:.2f}, {p_text(plane_test.p_value)}"
     boards = data.board_scatter(flat, noise)
 
     def plane(decision: str) -> SheetModel | FitFailure:
@@ -466,7 +466,7 @@ def _bow_or_boards(
     bowed, boards_bowed = data.likelier(bowed, noise, is_bowed=True)
     gain = 2.0 * (boards_bowed.log_likelihood - boards.log_likelihood)
     p_value = float(chdtrc(bowed.n_parameters - flat.n_parameters, max(gain, 0.0)))
-    likelihood = f"likelihood ratio {gain:.1f}, p {p_value:.2g}"
+    likelihood = f"likelihood ratio {gain:.1f}, {p_text(p_value)}"
     if p_value >= LACK_OF_FIT_P:
         return plane(
             f"a plane does not explain the stripes ({test}), and a bow does no better than boards "

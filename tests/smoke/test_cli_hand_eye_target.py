@@ -158,6 +158,22 @@ def test_inverse_poses_are_refused_by_name(
     assert not output.exists()
 
 
+def test_a_table_in_the_order_of_a_plain_sort_is_told(
+    calibrated: Bench, scan: Path, poses: Path, tmp_path: Path, fails: Fails
+) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    names = [f"view{k}.png" for k in range(5, 5 + len(POSTURES))]
+    for file, name in zip(sorted((scan / "images").iterdir()), names, strict=True):
+        shutil.copy(file, images / name)
+    lines = dict(zip(names, poses.read_text().split("\n"), strict=True))
+    poses.write_text("\n".join(lines[name] for name in sorted(names)))
+    words = words_of(images, "--poses", poses, "--camera", calibrated.camera)
+    message = fails(*words, "-o", tmp_path / "no.json")
+    assert "as a plain sort lists these (10 before 2) would leave 0." in message
+    assert "in natural order (2 before 10): sort the table so" in message
+
+
 @pytest.mark.parametrize("convention", ["rotation-vector", "intrinsic-zyx"])
 def test_a_table_in_metres_and_radians_is_told_what_to_type(
     calibrated: Bench, scan: Path, poses: Path, tmp_path: Path, fails: Fails, convention: str

@@ -65,6 +65,16 @@ def test_plain_json_with_nested_lists(tmp_path: Path) -> None:
     assert camera.parameters.tolist() == [500, 501, 320, 240, -0.1, 0.02, 0.001, 0.002, 0.0]
 
 
+def test_names_of_the_usual_script(tmp_path: Path) -> None:
+    """``mtx`` and ``dist``, as OpenCV's tutorial calls them."""
+    path = tmp_path / "camera.json"
+    path.write_text(
+        '{"mtx": [[500, 0, 320], [0, 501, 240], [0, 0, 1]], '
+        '"dist": [[-0.1, 0.02, 0.001, 0.002, 0]], "image_size": [640, 480]}'
+    )
+    assert read_foreign_camera(path).camera.parameters.tolist()[:5] == [500, 501, 320, 240, -0.1]
+
+
 def test_ros_camera_info(tmp_path: Path) -> None:
     path = tmp_path / "left.yaml"
     path.write_text(ROS)
@@ -111,6 +121,7 @@ BAD = {
     ),
     "nan": (ROS.replace("438.783367", ".Nan"), "not finite|not a"),
     "negative": (ROS.replace("438.783367", "-438.7"), "positive"),
+    "in parts of the image": (ROS.replace("438.783367", "0.6856"), "focal length of 0.6856 px"),
     "skew": (ROS.replace("[438.783367, 0.000000", "[438.783367, 2.5"), "skew"),
     "transposed": (
         ROS.replace("[438.783367, 0.000000, 305.593336", "[438.783367, 0.0, 0.0").replace(

@@ -57,6 +57,87 @@ def test_sixteen_bits_are_exact(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_array_equal(exposure.image, image)
 
 
+SHORT, TWO_BYTES = 3, "<HHIHH"
+
+
+def tiff_bytes(pixels: np.ndarray, *entries: tuple[int, int]) -> bytes:
+    """A TIFF of one strip with these tags of one short value beside those that it must have;
+    colour (3, H, W) lies in planes, one strip each.
+    """
+    height, width = pixels.shape[-2:]
+    n, bits = pixels.size // (height * width), 8 * pixels.itemsize
+    start = 8 + 2 + 12 * (9 + len(entries) + (n > 1)) + 4
+    strips = [start + 100 + k * height * width * pixels.itemsize for k in range(n)]
+    tail = struct.pack("<3H3I3I", bits, bits, bits, *(strips * 3)[:3], *([pixels.nbytes // n] * 3))
+    one = {256: width, 257: height, 259: 1, 262: 1 if n == 1 else 2, 277: n, 278: height}
+    values = one | dict(entries) | ({284: 2} if n > 1 else {})
+    packed = {tag: struct.pack(TWO_BYTES, tag, SHORT, 1, value, 0) for tag, value in values.items()}
+    far = {258: (SHORT, bits, start), 273: (4, strips[0], start + 6)}
+    far[279] = (4, pixels.nbytes // n, start + 18)
+    for tag, (kind, value, place) in far.items():
+        packed[tag] = struct.pack("<HHII", tag, kind, n, value if n == 1 else place)
+    body = b"".join(packed[tag] for tag in sorted(packed))
+    head = struct.pack("<2sHIH", b"II", 42, 8, len(packed)) + body + bytes(4)
+    return (head + tail).ljust(start + 100, b"\0") + pixels.tobytes()
+
+
+@pytest.mark.parametrize("orientation", [1, 2, 3, 6, 8])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_no_orientation_turns_a_tiff(tmp_path: Path, orientation: int, bits: int) -> None:
+    image, path = noise((20, 31), bits=bits), tmp_path / "turned.tif"
+    path.write_bytes(tiff_bytes(image, (274, orientation)))
+    np.testing.assert_array_equal(read_exposure(path).image, image)
+
+
+def test_colours_in_planes_are_read_or_refused(tmp_path: Path) -> None:
+    """The decoder takes planes of 16 bits for one after the other pixel."""
+    path, planes = tmp_path / "planes.tif", noise((3, 20, 32))
+    path.write_bytes(tiff_bytes(planes))
+    np.testing.assert_array_equal(read_exposure(path).image, planes.transpose(1, 2, 0))
+    path.write_bytes(tiff_bytes(noise((3, 20, 32), bits=16)))
+    with pytest.raises(FileFormatError, match="keeps its colours in planes of 16 bits"):
+        read_exposure(path)
+
+
+def test_grey_that_counts_from_white_is_read_or_refused(tmp_path: Path) -> None:
+    path, image = tmp_path / "white.tif", noise((20, 31))
+    path.write_bytes(tiff_bytes(image, (262, 0)))
+    np.testing.assert_array_equal(read_exposure(path).image, 255 - image)
+    path.write_bytes(tiff_bytes(noise((20, 31), bits=16), (262, 0)))
+    with pytest.raises(FileFormatError, match="counts from white, in 16 bits"):
+        read_exposure(path)
+
+
+def test_a_tiff_of_several_images_is_refused_but_not_for_its_preview(tmp_path: Path) -> None:
+    path, image = tmp_path / "stack.tif", noise((20, 30))
+    pages = [Image.fromarray(image), Image.fromarray(255 - image)]
+    pages[0].save(path, save_all=True, append_images=pages[1:])
+    with pytest.raises(FileFormatError, match="holds several images; save each of them"):
+        read_exposure(path)
+    pages[0].save(path, save_all=True, append_images=[Image.fromarray(image[::2, ::2])])
+    np.testing.assert_array_equal(read_exposure(path).image, image)
+
+
+def test_a_fourth_byte_that_nobody_filled_is_no_alpha(tmp_path: Path) -> None:
+    """A bitmap of 32 bits whose masks name red, green and blue only."""
+    rgb, path = noise((20, 31, 3)), tmp_path / "padded.bmp"
+    rows = np.dstack([rgb[::-1, :, ::-1], np.zeros((20, 31), np.uint8)]).tobytes()
+    masks = struct.pack("<III", 0xFF0000, 0xFF00, 0xFF)
+    info = struct.pack("<IiiHHIIiiII", 40, 31, 20, 1, 32, 3, len(rows), 0, 0, 0, 0) + masks
+    head = b"BM" + struct.pack("<IHHI", 14 + len(info) + len(rows), 0, 0, 14 + len(info))
+    path.write_bytes(head + info + rows)
+    np.testing.assert_array_equal(read_exposure(path).image, rgb)
+
+
+def test_a_pgm_header_of_windows_shifts_no_pixel(tmp_path: Path) -> None:
+    path, image = tmp_path / "crlf.pgm", noise((4, 6))
+    path.write_bytes(b"P5\r\n6 4\r\n255\r\n" + image.tobytes())
+    np.testing.assert_array_equal(read_exposure(path).image, image)
+    image[0, 0] = 10
+    path.write_bytes(b"P5\r\n6 4\r\n255\r" + image.tobytes())
+    np.testing.assert_array_equal(read_exposure(path).image, image)
+
+
 def test_bits_used_and_high_alignment(tmp_path: Path) -> None:
     image = noise((20, 30), bits=12)
     low, high = tmp_path / "low.png", tmp_path / "high.png"
@@ -194,6 +275,22 @@ def test_paths_relative_to_the_working_folder(
     monkeypatch.chdir(tmp_path / "deep")
     assert expand_paths(["**/*.png"]) == (Path("er/f.png"),)
     assert expand_paths(["../deep/er/*"]) == (Path("../deep/er/f.png"),)
+
+
+def test_hidden_files_are_no_images_unless_they_are_named(tmp_path: Path) -> None:
+    """As macOS leaves them beside each file on a disk of another system."""
+    for name in ("a.jpg", "._a.jpg", ".DS_Store"):
+        (tmp_path / name).write_bytes(b"x")
+    assert [path.name for path in expand_paths([tmp_path])] == ["a.jpg"]
+    assert [path.name for path in expand_paths([f"{tmp_path}/*.jpg"])] == ["a.jpg"]
+    assert [path.name for path in expand_paths([f"{tmp_path}/.*.jpg"])] == ["._a.jpg"]
+
+
+def test_a_folder_may_be_called_like_a_pattern(tmp_path: Path) -> None:
+    folder = tmp_path / "photos [new]"
+    folder.mkdir()
+    (folder / "a.png").write_bytes(b"x")
+    assert expand_paths([f"{folder}/*.png"]) == (folder / "a.png",)
 
 
 def test_paths_that_match_nothing_have_a_reason(tmp_path: Path) -> None:

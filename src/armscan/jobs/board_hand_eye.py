@@ -291,6 +291,16 @@ def _readings(looks: Sequence[BoardLook], source: LookSource, views: _Views) -> 
     rows = [row_of[look.posture] for look in looks]
     for words, remedy, turns, shifts in other_table_readings(source.poses, source.euler or EULER):
         yield words, remedy, turns[rows], shifts[rows]
+    names = [path.as_posix() for path in expand_paths(source.images)]
+    line_of = np.argsort(sorted(range(len(names)), key=names.__getitem__))[rows]
+    poses = read_robot_poses(source.poses, source.euler or EULER)
+    if not np.array_equal(line_of, rows):
+        yield (
+            "giving the poses to the photographs as a plain sort lists these (10 before 2)",
+            "photographs are taken in natural order (2 before 10): sort the table so",
+            np.array([poses[line].rotation for line in line_of]),
+            np.array([poses[line].translation_mm for line in line_of]),
+        )
 
 
 def _not_used_warnings(not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from armscan.models.camera import CameraModel, Lens
 from armscan.storage.codec import LARGEST_SIZE_PX as MOST_PX
 from armscan.storage.codec import is_json, parse_json
 
-MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
+MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "mtx")
 DISTORTION_KEYS = (
     "distortion_coefficients",
     "Distortion_Coefficients",
@@ -26,6 +26,7 @@ DISTORTION_KEYS = (
     "dist_coeffs",
     "dist_coeff",
     "D",
+    "dist",
 )
 WIDTH_KEYS = ("image_width", "image_Width", "width")
 HEIGHT_KEYS = ("image_height", "image_Height", "height")
@@ -42,6 +43,8 @@ KEYS = (
 INNER = ("data",)
 MOST_ENTRIES = 100
 SKEW_LIMIT = 1e-6
+LEAST_FOCAL = 0.01
+"""Focal length in widths of the image: below it is no lens, but a matrix in parts of the image."""
 N_COEFFICIENTS = 5
 
 
@@ -61,6 +64,13 @@ def parse_foreign_camera(data: bytes, where: str) -> tuple[CameraModel, float]:
     matrix = _matrix(tree, where)
     width, height = _size(tree, where)
     lens = _lens(tree, where)
+    if 0.0 < matrix[0, 0] < LEAST_FOCAL * width:
+        raise FileFormatError(
+            f"camera_matrix has a focal length of {matrix[0, 0]:g} px for an image {width} px wide",
+            where=where,
+            remedy="write the matrix in pixels: its rows times width and height if it is in parts "
+            "of the image",
+        )
     try:
         camera = CameraModel(
             fx_px=matrix[0, 0],

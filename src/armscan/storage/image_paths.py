@@ -41,6 +41,7 @@ def expand_paths(patterns: Iterable[str | Path]) -> tuple[Path, ...]:
 
     A folder stands for the images in it, a pattern for the files that match; each is sorted in
     natural order, and the order of the arguments is kept. A file that is named twice is taken once.
+    Hidden files (``._photo.jpg``) are left out unless they are named.
     """
     found: dict[Path, None] = {}
     for pattern in patterns:
@@ -101,7 +102,7 @@ def _expand(pattern: str) -> list[Path]:
 def _found(pattern: str) -> list[Path]:
     path = Path(pattern)
     if holds_files(path):
-        images = [item for item in files_in(path) if item.suffix.lower() in IMAGE_SUFFIXES]
+        images = [item for item in files_in(path) if _is_image_name(item.name)]
         if not images and path.suffix.lower() == ".mcap":
             raise FileFormatError(
                 "this is a recording in one file, where images are asked for",
@@ -124,7 +125,11 @@ def _found(pattern: str) -> list[Path]:
     if packed_place(path.parent) is not None:
         files = [one for one in files_in(path.parent) if fnmatchcase(one.name, path.name)]
     else:
-        files = [match for match in root.glob(str(path.relative_to(root))) if match.is_file()]
+        # the name of a folder that is there may hold the signs of a pattern
+        start = path.parent if path.parent.is_dir() else root
+        files = [match for match in start.glob(str(path.relative_to(start))) if match.is_file()]
+    if not path.name.startswith("."):
+        files = [one for one in files if not one.name.startswith(".")]
     if not files:
         raise FileFormatError(
             "no file matches the pattern",
@@ -132,6 +137,11 @@ def _found(pattern: str) -> list[Path]:
             remedy="check the folder and the ending, and put quotes around the pattern",
         )
     return sorted(files, key=lambda item: natural_key(item.as_posix()))
+
+
+def _is_image_name(name: str) -> bool:
+    """Hidden files are none: macOS leaves ``._photo.jpg`` beside ``photo.jpg`` on other disks."""
+    return Path(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith(".")
 
 
 LEVELS = 4

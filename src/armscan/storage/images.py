@@ -224,6 +224,8 @@ TIFF_DATA_TAGS = {273: 279, 324: 325}
 """Tags of the offsets of strips and tiles, with the tags of their byte counts."""
 
 TIFF_SIZE_TAGS = {256: "width", 257: "height", 258: "bits", 277: "channels"}
+TIFF_SUBFILE, TIFF_PHOTOMETRIC, TIFF_ORIENTATION, TIFF_PLANES = 254, 262, 274, 284
+TIFF_KIND_TAGS = (TIFF_SUBFILE, TIFF_PHOTOMETRIC, TIFF_PLANES)
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
 MOST_PICTURE_BYTES = 400_000_000
 """Of a decoded picture: 200 million grey pixels of 16 bits. A small file may claim any size."""
@@ -304,24 +306,54 @@ def _bmp_defect(data: bytes) -> str:
     return "is cut short" if is_plain and pixel_offset + row_bytes * abs(height) > len(data) else ""
 
 
-def _tiff_defect(data: bytes) -> str:
-    order = "<" if data[:2] == b"II" else ">"
-    (directory,) = struct.unpack_from(f"{order}I", data, 4)
-    (n_entries,) = struct.unpack_from(f"{order}H", data, directory)
+@dataclass(frozen=True, slots=True)
+class _Directory:
+    """What a TIFF file says of one picture: values of the tags that count here, the place of its
+    orientation in the file (0 for none), and that of the next directory (0 for none).
+    """
+
+    tags: dict[int, tuple[int, ...]]
+    orientation: int
+    following: int
+
+    def first(self, tag: int, otherwise: int) -> int:
+        """First value of a tag that may be missing."""
+        return (self.tags.get(tag) or (otherwise,))[0]
+
+
+def _tiff_directory(data: bytes, place: int) -> _Directory:
+    order = _tiff_order(data)
+    (n_entries,) = struct.unpack_from(f"{order}H", data, place)
     tags: dict[int, tuple[int, ...]] = {}
-    known = {*TIFF_DATA_TAGS, *TIFF_DATA_TAGS.values(), *TIFF_SIZE_TAGS}
-    for k in range(n_entries):
-        entry = directory + 2 + 12 * k
+    known = {*TIFF_DATA_TAGS, *TIFF_DATA_TAGS.values(), *TIFF_SIZE_TAGS, *TIFF_KIND_TAGS}
+    orientation, end = 0, place + 2 + 12 * n_entries
+    for entry in range(place + 2, end, 12):
         tag, kind, count = struct.unpack_from(f"{order}HHI", data, entry)
         n_bytes = TIFF_TYPE_BYTES.get(kind)
+        if (tag, kind, count) == (TIFF_ORIENTATION, 3, 1):
+            orientation = entry + 8
         if n_bytes is None or tag not in known:
             continue
         if n_bytes * count > 4:
-            (place,) = struct.unpack_from(f"{order}I", data, entry + 8)
+            (start,) = struct.unpack_from(f"{order}I", data, entry + 8)
         else:
-            place = entry + 8
+            start = entry + 8
         code = {1: "B", 2: "H", 4: "I"}[n_bytes]
-        tags[tag] = struct.unpack_from(f"{order}{count}{code}", data, place)
+        tags[tag] = struct.unpack_from(f"{order}{count}{code}", data, start)
+    following = struct.unpack_from(f"{order}I", data, end)[0] if end + 4 <= len(data) else 0
+    return _Directory(tags, orientation, following)
+
+
+def _tiff_order(data: bytes) -> str:
+    return "<" if data[:2] == b"II" else ">"
+
+
+def _first_place(data: bytes) -> int:
+    return int(struct.unpack_from(f"{_tiff_order(data)}I", data, 4)[0])
+
+
+def _tiff_defect(data: bytes) -> str:
+    tags = _tiff_directory(data, _first_place(data)).tags
     size = {name: tags[tag][0] for tag, name in TIFF_SIZE_TAGS.items() if tags.get(tag)}
     if defect := _claim_defect(**{"width": 0, "height": 0, "bits": 1} | size):
         return defect
@@ -330,6 +362,47 @@ def _tiff_defect(data: bytes) -> str:
         if any(offset + count > len(data) for offset, count in pairs):
             return "is cut short"
     return ""
+
+
+def _has_another_image(data: bytes, page: _Directory) -> bool:
+    """Whether a second picture is as large as the first, and not said to be its preview."""
+    if not page.following:
+        return False
+    try:
+        other = _tiff_directory(data, page.following)
+    except struct.error:  # a damaged end, behind a picture that is whole
+        return False
+    is_preview = bool(other.first(TIFF_SUBFILE, 0) & 1)
+    return not is_preview and all(other.first(tag, 0) == page.first(tag, 0) for tag in (256, 257))
+
+
+def _plain_tiff(data: bytes, where: str) -> bytes:
+    """The file without its orientation, by which the decoder would turn the picture.
+
+    Raises
+    ------
+    FileFormatError
+        If it holds several pictures of one size, of which the decoder gives the first, or stores
+        pixels in a way that the decoder misreads.
+    """
+    page = _tiff_directory(data, _first_place(data))
+    if _has_another_image(data, page):
+        raise FileFormatError(
+            "the TIFF file holds several images",
+            where=where,
+            remedy="save each of them in a file of its own",
+        )
+    if page.first(258, 1) > 8:
+        fact = ""
+        if page.first(277, 1) > 1 and page.first(TIFF_PLANES, 1) == 2:
+            fact = "keeps its colours in planes of 16 bits, one after the other"
+        elif page.first(TIFF_PHOTOMETRIC, 1) == 0:
+            fact = "counts from white, in 16 bits"
+        if fact:
+            raise FileFormatError(f"the TIFF file {fact}", where=where, remedy="save it as PNG")
+    at = page.orientation
+    upright = struct.pack(f"{_tiff_order(data)}H", 1)
+    return data[:at] + upright + data[at + 2 :] if at else data
 
 
 HEADER = re.compile(rb"P([2356])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d{1,6})" + rb"\s")
@@ -355,6 +428,8 @@ def decode_netpbm(data: bytes, where: str) -> tuple[ImageArray, int]:
     shape = (height, width, 3) if kind in (3, 6) else (height, width)
     stored, count = np.dtype(">u2" if greatest > 255 else "u1"), math.prod(shape)
     body = data[header.end() :]
+    if data[header.end() - 1 :].startswith(b"\r\n") and len(body) == count * stored.itemsize + 1:
+        body = body[1:]  # a line's end of two bytes, of which the standard knows one
     if kind in (2, 3):
         values = _ascii_values(body, where)
     else:
@@ -398,7 +473,8 @@ def read_exposure(
     """Read an image file of 8 to 16 bits, grey or colour.
 
     An orientation that a camera wrote into the file is ignored: a lens does not turn with the
-    picture. An alpha channel is dropped if it is opaque everywhere, and refused otherwise.
+    picture. An alpha channel is dropped if it is opaque everywhere or 0 everywhere, and refused
+    otherwise. A TIFF file that holds several images of one size is refused.
 
     Parameters
     ----------
@@ -491,6 +567,8 @@ def source_names(paths: Sequence[Path]) -> tuple[str, ...]:
 
 def _decode(data: bytes, path: Path) -> tuple[ImageArray, int]:
     """Decode with OpenCV to (H, W) or (H, W, 3) red, green, blue, with all bits of the type."""
+    if image_format(data) == "TIFF":
+        data = _plain_tiff(data, str(path))
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -507,7 +585,9 @@ def _decode(data: bytes, path: Path) -> tuple[ImageArray, int]:
             f"pixels have type {pixels.dtype}", where=str(path), remedy="save 8 or 16 bits a pixel"
         )
     if pixels.ndim == 3 and pixels.shape[2] == 4:
-        if int(pixels[:, :, 3].min()) < np.iinfo(pixels.dtype).max:
+        alpha = pixels[:, :, 3]
+        # all zero is what writers of four bytes a pixel leave in the one that they do not use
+        if alpha.any() and int(alpha.min()) < np.iinfo(pixels.dtype).max:
             raise FileFormatError(
                 "the image has transparent pixels",
                 where=str(path),

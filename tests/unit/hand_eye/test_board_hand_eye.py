@@ -346,6 +346,38 @@ def test_the_convention_that_is_told_is_the_right_one(
     assert told.remedy.startswith(f"give the rotation convention {meant}")
 
 
+@pytest.mark.parametrize(("turned", "order"), [(-1, "qx,qy,qz,qw"), (1, "qw,qx,qy,qz")])
+def test_the_order_of_quaternions_is_told(turned: int, order: str) -> None:
+    rig = board_rig(11, arm_mm=0.3)
+    looks = []
+    for one in rig.looks:
+        pose = one.base_from_tool
+        numbers = Rotation.from_matrix(pose.rotation).as_quat(scalar_first=True)
+        read = Rotation.from_quat(np.roll(numbers, turned), scalar_first=True)
+        looks.append(replace(one, base_from_tool=Pose(read.as_matrix(), pose.translation_mm)))
+    told = calibrate_on_board(looks, rig.camera)
+    assert isinstance(told, FitFailure)
+    assert f"as {order} would leave 0." in told.reason
+    assert told.remedy.startswith(f"name their columns {order}")
+
+
+def test_radians_of_another_convention_are_told() -> None:
+    rig = board_rig(11, arm_mm=0.3)
+    looks = []
+    for one in rig.looks:
+        pose = one.base_from_tool
+        angles = euler_from_rotations(pose.rotation[None], "extrinsic-xyz")
+        (read,) = rotations_from_euler(np.radians(angles), "intrinsic-xyz")
+        looks.append(replace(one, base_from_tool=Pose(read, pose.translation_mm)))
+    turns = np.array([look.base_from_tool.rotation for look in looks])
+    places = np.array([look.base_from_tool.translation_mm for look in looks])
+    readings = other_readings(turns, places, "intrinsic-xyz")
+    told = calibrate_on_board(looks, rig.camera, readings=readings)
+    assert isinstance(told, FitFailure)
+    assert "reading the angles (extrinsic-xyz) as radians would leave 0." in told.reason
+    assert told.remedy.endswith("give the rotation convention extrinsic-xyz")
+
+
 def test_inverse_poses_are_told_with_what_they_may_be() -> None:
     rig = board_rig(11, arm_mm=0.3)
     looks = [replace(one, base_from_tool=inverse(one.base_from_tool)) for one in rig.looks]

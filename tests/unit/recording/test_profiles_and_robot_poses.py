@@ -158,6 +158,8 @@ def test_the_convention_decides_what_the_angles_mean(tmp_path: Path) -> None:
         ("1 0 0 5\n0 1 0 5\n", "2 lines of four numbers are no matrices"),
         ("1 0 0 5 0 1 0 5 0 0 -1 500\n", "mirrors"),
         ("1 0 0 5 0 1 0 5 0 0 1 500 0 0 0 2\n", "last row of a 4 x 4 matrix"),
+        ("x;y;z;w;p;r\n1,5;2,5;0,5;0,0;90,0;0,0\n", "line 2: the numbers have commas as decimal"),
+        ("1,5 2 0,5 0 90,0 0\n", "line 1: the numbers have commas as decimal signs"),
         ("0 0 90 1300 500 200\n", "an angle of 1300 deg"),
         ("1.3 0 .5 0 0 0\n1.2 0 .5 20 0 0\n1.2 .1 .5 0 20 0\n", "look like metres"),
     ],

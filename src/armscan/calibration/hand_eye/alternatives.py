@@ -17,6 +17,7 @@ from typing import get_args
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
 from armscan.calibration.hand_eye.estimate import (
@@ -558,15 +559,15 @@ def other_readings(
                 )
                 for branch in (angles, _other_branch(angles, read)):
                     yield words, remedy, rotations_from_euler(branch, meant), translations
-    for meant in names:
-        angles = np.degrees(euler_from_rotations(rotations, meant))
-        if np.abs(angles).max() <= 2.0 * np.pi:
-            yield (
-                f"reading the angles ({meant}) as radians",
-                "write angles in degrees; of robot poses a header with a_rad, b_rad, c_rad will do",
-                rotations_from_euler(angles, meant),
-                translations,
-            )
+    yield from _as_radians(rotations, translations, convention)
+    quaternions = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
+    for shift, order, was in ((1, "qx,qy,qz,qw", "qw first"), (-1, "qw,qx,qy,qz", "qw last")):
+        yield (
+            f"taking the quaternions, which were read with {was}, as {order}",
+            f"name their columns {order}, in the order in which they stand",
+            Rotation.from_quat(np.roll(quaternions, shift, axis=1), scalar_first=True).as_matrix(),
+            translations,
+        )
     back = rotations.transpose(0, 2, 1)
     yield (
         "taking the poses as tool_from_base",
@@ -590,6 +591,26 @@ def other_readings(
             np.roll(rotations, shift, axis=0),
             np.roll(translations, shift, axis=0),
         )
+
+
+def _as_radians(
+    rotations: FloatArray, translations: FloatArray, convention: EulerConvention | None
+) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
+    """As `other_readings`: angles that were written in radians and read as degrees."""
+    names: tuple[EulerConvention, ...] = get_args(EulerConvention)
+    for read in names if convention is None else (convention,):
+        angles = np.degrees(euler_from_rotations(rotations, read))
+        if np.abs(angles).max() > 2.0 * np.pi:
+            continue
+        for meant in (read, *(name for name in names if name != read)):
+            told = "" if meant == read else f", and give the rotation convention {meant}"
+            yield (
+                f"reading the angles ({meant}) as radians",
+                "write angles in degrees (of robot poses a header with a_rad, b_rad, c_rad will "
+                f"do){told}",
+                rotations_from_euler(angles, meant),
+                translations,
+            )
 
 
 def _other_branch(angles_rad: FloatArray, convention: EulerConvention) -> FloatArray:

@@ -178,6 +178,9 @@ NUMBER = re.compile(r"^[+-]?\.?\d|^[+-]?(nan|inf)", re.IGNORECASE)
 UNIT = re.compile(r"[_ (\[]+([a-z°]+)", re.IGNORECASE)
 PLACE_UNITS, TURN_UNITS = {"mm", "m"}, {"deg", "rad", "°"}
 UNIT_OF_ANGLE = re.compile(r"[_ (\[](rad|deg)", re.IGNORECASE)
+WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?(e[+-]?\d+)?", re.IGNORECASE)
+N_LEAST = 4
+"""Numbers in a line of a pose: a matrix's row has the fewest."""
 N_ANGLES, N_QUATERNION, N_ROWS, N_MATRIX = 6, 7, 12, 16
 HOW_TO_WRITE = (
     "write x, y, z in mm and three angles in degrees, in this order; or a matrix of 3 x 4 or 4 x 4 "
@@ -353,6 +356,12 @@ def _from_text(data: bytes, where: str) -> tuple[list[str], list[list[float]], l
         words = [word for word in re.split(r"[\s,;\[\]]+", line) if word]
         if not words:
             continue
+        if _has_decimal_commas(line):
+            raise FileFormatError(
+                "the numbers have commas as decimal signs",
+                where=f"{where}, line {number}",
+                remedy="write them with decimal points, as 12.5",
+            )
         if not rows and not header and not any(map(NUMBER.match, words)):
             header = _header(line, words, f"{where}, line {number}")
             continue
@@ -361,6 +370,14 @@ def _from_text(data: bytes, where: str) -> tuple[list[str], list[list[float]], l
     if rows and all(len(row) == 4 for row in rows):
         return header, *_joined(rows, places)
     return header, rows, places
+
+
+def _has_decimal_commas(line: str) -> bool:
+    """True if semicolons or blanks part what then are numbers with at most one comma each."""
+    fields = re.split(r"[\s;]+", line)
+    if len(fields) < N_LEAST or not any("," in field for field in fields):
+        return False
+    return all(WITH_COMMA.fullmatch(field) for field in fields)
 
 
 def _header(line: str, words: list[str], where: str) -> list[str]:

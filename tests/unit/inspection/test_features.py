@@ -148,6 +148,7 @@ def test_what_is_not_there_is_not_found(part: PointCloud, wanted: WantedFeature)
         {"kind": "cylinder", "half_angle_deg": 3.0},
         {"kind": "cylinder", "diameter_mm": -3.0},
         {"kind": "cylinder", "diameter_range_mm": (5.0, 4.0)},
+        {"kind": "cylinder", "diameter_mm": 20.0, "diameter_range_mm": (5.0, 8.0)},
         {"kind": "cone", "half_angle_deg": 90.0},
         {"kind": "cone", "axis": (0.0, 0.0, 0.0)},
         {"kind": "cone", "seed_mm": (0.0, math.nan, 0.0)},
@@ -267,6 +268,16 @@ def two_plates(size_mm: float, height_mm: float = 5.0, n: int = 1500) -> PointCl
 def test_a_seed_is_on_the_feature_though_a_larger_one_is_near(z: float) -> None:
     plate = found(two_plates(50.0), WantedFeature("plane", seed_mm=(0.0, 0.0, z)))
     assert plate.shape.point_mm[2] == pytest.approx(z, abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("seed", "is_told"),
+    [((0.0, 0.0, 0.0), False), ((0.0, 0.0, -4.0), True), ((500.0, 0.0, 0.0), True)],
+)
+def test_a_seed_that_is_on_nothing_is_told(seed: tuple[float, ...], is_told: bool) -> None:
+    cloud = two_plates(50.0)
+    warnings = feature_report(found(cloud, WantedFeature("plane", seed_mm=seed)), cloud).warnings
+    assert any("the seed is not on it" in text for text in warnings) == is_told
 
 
 def test_sigma_of_a_small_angle_goes_with_the_size_of_the_faces() -> None:

@@ -183,9 +183,12 @@ RIM = _Model((0, 1, 2, 3, 4), (RADIUS,), 3, _rim)
 """A circle with the plane that it is fitted in: how errors of points move both."""
 
 
-def parameter_names(kind: ShapeKind) -> tuple[str, ...]:
-    """Free parameters of a kind: motions in its own axes, then sizes."""
-    return (*(MOTIONS[k] for k in MODELS[kind].motions), *MODELS[kind].sizes)
+def parameter_names(kind: ShapeKind, *, with_plane: bool = False) -> tuple[str, ...]:
+    """Free parameters of a kind, of a circle also of its plane: motions in its own axes, then
+    sizes.
+    """
+    model = RIM if with_plane and kind == "circle" else MODELS[kind]
+    return (*(MOTIONS[k] for k in model.motions), *model.sizes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,14 @@ import numpy as np
 from armscan.errors import OptionError
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, bools, ints
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.features import Linearised, Shape, fit_shape, linearise, moved
+from armscan.geometry.features import (
+    Linearised,
+    Shape,
+    fit_shape,
+    linearise,
+    moved,
+    parameter_names,
+)
 from armscan.inspection.results import (
     Deviations,
     MeasuredLength,
@@ -57,8 +64,10 @@ GAP_SPACINGS = 3.0
 """Gap, in spacings of the search's sample, over which a feature hangs together about a seed."""
 LARGEST_SIGMA = 0.2
 """Standard deviation of a diameter, as a part of it, beyond which there is none to speak of."""
-DIFFERENCE = 1e-5
-"""Step, in mm and rad, by which a value is differentiated by a shape's parameters."""
+SHIFT_MM, TURN_RAD = 1e-5, 1e-8
+"""Steps by which a value is differentiated by a shape's parameters. The angle of two features has
+a kink where they are parallel or square: large planes stand 1e-6 rad from it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -390,21 +399,30 @@ class Fitted:
         """Standard deviation of the direction along its worst way; NaN for a sphere."""
         if self.shape.kind == "sphere":
             return math.nan
-        ways = [partial(_along, way=axis) for axis in self.shape.axes[:2]]
-        return max(self.angle(way).sigma_rad for way in ways)
+        return self._worst_sigma(self.shape.axes[:2], _along)
 
     def centre_sigma_mm(self) -> float:
-        """Standard deviation of the point along the worst of the cloud's axes."""
-        ways = [partial(_at, axis=k) for k in range(3)]
-        return max(self.length(way).sigma_mm for way in ways)
+        """Standard deviation of a centre along its worst way."""
+        return self._worst_sigma(np.eye(3), _at)
+
+    def _worst_sigma(
+        self, axes: FloatArray, value: Callable[[FloatArray, tuple[Shape, ...]], float]
+    ) -> float:
+        """The largest along the principal ways, as the points lie, among unit axes (K, 3)."""
+        linear = self.linearised()
+        shapes = (self.shape,)
+        slopes = np.stack([_slopes(shapes, 0, partial(value, axis)) for axis in axes])
+        spread = slopes @ np.linalg.solve(linear.jacobian.T @ linear.jacobian, slopes.T)
+        ways = np.linalg.eigh(spread)[1].T @ axes
+        return max(together((self,), partial(value, way)).sigma_mm for way in ways)
 
 
-def _along(shape: Shape, way: FloatArray) -> float:
-    return float(shape.direction @ way)
+def _along(way: FloatArray, shapes: tuple[Shape, ...]) -> float:
+    return float(shapes[0].direction @ way)
 
 
-def _at(shape: Shape, axis: int) -> float:
-    return float(shape.point_mm[axis])
+def _at(way: FloatArray, shapes: tuple[Shape, ...]) -> float:
+    return float(shapes[0].point_mm @ way)
 
 
 def as_angle(length: MeasuredLength) -> MeasuredAngle:
@@ -428,8 +446,7 @@ def together(
     for k, part in enumerate(parts):
         n, p = part.jacobian.shape
         jacobian[row : row + n, column : column + p] = part.jacobian
-        for j in range(p):
-            slope[column + j] = _slope(shapes, k, np.eye(p)[j] * DIFFERENCE, value)
+        slope[column : column + p] = _slopes(shapes, k, value)
         row, column = row + n, column + p
     linear = FitLinearised(
         jacobian,
@@ -441,16 +458,19 @@ def together(
     return measured_length(value(shapes), linear, fits[0].cloud, rows)
 
 
-def _slope(
-    shapes: tuple[Shape, ...],
-    k: int,
-    step: FloatArray,
-    value: Callable[[tuple[Shape, ...]], float],
-) -> float:
-    ahead, behind = list(shapes), list(shapes)
-    ahead[k] = moved(shapes[k], step, with_plane=True)
-    behind[k] = moved(shapes[k], -step, with_plane=True)
-    return (value(tuple(ahead)) - value(tuple(behind))) / (2.0 * DIFFERENCE)
+def _slopes(
+    shapes: tuple[Shape, ...], k: int, value: Callable[[tuple[Shape, ...]], float]
+) -> FloatArray:
+    """(P,) derivatives of a value by the parameters of one shape, of a circle with its plane."""
+    names = parameter_names(shapes[k].kind, with_plane=True)
+    steps = [TURN_RAD if name.endswith("_rad") else SHIFT_MM for name in names]
+    slopes = np.zeros(len(steps))
+    for j, step in enumerate(np.diag(steps)):
+        ahead, behind = list(shapes), list(shapes)
+        ahead[k] = moved(shapes[k], step, with_plane=True)
+        behind[k] = moved(shapes[k], -step, with_plane=True)
+        slopes[j] = (value(tuple(ahead)) - value(tuple(behind))) / (2.0 * steps[j])
+    return slopes
 
 
 @dataclass(frozen=True, slots=True, eq=False)

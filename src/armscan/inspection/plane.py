@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from armscan.geometry.arrays import Box, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Plane, fit_plane
 from armscan.inspection.results import (
@@ -20,6 +20,7 @@ from armscan.inspection.selection import (
     MIN_POINTS,
     OUTLIER_RULE,
     SEARCH_BAND_MM,
+    SEARCH_SIGMAS,
     InspectionOptions,
     Selection,
     dominant_flat,
@@ -28,6 +29,9 @@ from armscan.inspection.selection import (
 )
 from armscan.inspection.uncertainty import FitLinearised, measured_length
 from armscan.records.cloud import PointCloud
+
+BIN_MM = 0.1
+"""Heights along a normal are counted in bins of this width."""
 
 
 def inspect_plane(
@@ -87,8 +91,7 @@ def inspect_plane(
             f"{np.abs(start.distance_mm(points)).min():.3g} mm away",
             "check the plane, its frame and its unit (mm), or widen --feature-mm",
         )
-    feature = selection.rows[is_near]
-    return _inspected(selection, feature, start, reference, reference_text)
+    return _inspected(selection, is_near, start, reference, reference_text)
 
 
 def _search(points: FloatArray, middle: FloatArray, stripe: IntArray | None) -> Plane | FitFailure:
@@ -96,10 +99,11 @@ def _search(points: FloatArray, middle: FloatArray, stripe: IntArray | None) -> 
     if isinstance(normal, FitFailure):
         return normal
     heights = (points - middle) @ normal
-    # the densest bin: a median would fall between two faces
-    edges = np.arange(heights.min(), heights.max() + 2 * SEARCH_BAND_MM, 0.1)
-    counts = np.histogram(heights, edges)[0]
-    height = float(edges[int(counts.argmax())]) + 0.05
+    # the densest bin: a median would fall between two faces; bins without points would fill the
+    # memory, as strays may lie far away
+    low = float(heights.min())
+    filled, counts = np.unique(np.floor((heights - low) / BIN_MM), return_counts=True)
+    height = low + (float(filled[int(counts.argmax())]) + 0.5) * BIN_MM
     near = points[np.abs(heights - height) <= SEARCH_BAND_MM]
     fit = fit_plane(near)
     return fit if isinstance(fit, FitFailure) else fit.value
@@ -107,25 +111,22 @@ def _search(points: FloatArray, middle: FloatArray, stripe: IntArray | None) -> 
 
 def _inspected(
     selection: Selection,
-    feature: IntArray,
+    is_feature: BoolArray,
     start: Plane,
     reference: Plane | None,
     reference_text: str,
 ) -> PlaneInspection | FitFailure:
     cloud, band = selection.cloud, f"within {selection.feature_mm:g} mm"
+    feature = selection.rows[is_feature]
     points = cloud.points_mm[feature]
     fit = fit_robustly(points, start, fit_plane)
     if isinstance(fit, FitFailure):
         return fit
     plane, is_fitted = fit
-    near = np.abs(plane.distance_mm(points)) <= SEARCH_BAND_MM
-    if reference is None and float(near.mean()) < LEAST_CONCENTRATION:
-        return FitFailure(
-            f"there is no flat face: at the best place for one, only {int(near.sum())} of "
-            f"{len(near)} points {band} of its plane lie within "
-            f"{SEARCH_BAND_MM:g} mm",
-            "show where the face is with --region, or give the plane it should be",
-        )
+    off_mm = np.abs(plane.distance_mm(points))
+    failure = None if reference is not None else _unlike(selection, is_feature, off_mm)
+    if failure is not None:
+        return failure
     towards, side_text = _positive(plane, reference, cloud, feature)
     plane = _facing(plane, towards)
     counts = PointCounts(
@@ -153,7 +154,7 @@ def _inspected(
         sine = np.linalg.norm(np.cross(plane.normal, reference.normal))
         tilt = 1000.0 * math.asin(min(1.0, float(sine)))
         is_on = np.abs(plane.distance_mm(selection.points_mm)) <= SEARCH_BAND_MM
-        n_beyond = int(is_on.sum()) - int(near.sum())
+        n_beyond = int(is_on.sum()) - int((off_mm <= SEARCH_BAND_MM).sum())
     return PlaneInspection(
         plane=plane,
         reference=reference,
@@ -167,6 +168,31 @@ def _inspected(
         side_text=side_text,
         n_beyond=n_beyond,
     )
+
+
+def _unlike(selection: Selection, is_feature: BoolArray, off_mm: FloatArray) -> FitFailure | None:
+    """Why points (F,) this far off their plane make no face, though they lie about it; else None.
+
+    Near is what the points' own sigma may throw off it, as of a ball.
+    """
+    bands_mm = selection.search_band_mm[is_feature]
+    band_mm, n_near = float(np.median(bands_mm)), int((off_mm <= bands_mm).sum())
+    # as far above the part of evenly spread points as without a wider band
+    least = LEAST_CONCENTRATION + (band_mm - SEARCH_BAND_MM) / selection.feature_mm
+    if n_near >= least * len(off_mm):
+        return None
+    facts = (
+        f"at the best place for one, only {n_near} of {len(off_mm)} points within "
+        f"{selection.feature_mm:g} mm of its plane lie within {band_mm:.3g} mm"
+    )
+    remedy = "show where the face is with --region, or give the plane it should be"
+    widest = 2.0 * SEARCH_SIGMAS * float(np.median(selection.sigma_mm[is_feature]))
+    if widest > selection.feature_mm:
+        # half of it is the widest band
+        remedy = (
+            f"give --feature-mm {widest:.2g}, as the points' stated sigma asks for; or {remedy}"
+        )
+    return FitFailure(f"there is no flat face: {facts}", remedy)
 
 
 def _positive(

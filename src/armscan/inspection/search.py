@@ -131,6 +131,9 @@ class WantedFeature:
              f"a diameter of {self.diameter_mm} mm", "give it in mm, above 0"),
             (not 0.0 < low < high < 1e4, f"diameters from {low:g} to {high:g} mm",
              "give the least and the largest diameter"),
+            (self.diameter_range_mm is not None and not low <= (self.diameter_mm or low) <= high,
+             f"a diameter of {self.diameter_mm} mm is not within the range of {low:g} to {high:g}",
+             "give a range that holds it, or one of them"),
             (self.half_angle_deg is not None and not 0.0 < self.half_angle_deg < 85.0,
              f"a half angle of {self.half_angle_deg} degrees", "give 0 to 85"),
             (self.axis is not None and not (_are_three(self.axis) and any(self.axis)),
@@ -312,13 +315,30 @@ def find_shape(sample: Sample, wanted: WantedFeature) -> Shape | FitFailure:
         for k, shape in enumerate(_candidates(sample, wanted, _pool(sample, wanted)))
         if wanted.may_be(shape)
     ]
-    scored = sorted((item for item in scored if item[0] > 0.0), reverse=True)[:N_POLISHED]
+    scored = sorted((item for item in scored if item[0] > 0.0), reverse=True)
+    scored = _through_seed(sample, wanted, scored)[:N_POLISHED]
     if not scored:
         return FitFailure(
             f"there is no {wanted}: no candidate fits what is known of it",
             "check the nominal values, or show where it is with --region or --seed",
         )
     return max((_polished(sample, wanted, item[2]) for item in scored), key=lambda one: one[0])[1]
+
+
+def _through_seed(
+    sample: Sample, wanted: WantedFeature, scored: list[tuple[float, int, Shape]]
+) -> list[tuple[float, int, Shape]]:
+    """Candidates on which the point nearest to the seed may lie; all of them where none is.
+
+    The seed is as far off the feature as it was read off, never nearer to another one.
+    """
+    if wanted.seed_mm is None:
+        return scored
+    seed = np.asarray(wanted.seed_mm)[None, :]
+    is_thin = wanted.kind in ("line", "circle")
+    band = float(sample.band_mm.max()) if is_thin else sample.noise_mm
+    far = float(np.linalg.norm(sample.points_mm - seed, axis=1).min()) + band
+    return [one for one in scored if abs(float(one[2].distance_mm(seed)[0])) <= far] or scored
 
 
 def _polished(sample: Sample, wanted: WantedFeature, shape: Shape) -> tuple[float, Shape]:

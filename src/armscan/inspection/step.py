@@ -36,6 +36,7 @@ from armscan.records.cloud import PointCloud
 BIN_MM = 0.1
 MAX_PEAKS = 60
 MAX_EXTENT_MM = 1e5
+"""Heights about their median among which faces are looked for."""
 LEAST_INSIDE = 0.5
 HEIGHT_TOLERANCE = 0.05
 """Faces are searched up to this part of the nominal height from it."""
@@ -88,9 +89,9 @@ def find_levels(
 
 def _levels(heights: FloatArray) -> tuple[FloatArray, IntArray]:
     """Local maxima of the heights' density, best filled first, and the points about each."""
+    # a stray far away would make too many bins
+    heights = heights[np.abs(heights - np.median(heights)) <= MAX_EXTENT_MM / 2.0]
     low = float(heights.min())
-    if np.ptp(heights) > MAX_EXTENT_MM:
-        return np.zeros(0), np.zeros(0, dtype=np.int64)
     bins = np.bincount(((heights - low) / BIN_MM).astype(np.int64))
     width = max(1, round(SEARCH_BAND_MM / BIN_MM))
     filled = np.convolve(bins, np.ones(2 * width + 1), "same").astype(np.int64)

@@ -13,10 +13,12 @@ import pytest
 from armscan.errors import OptionError
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.features import Shape, fit_shape
+from armscan.geometry.features import Shape, ShapeKind, fit_shape
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.inspection.features import (
     FeatureInspection,
     Fitted,
+    _angle,
     _skew,
     inspect_feature,
     relate,
@@ -28,7 +30,7 @@ from armscan.inspection.selection import InspectionOptions
 from armscan.records.cloud import PointCloud
 from armscan.report.inspection.features import feature_report, relation_report
 from rigs.feature_clouds import BALL_MM, BORE_MM, BOSS_MM, CONE_DEG, workpiece
-from rigs.inspection_clouds import cloud_of
+from rigs.inspection_clouds import cloud_of, random_motion
 
 OPTIONS = InspectionOptions(feature_mm=0.5)
 BORE = WantedFeature("cylinder", diameter_mm=BORE_MM)
@@ -146,6 +148,7 @@ def test_what_is_not_there_is_not_found(part: PointCloud, wanted: WantedFeature)
         {"kind": "cylinder", "half_angle_deg": 3.0},
         {"kind": "cylinder", "diameter_mm": -3.0},
         {"kind": "cylinder", "diameter_range_mm": (5.0, 4.0)},
+        {"kind": "cylinder", "diameter_mm": 20.0, "diameter_range_mm": (5.0, 8.0)},
         {"kind": "cone", "half_angle_deg": 90.0},
         {"kind": "cone", "axis": (0.0, 0.0, 0.0)},
         {"kind": "cone", "seed_mm": (0.0, math.nan, 0.0)},
@@ -248,3 +251,72 @@ def test_axes_that_pass_each_other() -> None:
     turned = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     second = Shape(kind="line", point_mm=np.array([7.0, 3.0, 50.0]), axes=turned)
     assert _skew((first, second)) == pytest.approx(3.0)
+
+
+def two_plates(size_mm: float, height_mm: float = 5.0, n: int = 1500) -> PointCloud:
+    """Two parallel plates, the lower one of twice as many points; noise 0.005 mm across them."""
+    rng = np.random.default_rng(11)
+    flat = np.zeros((3 * n, 3))
+    flat[:, :2] = rng.uniform(-0.5, 0.5, (3 * n, 2)) * size_mm
+    flat[:, 2] = np.repeat([0.0, height_mm], [2 * n, n]) + rng.normal(0.0, 0.005, 3 * n)
+    up = np.tile([0.0, 0.0, 1.0], (3 * n, 1))
+    exposure = np.tile(np.arange(30), n // 10)
+    return cloud_of(flat, exposure, sigma_mm=1e-9, noise_mm=0.005, noise_along=up)
+
+
+@pytest.mark.parametrize("z", [0.0, 5.0])
+def test_a_seed_is_on_the_feature_though_a_larger_one_is_near(z: float) -> None:
+    plate = found(two_plates(50.0), WantedFeature("plane", seed_mm=(0.0, 0.0, z)))
+    assert plate.shape.point_mm[2] == pytest.approx(z, abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("seed", "is_told"),
+    [((0.0, 0.0, 0.0), False), ((0.0, 0.0, -4.0), True), ((500.0, 0.0, 0.0), True)],
+)
+def test_a_seed_that_is_on_nothing_is_told(seed: tuple[float, ...], is_told: bool) -> None:
+    cloud = two_plates(50.0)
+    warnings = feature_report(found(cloud, WantedFeature("plane", seed_mm=seed)), cloud).warnings
+    assert any("the seed is not on it" in text for text in warnings) == is_told
+
+
+def test_sigma_of_a_small_angle_goes_with_the_size_of_the_faces() -> None:
+    """Faces a hundred times as large tell their angle a hundred times as well."""
+    sigmas = []
+    for size_mm in (10.0, 1000.0):
+        cloud = two_plates(size_mm)
+        fits = []
+        for rows in (np.arange(3000), np.arange(3000, 4500)):
+            fit = fit_shape("plane", cloud.points_mm[rows])
+            assert not isinstance(fit, FitFailure)
+            fits.append(Fitted(fit.value, cloud, rows))
+        sigmas.append(together(tuple(fits), _angle).sigma_mm * size_mm)
+    assert sigmas[1] == pytest.approx(sigmas[0], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("sphere", "centre_sigma_mm"), ("cylinder", "direction_sigma_rad")]
+)
+def test_the_worst_sigma_is_that_of_any_frame(kind: ShapeKind, name: str) -> None:
+    """Of a cap's centre and of the axis of an arc of a cylinder, turned in space and about it."""
+    a = np.tile(np.linspace(-0.4, 0.4, 20), 30)
+    b = np.repeat(np.linspace(-0.4, 0.4, 30), 20)
+    outward = np.stack([np.cos(a), np.sin(a), 0.0 * a], axis=1)
+    exact = 10.0 * outward + b[:, None] * np.array([0.0, 0.0, 10.0])
+    if kind == "sphere":
+        outward = np.cos(b)[:, None] * outward + np.sin(b)[:, None] * np.array([0.0, 0.0, 1.0])
+        exact = 10.0 * outward
+    sigmas = []
+    for seed in range(4):
+        turn, shift = random_motion(seed)
+        about = rotation_from_vector(np.array([0.0, 0.0, 0.8 * seed]))
+        shape = Shape(kind=kind, point_mm=shift, axes=about @ turn.T, radius_mm=10.0)
+        cloud = cloud_of(
+            exact @ turn.T + shift,
+            np.arange(600) // 20,
+            sigma_mm=1e-9,
+            noise_mm=NOISE_MM,
+            noise_along=outward @ turn.T,
+        )
+        sigmas.append(getattr(Fitted(shape, cloud, np.arange(600)), name)())
+    assert max(sigmas) == pytest.approx(min(sigmas), rel=0.01)

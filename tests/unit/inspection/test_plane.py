@@ -218,6 +218,25 @@ def test_a_curved_surface_is_no_flat_face_but_may_be_compared_with_a_plane() -> 
     assert found.nominal is not None
 
 
+def test_a_face_that_scatters_as_its_sigma_says_is_one() -> None:
+    """A ball of such points is found, too; without a sigma they may be of anything."""
+    rng = np.random.default_rng(4)
+    points = np.column_stack([rng.uniform(0.0, 200.0, (2000, 2)), rng.normal(0.0, 0.6, 2000)])
+    wide = InspectionOptions(feature_mm=3.0)
+    cloud = cloud_of(points, np.arange(2000) // 50, sigma_mm=0.6)
+    found = inspected(inspect_plane(cloud, options=wide))
+    assert found.fitted.value("std_mm") == pytest.approx(0.6, abs=0.03)
+    failure = inspect_plane(cloud)
+    assert isinstance(failure, FitFailure)
+    assert "give --feature-mm 2.4" in failure.remedy
+    assert isinstance(inspect_plane(cloud_of(points, sigma_mm=0.0), options=wide), FitFailure)
+
+
+def test_a_stray_kilometres_away_costs_no_memory() -> None:
+    points = np.concatenate([GRID, [[1.0, 2.0, 1e12]]])
+    assert inspected(inspect_plane(cloud_of(points))).counts.n_feature == len(GRID)
+
+
 def test_input_without_a_plane_is_refused_in_words() -> None:
     with pytest.raises(InputError, match="the cloud holds 0 points; an inspection needs 30"):
         inspect_plane(cloud_of(np.zeros((0, 3))))

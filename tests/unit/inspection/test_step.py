@@ -189,6 +189,13 @@ def test_points_of_another_program_have_no_stripes_and_work_all_the_same() -> No
     assert found.height.value_mm == pytest.approx(HEIGHT_MM, abs=1e-9)
 
 
+def test_a_stray_far_away_hides_no_face() -> None:
+    points, exposure = block_stripes(HEIGHT_MM)
+    points[0, 2] = 1e6
+    found = inspected(inspect_step(cloud_of(points, exposure), HEIGHT_MM))
+    assert found.height.value_mm == pytest.approx(HEIGHT_MM, abs=1e-9)
+
+
 def test_input_without_the_step_is_refused_in_words() -> None:
     points, exposure = block_stripes(HEIGHT_MM)
     wrong = inspect_step(cloud_of(points, exposure), 10.0)

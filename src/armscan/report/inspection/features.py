@@ -37,6 +37,8 @@ ROUND = ("sphere", "cylinder", "cone")
 OTHER_SHAPE = 8.0
 """Rms distance from a fitted shape, in scatters of neighbours, beyond which it is doubted: bores
 and bosses have 1, a cylinder in a cone of 25 degrees or in two flat faces 15 and more."""
+SEED_OFF_MM = 1.0
+"""Distance from a feature within which its seed is on it."""
 ANGLE_NOTE = "near 0 and 90 degrees it is the size of a tilt, which noise never makes negative"
 
 
@@ -45,7 +47,7 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
     kind = found.shape.kind
     main = found.nominal or found.fitted
     told = feature_quantities(found)
-    warnings = [*point_warnings(found.counts, cloud), *_shape_warnings(found)]
+    warnings = [*point_warnings(found.counts, cloud), *_shape_warnings(found, cloud)]
     if kind in ("circle", "cylinder", "cone") and found.seen_deg < NARROW_ARC_DEG:
         warnings.append(
             f"the points cover only {found.seen_deg:.0f} degrees of the turn, where radius and "
@@ -76,18 +78,39 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
     )
 
 
-def _shape_warnings(found: FeatureInspection, whose: str = "") -> tuple[str, ...]:
-    """Warn of points that lie much farther off the shape than they lie off their neighbours."""
+def _shape_warnings(
+    found: FeatureInspection, cloud: PointCloud, whose: str = ""
+) -> tuple[str, ...]:
+    """Warn of points that lie much farther off the shape than they lie off their neighbours, and of
+    a seed that is on no feature.
+    """
+    seed = _seed_warnings(found, cloud, whose)
     deviations = found.fitted.deviations_mm[found.is_fitted]
     rms = math.sqrt(float(np.mean(deviations**2)))
     kind = found.shape.kind
     # written so that a scatter that is not known warns of nothing
     if kind not in ROUND or not rms > OTHER_SHAPE * found.scatter_mm:
-        return ()
+        return seed
     return (
+        *seed,
         f"{whose}the points may be of no {kind}: they lie {significant(rms, 'mm', 2)} (rms) off "
         f"it, {rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, "
         "and show where it is by a region or a seed",
+    )
+
+
+def _seed_warnings(found: FeatureInspection, cloud: PointCloud, whose: str) -> tuple[str, ...]:
+    """Of a seed off the surface, or farther from its points than these lie from each other."""
+    if found.wanted.seed_mm is None:
+        return ()
+    seed, points = np.asarray(found.wanted.seed_mm), cloud.points_mm[found.rows]
+    off = abs(float(found.shape.distance_mm(seed[None, :])[0]))
+    far = float(np.linalg.norm(points - seed, axis=1).min())
+    if off <= SEED_OFF_MM and far <= float(np.linalg.norm(np.ptp(points, axis=0))):
+        return ()
+    return (
+        f"{whose}the seed is not on it: the nearest of its points is {significant(far, 'mm', 2)} "
+        "away; another feature may be meant",
     )
 
 
@@ -261,8 +284,8 @@ def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
     warnings = (
         *point_warnings(found.first.counts, cloud, "first feature"),
         *point_warnings(found.second.counts, cloud, "second feature"),
-        *_shape_warnings(found.first, "first feature: "),
-        *_shape_warnings(found.second, "second feature: "),
+        *_shape_warnings(found.first, cloud, "first feature: "),
+        *_shape_warnings(found.second, cloud, "second feature: "),
     )
     deviations = np.concatenate([one.fitted.deviations_mm for one in both])
     return InspectionReport(

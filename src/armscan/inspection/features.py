@@ -157,7 +157,7 @@ def inspect_feature(
     InputError
         If there are too few points.
     """
-    selection = select(cloud, wanted.region, options)
+    selection = select(cloud, wanted.region, options, size_mm=wanted.radii_mm[1])
     sample = sample_of(selection)
     start = find_shape(sample, wanted)
     if isinstance(start, FitFailure):

@@ -29,6 +29,8 @@ SEARCH_SIGMAS = 2.0
 """The same in the points' stated sigmas, where these are larger: 19 of 20 points lie within."""
 MIN_POINTS = 30
 """Fewest points that make a feature."""
+LEAST_OF_SIZE = 0.1
+"""Of a feature's nominal size, over which its points spread; written in metres they have 0.001."""
 AT_REST_MM, SAMPLED = 0.1, 10_000
 """More than an arm at rest trembles, and less than a light sheet is thick; points of which the
 distance from the head is taken."""
@@ -173,8 +175,12 @@ def select(
     region: Box | None,
     options: InspectionOptions | None,
     min_points: int = MIN_POINTS,
+    *,
+    size_mm: float = math.inf,
 ) -> Selection:
     """Take the points of a cloud inside a region; default options if None.
+
+    ``size_mm`` is a feature's nominal size, beside which a small cloud is not taken for metres.
 
     Raises
     ------
@@ -186,7 +192,8 @@ def select(
         raise InputError(
             f"all {len(cloud)} points lie in one place", remedy="give a cloud that was measured"
         )
-    if len(cloud) >= min_points and extent < SMALLEST_EXTENT_MM:
+    smallest_mm = min(SMALLEST_EXTENT_MM, LEAST_OF_SIZE * size_mm)
+    if len(cloud) >= min_points and extent < smallest_mm:
         raise InputError(
             f"all {len(cloud)} points lie within {extent:.3g} mm: these look like metres",
             remedy="multiply the coordinates by 1000",

@@ -61,7 +61,7 @@ def inspect_sphere(
     """
     if not 0.0 < diameter_mm < 1e4:
         raise InputError(f"a ball of {diameter_mm:g} mm diameter", remedy="give the diameter in mm")
-    selection = select(cloud, region, options)
+    selection = select(cloud, region, options, size_mm=diameter_mm)
     points = selection.points_mm
     found = find_ball(points, diameter_mm / 2.0, selection.search_band_mm)
     if isinstance(found, FitFailure):

@@ -300,7 +300,7 @@ def inspect_step(
     """
     if not 0.0 < height_mm < 1e4:
         raise InputError(f"a step {height_mm} mm high", remedy="give the height in mm")
-    selection = select(cloud, region, options, 2 * MIN_POINTS)
+    selection = select(cloud, region, options, 2 * MIN_POINTS, size_mm=height_mm)
     section = _section(selection)
     if isinstance(section, FitFailure):
         return section

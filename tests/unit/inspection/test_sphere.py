@@ -145,6 +145,15 @@ def test_points_that_scatter_too_much_are_not_called_another_diameter() -> None:
         assert ("scatter too much" in nothing.reason) == (sigma_mm > 0.1)
 
 
+def test_a_ball_of_a_millimetre_is_not_taken_for_one_in_metres() -> None:
+    small = ball(1.0, 0.002)
+    found = inspect_sphere(cloud_of(small, sigma_mm=0.002), 1.0)
+    assert not isinstance(found, FitFailure)
+    assert found.diameter.value_mm == pytest.approx(1.0, abs=0.001)
+    with pytest.raises(InputError, match="look like metres"):
+        inspect_sphere(cloud_of(small / 1000.0), 1.0)
+
+
 def test_input_without_the_ball_is_refused_in_words() -> None:
     points = ball(DIAMETER_MM, 0.005)
     wrong = inspect_sphere(cloud_of(points), 25.4)

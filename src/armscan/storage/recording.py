@@ -71,6 +71,8 @@ UNIT_FACTORS = (1_000, 1_000_000, 1_000_000_000)
 """Nanoseconds in a microsecond, a millisecond, a second."""
 CROWD = 3
 """So many arrangements between two samples of the arm are warned of."""
+FEWEST_STEPS, FASTEST_NS = 4, 20_000
+"""Of so many steps and more, in the median, neither a camera nor an arm is as fast."""
 
 
 def check_clock(
@@ -106,6 +108,7 @@ def check_clock(
             where=where,
             remedy="write both times in nanoseconds of one clock, or record trigger ids",
         )
+    warnings += _haste_warning(times, arm.t_ns, where)
     warnings += _crowd_warning(rows, arm.t_ns, where)
     return ([] if "time.clock" in said.stated else ["cameras and arm share one clock"]), warnings
 
@@ -150,6 +153,18 @@ def _wrong_unit(times: Times, arm_ns: Times) -> tuple[str, int] | None:
         if 1.0 / SPAN_RATIO < ratio < SPAN_RATIO and _is_within(scaled, reference).mean() > 0.5:
             return (EXPOSURES_FILE if is_shorter else ARM_FILE), factor
     return None
+
+
+def _haste_warning(times: IntArray, arm_ns: IntArray, where: str) -> list[str]:
+    """A sentence where both tables are faster than any camera and any arm."""
+    steps_ns = [np.diff(np.unique(span)) for span in (times, arm_ns)]
+    if any(len(one) < FEWEST_STEPS or np.median(one) > FASTEST_NS for one in steps_ns):
+        return []
+    exposures_ns, samples_ns = (float(np.median(one)) for one in steps_ns)
+    return [
+        f"{where}: exposures follow each other by {exposures_ns:g} ns and the arm's samples by "
+        f"{samples_ns:g} ns: are both times in nanoseconds?"
+    ]
 
 
 def _crowd_warning(rows: Sequence[ExposureRow], arm_ns: IntArray, where: str) -> list[str]:

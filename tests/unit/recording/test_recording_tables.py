@@ -289,3 +289,16 @@ def test_without_an_arm_no_clock_is_needed(tmp_path: Path) -> None:
         lab_folder(tmp_path, arm=None, session=SESSION.replace("shared", "separate"))
     )
     assert scan.arm is None
+
+
+@pytest.mark.parametrize(("unit_ns", "is_asked"), [(S, True), (MS, True), (1, False)])
+def test_both_tables_in_another_unit_are_asked_about(
+    tmp_path: Path, unit_ns: int, is_asked: bool
+) -> None:
+    """Ten samples of the arm in each of six seconds, one exposure a second."""
+    period = 100 * MS // unit_ns or 1
+    lines = [f"{k},{10 * k * period},0,images/{k % 3}.png,A," for k in range(6)]
+    listed = exposures(*lines, header=HEADER + ",view")
+    folder = lab_folder(tmp_path, exposures=listed, arm=track_text(period, 60 * period))
+    asked = [one for one in read_recording(folder).warnings if "both times in nanoseconds" in one]
+    assert len(asked) == int(is_asked)

@@ -37,7 +37,6 @@ from armscan.calibration.cameras.result import reasons_to_refuse as camera_reaso
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit
 from armscan.calibration.sheets.result import reasons_to_refuse as sheet_reasons
@@ -357,7 +356,7 @@ def hand_eye_case(seed: int) -> Case:
         if not isinstance(fit, HandEyeFit):
             return Said(f"{fit.reason}; {fit.remedy}")
         stated = fit.calibration
-        error = hand_eye_difference(stated.tool_from_sensor, TOOL_FROM_SENSOR)
+        error = stated.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
         is_wrong = is_beyond(quadratic(error, stated.covariance), 6)
         return Said("", fit.warnings, is_wrong)
 

@@ -55,7 +55,6 @@ from armscan.calibration.hand_eye.surface import (
     HandEyeState,
     PlateSurface,
     SphereSurface,
-    hand_eye_difference,
 )
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose, Sensor, Tool
@@ -243,7 +242,7 @@ class Stated:
 
     def outcome(self, drawn: Drawn, bound: FloatArray | None, truth: Pose[Tool, Sensor]) -> Outcome:
         """The error over what is stated, and what is stated over the bound if there is one."""
-        error, ratio = hand_eye_difference(self.pose, truth), np.nan
+        error, ratio = self.pose.step_from(truth), np.nan
         if bound is not None:
             over = np.linalg.slogdet(self.covariance)[1] - np.linalg.slogdet(bound)[1]
             ratio = float(np.exp(over / 12.0))
@@ -258,7 +257,7 @@ def placed_squares(stated: Stated, rig: PlateRig, rng: np.random.Generator) -> t
     """
     hand_eye, noise = rig.tool_from_sensor, rig.noise
     scan_point = hand_eye.apply(SCAN_POINT_MM)
-    error = hand_eye_difference(stated.pose, hand_eye)
+    error = stated.pose.step_from(hand_eye)
     shift = noise.posture_mm**2 + noise.exposure_mm**2
     true = ArmNoise(np.sqrt(shift), float(np.hypot(noise.posture_rad, noise.exposure_rad)))
     found = []

@@ -25,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
@@ -207,7 +206,7 @@ def judged(row: Row, fit: HandEyeFit | FitFailure, sigma: FloatArray) -> tuple[s
     if isinstance(fit, FitFailure):
         text = f"{fit.reason} {fit.remedy}"
         return ("named" if any(word in text for word in row.words) else "refused"), float("nan")
-    error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+    error = fit.calibration.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
     effect = float(np.abs(error / sigma).max())
     text = " ".join(fit.warnings)
     if any(word in text for word in row.words):
@@ -232,7 +231,7 @@ def clean_sets(count: int, seed: int) -> None:
                 print("   refused:", fit.reason[:140])
                 continue
             warned.update({warning[:60] for warning in fit.warnings})
-            error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+            error = fit.calibration.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
             inside += float(error @ np.linalg.solve(fit.calibration.covariance, error)) < 12.59
         print(f"arm of {arm_mm:g} mm: {count} clean sets, {refused} refused, "
               f"{inside} within the stated 95 %; warnings {dict(warned)}", flush=True)  # fmt: skip

@@ -39,7 +39,7 @@ from armscan.calibration.hand_eye.observations import (
     straight_stripes,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.surface import PlateSurface, hand_eye_difference
+from armscan.calibration.hand_eye.surface import PlateSurface
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose, Sensor, Tool
 from rigs.plate_bound import cramer_rao, plain_least_squares, scored_densely
@@ -71,7 +71,7 @@ def study(
             errors.append(np.full(6, np.inf))
             continue
         pose, covariance, region_factor = found
-        error = hand_eye_difference(pose, TOOL_FROM_SENSOR)
+        error = pose.step_from(TOOL_FROM_SENSOR)
         errors.append(error)
         inside += is_inside(error, covariance * region_factor)
     return np.array(errors), inside

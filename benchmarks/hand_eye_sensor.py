@@ -24,7 +24,6 @@ import numpy as np
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import HandEyeCalibration, ScannerCalibration, SensorCalibration
 from rigs.calibrated_head import CalibratedHead
@@ -44,7 +43,7 @@ def figures(
     spread = ScannerCalibration(sensor=sensor, hand_eye=hand_eye, provenance=PROVENANCE).covariance[
         -6:, -6:
     ]
-    off = hand_eye_difference(hand_eye.tool_from_sensor, TOOL_FROM_SENSOR)
+    off = hand_eye.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
     return [
         float(((error @ PLATE_NORMAL) ** 2).mean()),
         float(stated.mean()),

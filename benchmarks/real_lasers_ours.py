@@ -24,8 +24,6 @@ from armscan.cli.run import main
 from armscan.geometry.estimate import FitFailure
 from armscan.storage.documents import sensor_document
 
-ON_BOARD = {"USED", "OFF_SHEET", "UNNAMED", "OUTLYING_BOARD"}
-
 
 class Kept:
     """What passed between the parts of the command."""

@@ -34,12 +34,8 @@ NEAR_PX = 3.0
 NO_POINTS = np.zeros((0, 2))
 
 
-def lines(n: int, width: int, height: int) -> Exposure:
-    """Nearly horizontal lines."""
-    return horizontal(n, width, height).expose(0)
-
-
 def horizontal(n: int, width: int, height: int) -> StripeScene:
+    """Nearly horizontal lines."""
     gap = height / (n + 1.0)
     waves = tuple(
         SimulatedStripe(WaveCurve(0.0, gap * (k + 1), 0.3, 10.0, 700.0), sigma_px=SIGMA_PX)

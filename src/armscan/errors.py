@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 MOST_CHARACTERS = 1000
 """Of a sentence about a file that quotes it: files may hold words of any length."""
@@ -16,6 +17,17 @@ def shown(text: str, most: int = MOST_CHARACTERS) -> str:
     plain = NOT_SHOWN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
     half = most // 2 - 3
     return plain if len(plain) <= most else f"{plain[:half]} ... {plain[-half:]}"
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """The first names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+def begun(names: Sequence[str], most: int) -> str:
+    """The first names, and an ellipsis where there are more."""
+    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
 
 
 class ArmscanError(Exception):

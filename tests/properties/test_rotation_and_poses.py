@@ -129,3 +129,12 @@ def test_poses_and_points_cannot_be_changed() -> None:
     points: Points[Base] = Points(source)
     source[0, 0] = 7.0
     assert points.xyz_mm[0, 0] == 0.0
+
+
+@given(small_vectors, lengths, vectors, lengths)
+def test_a_step_leads_from_one_pose_to_the_other(
+    turn: np.ndarray, shift: np.ndarray, vector: np.ndarray, place: np.ndarray
+) -> None:
+    pose: Pose[Base, Tool] = Pose.from_vectors(vector, place)
+    step = np.concatenate([turn, shift])
+    assert np.abs(pose.retract(step).step_from(pose) - step).max() < LENGTH_ROUNDING_MM

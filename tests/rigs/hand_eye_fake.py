@@ -59,7 +59,6 @@ def fake_fit(method: str = "plate") -> tuple[HandEyeFit, tuple[PosedStripe, ...]
         start=TOOL_FROM_SENSOR,
         stripes=tuple(residuals),
         postures=tuple(postures),
-        singular_values=np.geomspace(30.0, 1.0, 6),
         reference=(("Plate", "plane of 40 probed points, 0.008 mm rms"),),
         warnings=("posture 3 is the only one tilted towards the far side",),
     )

@@ -362,7 +362,6 @@ def probed(made: Instrument, waves: Waves, rng: np.random.Generator) -> PlateRef
         covariance=fitted.covariance,
         rms_mm=float(np.sqrt((fitted.residuals**2).mean())),
         n_points=len(places),
-        source="rig",
     )
 
 

@@ -254,7 +254,6 @@ class PlateRig:
             covariance=fitted.covariance,
             rms_mm=rms,
             n_points=len(points),
-            source="rig",
         )
 
     @property

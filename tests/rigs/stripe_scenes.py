@@ -15,7 +15,6 @@ from rigs.stripe_image import SimulatedStripe, StraightCurve, StripeScene
 
 FALSE_PX = 1.0
 """A third of the line's sigma: no noise of these scenes reaches it."""
-MARGIN_PX = 14.0
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from armscan.storage.images import read_exposure
 from armscan.vision.targets.target import Chessboard
 from rigs.photographs import DATA, needs
 
-ROOT = Path(__file__).resolve().parents[2]
 CICLOP = DATA / "ciclop"
 pytestmark = needs("ciclop")
 BOARD = Chessboard(11, 6, 13.0)

@@ -4,7 +4,6 @@
 import json
 import re
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +28,6 @@ from armscan.storage.recordings.robot_poses import read_robot_poses
 from armscan.thesis.hand_eye import SAME_ROTATION_DEG, TwoStepHandEye, calibrate_in_two_steps
 from rigs.photographs import DATA, needs
 
-ROOT = Path(__file__).resolve().parents[2]
 SPHERE, BOARD = DATA / "sphere_profiles", DATA / "plate_profiles"
 pytestmark = needs("sphere_profiles", "plate_profiles")
 DIAMETER_MM = 80.0

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stripes on real photographs of a desktop scanner (folder ``ciclop`` of the test data)."""
 
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -14,7 +13,6 @@ from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.stripe.extract import extract_stripes
 from rigs.photographs import DATA, needs
 
-ROOT = Path(__file__).resolve().parents[2]
 CICLOP = DATA / "ciclop"
 pytestmark = needs("ciclop")
 # (y, x) knots of the two laser lines on the board, read off the photographs by eye, +-2 px

@@ -15,7 +15,6 @@ from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, CircleGrid, TargetView
 from rigs.photographs import DATA, needs
 
-ROOT = Path(__file__).parents[2]
 pytestmark = needs("ciclop")
 BOARD = Chessboard(11, 6, 13.0)
 

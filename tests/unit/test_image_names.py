@@ -30,11 +30,11 @@ def test_numbers_count_and_other_digits_are_letters() -> None:
     ],
 )
 def test_a_name_its_end_or_a_pattern_chooses(pattern: str, found: tuple[str, ...]) -> None:
-    assert named_by([pattern], NAMES, "--leave-out") == found
+    assert named_by([pattern], NAMES) == found
 
 
 @pytest.mark.parametrize("pattern", ["1.png", "c*", "A1.png", "on"])
 def test_what_names_nothing_is_refused(pattern: str) -> None:
     with pytest.raises(OptionError, match=r"on/a1\.png") as error:
-        named_by(["a1.png", pattern], NAMES, "--leave-out")
+        named_by(["a1.png", pattern], NAMES)
     assert pattern in error.value.what

@@ -14,7 +14,6 @@ from armscan.calibration.hand_eye.probed_plate import (
     find_outliers,
     fit_probed_plate,
     plate_from_coefficients,
-    plate_from_probing,
 )
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
@@ -60,6 +59,15 @@ def test_the_surface_is_half_a_diameter_below_the_centres() -> None:
         assert plate.tip_diameter_mm == TIP_MM
         np.testing.assert_allclose(plate.plane.axes @ plate.plane.axes.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(plate.plane.axes) > 0.0
+
+
+def plate_from_probing(
+    probed: ProbedPoints,
+    towards_mm: FloatArray | None = None,
+    options: ProbingOptions | None = None,
+) -> PlateReference | FitFailure:
+    fit = fit_probed_plate(probed, towards_mm, options)
+    return fit.reference if isinstance(fit, ProbedPlate) else fit
 
 
 def plate_of(probed: ProbedPoints, towards_mm: FloatArray) -> PlateReference:

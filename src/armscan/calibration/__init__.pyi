@@ -12,7 +12,6 @@ from .hand_eye.calibrate import calibrate_on_sphere as calibrate_on_sphere
 from .hand_eye.observations import HandEyeOptions as HandEyeOptions
 from .hand_eye.observations import PlateReference as PlateReference
 from .hand_eye.observations import PosedStripe as PosedStripe
-from .hand_eye.probed_plate import plate_from_probing as plate_from_probing
 from .hand_eye.result import HandEyeFit as HandEyeFit
 from .sheets.calibrate import calibrate_sheets as calibrate_sheets
 from .sheets.result import BoardStripes as BoardStripes

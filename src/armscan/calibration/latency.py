@@ -160,8 +160,6 @@ class LatencyFit:
     before_t_ns, before_mm
         (L,) heights over the same plate with the latency at 0, or at the coarse search's for
         separate clocks, of those that then have a pose.
-    normal_base
-        (3,) of the plate, in Base.
     n_left_out
         Exposures that do not fit the plate, or had no pose.
     """
@@ -173,7 +171,6 @@ class LatencyFit:
     t_ns: IntArray
     before_t_ns: IntArray
     before_mm: FloatArray
-    normal_base: FloatArray
     motion: StandOffMotion
     noise: tuple[ResidualNoise, ...]
     n_left_out: int
@@ -605,7 +602,6 @@ def _result(problem: _Problem, fine: _Solution, before_ns: int) -> LatencyFit | 
         t_ns=problem.t_ns[system.rows],
         before_t_ns=problem.t_ns[earlier.rows],
         before_mm=earlier.residuals[0],
-        normal_base=fine.state.normal,
         motion=motion,
         noise=fine.noise,
         n_left_out=len(problem.t_ns) - len(system.rows),

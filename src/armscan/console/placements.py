@@ -193,9 +193,9 @@ def drawing(placement: Placement) -> str:
     )
 
 
-def _polygon(points: FloatArray, fill: str, stroke: str = INK, width: float = 1.2) -> str:
+def _polygon(points: FloatArray, fill: str, stroke: str = INK) -> str:
     text = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    return f'<polygon points="{text}" fill="{fill}" stroke="{stroke}" stroke-width="{width}"/>'
+    return f'<polygon points="{text}" fill="{fill}" stroke="{stroke}" stroke-width="1.2"/>'
 
 
 def _line(points: FloatArray, stroke: str, width: float) -> str:

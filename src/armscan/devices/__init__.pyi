@@ -18,9 +18,7 @@ from .protocols import DeviceInfo as DeviceInfo
 from .protocols import Frame as Frame
 from .protocols import LaserController as LaserController
 from .protocols import LaserEvent as LaserEvent
-from .protocols import SimulatedRig as SimulatedRig
 from .registry import DriverReport as DriverReport
-from .registry import find_devices as find_devices
 from .registry import open_device as open_device
 from .registry import survey_drivers as survey_drivers
 from .sources import ScanSource as ScanSource

@@ -205,7 +205,19 @@ class FaultyLine(Generic[T]):
             self._held = None
 
     def inject(self, fault: Fault, amount: float) -> None:
-        """See `armscan.devices.protocols.SimulatedRig.inject`."""
+        """Make the device fail.
+
+        Parameters
+        ----------
+        fault
+            ``unplug``: it answers with `DeviceError` for so many seconds; ``stall``: for so many
+            seconds nothing arrives, all of it comes afterwards; ``drop``: so many elements never
+            arrive; ``corrupt``: as many frames arrive with a part lost, `Frame.is_complete` False;
+            ``clock-jump``: its clock jumps by so many seconds; ``duplicate``: so many elements
+            arrive twice; ``reorder``: so many arrive after the one that follows them.
+        amount
+            Seconds or count, as the fault says.
+        """
         now_ns = time.monotonic_ns()
         if fault == "unplug":
             self._unplugged_ns = now_ns + round(1e9 * amount)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from enum import IntFlag
 from typing import Literal, Protocol
 
-from armscan.devices.sources import TwinScene
 from armscan.geometry.arrays import FloatArray, ImageArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.records.exposure import SensorWindow
@@ -254,43 +253,6 @@ class LaserController(Protocol):
 
 
 Fault = Literal["unplug", "stall", "drop", "corrupt", "clock-jump", "duplicate", "reorder"]
-
-
-class SimulatedRig(Protocol):
-    """What stands behind the devices of one simulated instrument: their attribute ``rig``."""
-
-    @property
-    def scene(self) -> TwinScene:
-        """What is before the head."""
-
-    def show(self, scene: TwinScene) -> None:
-        """Put another thing before the head; the count of triggers goes on.
-
-        Raises
-        ------
-        OptionError
-            If there is no such scene.
-        """
-
-    def press(self, button: int, seconds: float = 0.2) -> None:
-        """Hold a button of the arm, counted from 0."""
-
-    def inject(self, device: str, fault: Fault, amount: float = 1.0) -> None:
-        """Make a device fail.
-
-        Parameters
-        ----------
-        device
-            ``camera0``, ``camera1``, ``arm`` or ``lasers``.
-        fault
-            ``unplug``: it answers with `DeviceError` for so many seconds; ``stall``: for so many
-            seconds nothing arrives, all of it comes afterwards; ``drop``: so many elements never
-            arrive; ``corrupt``: as many frames arrive with a part lost, `Frame.is_complete` False;
-            ``clock-jump``: its clock jumps by so many seconds; ``duplicate``: so many elements
-            arrive twice; ``reorder``: so many arrive after the one that follows them.
-        amount
-            Seconds or count, as the fault says.
-        """
 
 
 class DeviceDriver(Protocol):

@@ -86,15 +86,6 @@ def device_drivers() -> tuple[str, ...]:
     return tuple(sorted(entry_points(group=DEVICE_GROUP).names))
 
 
-def find_devices(kind: DeviceKind | None = None) -> tuple[DeviceInfo, ...]:
-    """Devices of a kind, or of all, that say themselves that they are there.
-
-    A driver that fails finds nothing; `survey_drivers` says why.
-    """
-    every = (device for report in survey_drivers() for device in report.found)
-    return tuple(device for device in every if kind is None or device.kind == kind)
-
-
 def survey_drivers() -> tuple[DriverReport, ...]:
     """Ask all installed drivers, sorted by name, what they find."""
     return tuple(_survey(_entry_point(name, name)) for name in device_drivers())

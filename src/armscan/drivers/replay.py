@@ -150,7 +150,7 @@ class Playback:
             self.lock.notify_all()
 
     def inject(self, device: str, fault: Fault, amount: float = 1.0) -> None:
-        """See `armscan.devices.protocols.SimulatedRig.inject`."""
+        """Make a device fail: see `FaultyLine.inject`; raises `OptionError` for other devices."""
         if device not in self.lines or not amount > 0.0:
             raise OptionError(f"no device '{device}', or no fault by {amount}")
         self.lines[device].inject(fault, amount)

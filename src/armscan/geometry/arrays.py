@@ -30,7 +30,6 @@ def frozen_floats(
     name: str,
     *,
     allow_nan: bool = False,
-    allow_infinite: bool = False,
 ) -> FloatArray:
     """Return a read-only float64 array of ``values`` after checking shape and finiteness.
 
@@ -46,15 +45,13 @@ def frozen_floats(
         The name that an error message shows, with frame and unit.
     allow_nan
         Accept NaN (a gap).
-    allow_infinite
-        Accept infinity (no limit).
 
     Raises
     ------
     InputError
         If the shape differs or a value is not finite.
     """
-    array: FloatArray = _Column(shape, _FLOAT, allow_nan, allow_infinite).owned(values, name, {})
+    array: FloatArray = _Column(shape, _FLOAT, allow_nan).owned(values, name, {})
     return array
 
 

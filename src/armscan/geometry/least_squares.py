@@ -137,11 +137,6 @@ class Whitening:
         """Whitened residuals (N,), or the rows of a Jacobian (N, K)."""
         return np.asarray(solve_triangular(self._root, values, lower=True))
 
-    @property
-    def log_determinant(self) -> float:
-        """Logarithm of the covariance's determinant."""
-        return 2.0 * float(np.log(np.diag(self._root)).sum())
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DenseSystem:

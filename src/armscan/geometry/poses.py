@@ -138,6 +138,11 @@ class Pose(ArrayRecord, Generic[A, B], kw_only=False):
         """The pose after a step (6,): a rotation vector in A from the left, then a translation."""
         return Pose(rotation_from_vector(step[:3]) @ self.rotation, self.translation_mm + step[3:])
 
+    def step_from(self, other: Pose[A, B]) -> FloatArray:
+        """(6,) step of `retract` that leads from another pose to this one."""
+        turn = vector_from_rotation(self.rotation @ other.rotation.T)
+        return np.concatenate([turn, self.translation_mm - other.translation_mm])
+
     def jacobian(self, points_mm: FloatArray) -> FloatArray:
         """(N, 3, 6) derivative of ``apply(points_mm)`` by a step of `retract`; points (N, 3)."""
         turned = self.rotate(points_mm)

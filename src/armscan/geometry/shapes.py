@@ -64,6 +64,18 @@ class Plane(ArrayRecord, kw_only=False):
         """(N,) signed distance of (N, 3) points along the normal."""
         return np.asarray((points_mm - self.point_mm) @ self.axes[2])
 
+    def tilted(self, step: FloatArray) -> Plane:
+        """Add ``step[0] x + step[1] y + step[2]`` (x, y, mm of its axes) to its height.
+
+        True to first order; the triad is turned so that it stays orthonormal.
+        """
+        normal = self.axes[2] - step[0] * self.axes[0] - step[1] * self.axes[1]
+        normal = normal / np.linalg.norm(normal)
+        first = self.axes[0] - (self.axes[0] @ normal) * normal
+        first = first / np.linalg.norm(first)
+        point = self.point_mm + step[2] * self.axes[2]
+        return Plane(point, np.stack([first, np.cross(normal, first), normal]))
+
 
 def fit_line(points: FloatArray, weights: FloatArray | None = None) -> Line | FitFailure:
     """Fit a line to (N, D) points: least sum of squared distances.

@@ -434,17 +434,13 @@ def face_values(face: FaceComparison) -> tuple[PartQuantity, ...]:
 
 @dataclass(frozen=True, slots=True)
 class PartRow:
-    """One part in the table of all; without ``quantities`` and with a ``reason`` if not inspected.
-
-    ``n_points`` are those of the cloud after cleaning.
-    """
+    """One part in the table of all; not inspected: a ``reason`` in place of ``quantities``."""
 
     name: str
     cloud: str
     quantities: tuple[PartQuantity, ...] = ()
     notes: tuple[str, ...] = ()
     reason: str = ""
-    n_points: int = 0
     is_simulated: bool = False
     forced: tuple[str, ...] = ()
 

@@ -50,11 +50,6 @@ class ParallelFaces:
     lower_mm: float
     upper_mm: float
 
-    @property
-    def height_mm(self) -> float:
-        """Distance between the faces."""
-        return self.upper_mm - self.lower_mm
-
 
 def find_levels(
     points: FloatArray,

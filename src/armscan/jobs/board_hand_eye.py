@@ -19,7 +19,7 @@ from armscan.calibration.hand_eye.on_board import (
     calibrate_on_board,
 )
 from armscan.calibration.sheets.board_points import BoardBow, HeadCameras, find_board_bow
-from armscan.errors import InputError, OptionError
+from armscan.errors import InputError, OptionError, listed
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import EulerConvention
@@ -203,7 +203,7 @@ def _photographs(source: LookSource, image_options: ImageOptions) -> _Views:
             remedy="give one pose a photograph, in the photographs' order",
         )
     names = source_names(paths)
-    gone = set(named_by(source.leave_out, names, "--leave-out"))
+    gone = set(named_by(source.leave_out, names))
     kept = [k for k, name in enumerate(names) if name not in gone]
     exposures = read_exposures([paths[k] for k in kept], image_options)
     return _Views(
@@ -226,7 +226,7 @@ def _scan_views(source: LookSource) -> _Views:
     recording = read_recording(folder, arm)
     poses = exposure_poses(recording.rows, recording.arm, recording.session.clock)
     names = [row.source for row in recording.rows]
-    gone = set(named_by(source.leave_out, names, "--leave-out"))
+    gone = set(named_by(source.leave_out, names))
     left = [k for k, row in enumerate(recording.rows) if row.camera == 0 and names[k] not in gone]
     dark = [k for k in left if not recording.rows[k].lasers]
     posed = [k for k in dark or left if poses.has_pose[k]]
@@ -307,10 +307,9 @@ def _not_used_warnings(not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:
     """Name the views that give no pose of the target, with the reasons of the first."""
     if not not_used:
         return ()
-    named = ", ".join(f"{source} ({without_source(source, why)})" for source, why in not_used[:4])
-    more = f" and {len(not_used) - 4} more" if len(not_used) > 4 else ""
+    named = listed([f"{source} ({without_source(source, why)})" for source, why in not_used], 4)
     verb = "was" if len(not_used) == 1 else "were"
-    return (f"{plural(len(not_used), 'view')} {verb} not used: {named}{more}",)
+    return (f"{plural(len(not_used), 'view')} {verb} not used: {named}",)
 
 
 def _explained(failure: FitFailure, found: FoundTargets) -> FitFailure:

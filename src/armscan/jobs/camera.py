@@ -88,7 +88,7 @@ def calibrate_camera(
     read = _camera_images(images, scan, image_options)
     check_same_size(read.exposures)
     sources = [exposure.source for exposure in read.exposures]
-    options = replace(options, leave_out=named_by(options.leave_out, sources, "--leave-out"))
+    options = replace(options, leave_out=named_by(options.leave_out, sources))
     plate = settle_target(read.exposures, plate)
     found = find_targets(read.exposures, plate, cache=job.cache, progress=job.progress)
     run = calibrate_camera_from_found(found, plate, options, progress=job.progress)
@@ -158,7 +158,7 @@ def calibrate_camera_from_file(
         **{**recorded_options(before.provenance, CameraOptions), **(changes or {})}
     )
     sources = [view.source for view in found.views]
-    options = replace(options, leave_out=named_by(options.leave_out, sources, "--leave-out"))
+    options = replace(options, leave_out=named_by(options.leave_out, sources))
     kinds: tuple[type[Target], ...] = (Chessboard, Charuco, CircleGrid, AprilGrid)
     recorded = {kind: recorded_options(before.provenance, kind) for kind in kinds}
     targets = [kind(**values) for kind, values in recorded.items() if values]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import ArmscanError, FileFormatError
+from armscan.errors import ArmscanError, FileFormatError, listed
 from armscan.geometry.arrays import IntArray
 from armscan.geometry.least_squares import p_text
 from armscan.models.calibration import (
@@ -138,10 +138,9 @@ def describe_recording(folder: Path) -> dict[str, Any]:
 def _damage(images: tuple[str, ...], path: Path) -> tuple[str, ...]:
     if not images:
         return ()
-    rest = f" and {len(images) - LISTED} more" if len(images) > LISTED else ""
     return (
         f"the file is damaged: {plural(len(images), 'image')} cannot be read "
-        f"({', '.join(images[:LISTED])}{rest}): armscan recover {path} -o FOLDER",
+        f"({listed(images, LISTED)}): armscan recover {path} -o FOLDER",
     )
 
 

@@ -11,7 +11,7 @@ from typing import get_args
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.errors import EstimationError, InputError, OptionError
+from armscan.errors import EstimationError, InputError, OptionError, listed
 from armscan.geometry.arrays import FloatArray
 from armscan.jobs.job import Job
 from armscan.markers.candidates import RingMatchOptions
@@ -280,8 +280,7 @@ def _without_line(profiles: Sequence[Profile], *, has_colours: bool) -> tuple[st
     empty = [profile.source for profile in profiles if not profile.is_accepted.any()]
     if not empty:
         return ()
-    more = f" and {len(empty) - NAMED} more" if len(empty) > NAMED else ""
-    said = f"no line was found in {', '.join(empty[:NAMED])}{more}"
+    said = f"no line was found in {listed(empty, NAMED)}"
     if not has_colours:
         return (said,)
     return (

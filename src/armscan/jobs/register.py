@@ -36,6 +36,12 @@ from armscan.pipeline.register import (
 )
 from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.records.points import MarkerSet
+from armscan.report.markers import (
+    MarkerScene,
+    RegisterReport,
+    drift_chart,
+    registration_page,
+)
 from armscan.report.page import render_page
 from armscan.report.quantity import (
     Quantity,
@@ -46,12 +52,6 @@ from armscan.report.quantity import (
     sentences,
     significant,
     with_sigma,
-)
-from armscan.report.register import (
-    MarkerScene,
-    RegisterReport,
-    drift_chart,
-    registration_page,
 )
 from armscan.storage.clouds import FOREIGN_FRAME, ply_bytes, read_cloud
 from armscan.storage.documents import (

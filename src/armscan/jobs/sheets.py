@@ -222,7 +222,7 @@ def _read(images: SheetImages, image_options: ImageOptions, *, is_stereo: bool) 
     off = expand_paths(images.off) if images.off else ()
     exposures = read_exposures((*on, *off), image_options)
     lit, dark = exposures[: len(on)], exposures[len(on) :]
-    named = named_by(images.leave_out, [one.source for one in exposures], "--leave-out")
+    named = named_by(images.leave_out, [one.source for one in exposures])
     gone = _with_partners(lit, dark, set(named))
     pairs = pair_exposures(
         [one for one in lit if one.source not in gone],
@@ -258,7 +258,7 @@ def _read_scan(folder: Path, leave_out: Sequence[str], *, is_stereo: bool) -> _I
     exposures = tuple(recording.exposure(k) for k in rows)
     views = {one.view: None for one in exposures if one.view is not None}
     names = [*(one.source for one in exposures), *views]
-    named = set(named_by(leave_out, names, "--leave-out"))
+    named = set(named_by(leave_out, names))
     # without its image without laser a view is no pair any more
     named |= {one.view for one in exposures if one.view and not one.lasers and one.source in named}
     gone = {one.source for one in exposures if one.view in named or one.source in named}

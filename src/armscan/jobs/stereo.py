@@ -84,7 +84,7 @@ def calibrate_stereo(
     if given is not None and options.intrinsics == "prior":
         _check_not_the_same(given, hashes)
     by_source = {one.source: one for pair in read.pairs for one in pair if one is not None}
-    left_out = named_by(options.leave_out, list(by_source), "--leave-out")
+    left_out = named_by(options.leave_out, list(by_source))
     options = replace(options, leave_out=left_out)
     exposures = list(by_source.values())
     plate = settle_target(exposures, plate)

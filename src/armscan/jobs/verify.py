@@ -240,7 +240,7 @@ def _plate(
     if standard.plate is not None:
         return read_plate(standard.plate, middle_mm, towards_mm=towards_mm, side=standard.side)
     plane = plane_from_coefficients(parse_plane(standard.plane, "--plane"), middle_mm)
-    return PlateReference(plane=plane, source="--plane"), ()
+    return PlateReference(plane=plane), ()
 
 
 def _tool_places(measured: Measured) -> FloatArray | None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats, homogeneous
+from armscan.geometry.shapes import Plane
 
 BOW_TERMS: tuple[tuple[int, int], ...] = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1))
 """Powers (i, j) of the bow's terms ``u^i v^j``, u along the stripe and v along the depth; the terms
@@ -212,21 +213,13 @@ class LightSheet(ArrayRecord):
         """Apply a step (8,) in (tilt_u, tilt_v, offset_mm, bow).
 
         To first order the step adds ``t_u u + t_v v + offset + bow_step`` to the surface's height
-        over its plane; the triad is rotated so that it stays orthonormal.
+        over its plane: `Plane.tilted`.
         """
-        normal = (
-            self.axes[2]
-            - step[0] / self.scale_mm * self.axes[0]
-            - step[1] / self.scale_mm * self.axes[1]
-        )
-        normal = normal / np.linalg.norm(normal)
-        e_u = self.axes[0] - (self.axes[0] @ normal) * normal
-        e_u = e_u / np.linalg.norm(e_u)
-        axes = np.stack([e_u, np.cross(normal, e_u), normal])
-        origin = self.origin_mm + step[2] * self.axes[2]
+        slopes = step[0] / self.scale_mm, step[1] / self.scale_mm
+        plane = Plane(self.origin_mm, self.axes).tilted(np.array([*slopes, step[2]]))
         return LightSheet(
-            origin_mm=origin,
-            axes=axes,
+            origin_mm=plane.point_mm,
+            axes=plane.axes,
             scale_mm=self.scale_mm,
             bow_mm=self.bow_mm + step[3:],
             fan=self.fan,

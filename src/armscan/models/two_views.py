@@ -353,8 +353,3 @@ class StereoCalibration(ArrayRecord):
     n_points: int
     provenance: Provenance
     diagnostics: StereoDiagnostics | None = None
-
-    @property
-    def views(self) -> TwoViews:
-        """The two cameras as a model, without what is uncertain in them."""
-        return TwoViews(self.left.camera, self.right.camera, self.right_from_left)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # What `from armscan.pipeline import ...` offers; loaded when it is first asked for.
 from .cameras import calibrate_camera_from_exposures as calibrate_camera_from_exposures
-from .cameras import calibrate_stereo_from_exposures as calibrate_stereo_from_exposures
+from .cameras import calibrate_stereo_from_found as calibrate_stereo_from_found
 from .cameras import camera_calibration as camera_calibration
 from .cameras import pair_lists as pair_lists
 from .cameras import stereo_calibration as stereo_calibration
@@ -24,5 +24,6 @@ from .scan import ScanOptions as ScanOptions
 from .scan import ScanReconstruction as ScanReconstruction
 from .scan import measure_scan as measure_scan
 from .scan import place_profiles as place_profiles
+from .targets import find_targets as find_targets
 from .verify import verify_on_ball as verify_on_ball
 from .verify import verify_on_plate as verify_on_plate

@@ -24,11 +24,10 @@ from armscan.calibration.cameras.result import (
 )
 from armscan.calibration.cameras.robust import agreeing_numberings, missed_places_mm
 from armscan.calibration.cameras.stereo_result import SideFit, StereoFit
-from armscan.errors import InputError
+from armscan.errors import InputError, begun
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose
-from armscan.geometry.rotations import vector_from_rotation
 from armscan.models.calibration import (
     CameraCalibration,
     CameraDiagnostics,
@@ -308,13 +307,10 @@ class StereoRun:
         The result.
     not_found
         (source, reason) of exposures without a usable target.
-    centre_rounds
-        How often circle centres were measured again with the cameras; 0 for other targets.
     """
 
     fit: StereoFit
     not_found: tuple[tuple[str, str], ...]
-    centre_rounds: int
 
 
 def pair_lists(left: Sequence[Exposure], right: Sequence[Exposure]) -> list[ExposedPair]:
@@ -374,26 +370,29 @@ def stereo_rows(rows: Sequence[ExposureRow], where: str) -> list[tuple[int | Non
     return pairs
 
 
-def calibrate_stereo_from_exposures(
+def calibrate_stereo_from_found(
     exposures: Sequence[ExposedPair],
+    found: FoundTargets,
     target: Target,
     options: StereoOptions | None = None,
     given: Given | None = None,
     *,
     progress: Progress = silent,
 ) -> StereoRun | FitFailure:
-    """Find the target in each exposure and calibrate.
+    """Calibrate from exposures in which the target was looked for.
 
     Parameters
     ----------
     exposures
         Left and right exposure of each instant; None where one camera has none.
+    found
+        What `find_targets` saw in them.
     target
-        What to look for.
+        What was looked for.
     options, given
         As `calibrate_stereo`.
     progress
-        Is told of each exposure and of each solution.
+        Is told of each solution.
 
     Returns
     -------
@@ -405,21 +404,6 @@ def calibrate_stereo_from_exposures(
     InputError, OptionError
         As `calibrate_stereo`.
     """
-    every = [exposure for pair in exposures for exposure in pair if exposure is not None]
-    found = find_targets(every, target, progress=progress)
-    return calibrate_stereo_from_found(exposures, found, target, options, given, progress=progress)
-
-
-def calibrate_stereo_from_found(
-    exposures: Sequence[ExposedPair],
-    found: FoundTargets,
-    target: Target,
-    options: StereoOptions | None = None,
-    given: Given | None = None,
-    *,
-    progress: Progress = silent,
-) -> StereoRun | FitFailure:
-    """As `calibrate_stereo_from_exposures`, with the targets looked for already."""
     if found.wrong_count is not None:
         return found.wrong_count
     pairs = _found_pairs(exposures, {view.source: view for view in found.views})
@@ -444,7 +428,7 @@ def calibrate_stereo_from_pairs(
 ) -> StereoRun | FitFailure:
     """Calibrate; for circles, correct the centres with the cameras and calibrate again.
 
-    Parameters, errors and result as `calibrate_stereo_from_exposures`, with the target found.
+    Parameters, errors and result as `calibrate_stereo_from_found`, of views of the target.
     """
     has_circles = any(
         view is not None and view.edges is not None for pair in pairs for view in pair.views
@@ -467,7 +451,7 @@ def calibrate_stereo_from_pairs(
         progress(ProgressEvent("solve", total if is_stable else rounds + 1, total))
     alike = _pairs_numbered_alike(pairs, fit, target)
     again = fit if alike is None else calibrate_stereo(alike, target, options, given)
-    return StereoRun(fit if isinstance(again, FitFailure) else again, (), rounds)
+    return StereoRun(fit if isinstance(again, FitFailure) else again, ())
 
 
 def _pairs_numbered_alike(
@@ -595,13 +579,11 @@ def _stereo_corrected(view: TargetView | None, camera: CameraModel) -> TargetVie
 def _stereo_moved_sigmas(before: StereoFit, after: StereoFit) -> float:
     """Largest change of a parameter over its standard deviation."""
     old, new = before.views, after.views
-    turn = new.right_from_left.rotation @ old.right_from_left.rotation.T
     moved = np.concatenate(
         [
             new.left.parameters - old.left.parameters,
             new.right.parameters - old.right.parameters,
-            vector_from_rotation(turn),
-            new.right_from_left.translation_mm - old.right_from_left.translation_mm,
+            new.right_from_left.step_from(old.right_from_left),
         ]
     )
     is_free = after.sigma > 0.0
@@ -611,8 +593,7 @@ def _stereo_moved_sigmas(before: StereoFit, after: StereoFit) -> float:
 
 
 def _listed(exposures: Sequence[Exposure]) -> str:
-    names = [exposure.source for exposure in exposures[:LISTED]]
-    return ", ".join(names) + (", ..." if len(exposures) > LISTED else "")
+    return begun([exposure.source for exposure in exposures], LISTED)
 
 
 def camera_calibration(fit: CameraFit, provenance: Provenance) -> CameraCalibration:

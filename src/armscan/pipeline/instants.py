@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import grey_opening
 
 from armscan.devices.sources import ScanSource
-from armscan.errors import ArmscanError, InputError
+from armscan.errors import ArmscanError, InputError, begun
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.camera import CameraModel
@@ -285,8 +285,7 @@ def _structure(exposure: Exposure) -> FloatArray:
 
 
 def _listed(sources: Sequence[str]) -> str:
-    names = [PurePath(source).name for source in sources[:LISTED]]
-    return ", ".join(names) + (", ..." if len(sources) > LISTED else "")
+    return begun([PurePath(source).name for source in sources], LISTED)
 
 
 SAME_TIME_NS = 1_000_000

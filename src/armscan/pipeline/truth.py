@@ -17,7 +17,6 @@ from armscan.devices.sources import SimulatedScan, TrueStripe, TwinScene, TwinTr
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
-from armscan.geometry.rotations import vector_from_rotation
 from armscan.inspection.results import PlaneInspection, SphereInspection, StepInspection
 from armscan.inspection.uncertainty import COARSE_BLOCKS, exposure_blocks
 from armscan.models.calibration import (
@@ -302,14 +301,13 @@ def true_names(
 def hand_eye_errors(scanner: ScannerCalibration, truth: Pose[Tool, Sensor]) -> HandEyeErrors:
     """Errors of the hand-eye of a scanner, in the form of its own parameters."""
     found = scanner.hand_eye.tool_from_sensor
-    turn = vector_from_rotation(found.rotation @ truth.rotation.T)
-    shift = found.translation_mm - truth.translation_mm
+    step = found.step_from(truth)
     covariance = np.asarray(scanner.covariance[-6:, -6:])
     is_free = np.asarray(np.diag(covariance) > 0.0)
     return HandEyeErrors(
-        rotation_deg=float(np.degrees(np.linalg.norm(turn))),
-        translation_mm=float(np.linalg.norm(shift)),
-        normalised=normalised_length(np.concatenate([turn, shift]), covariance, is_free),
+        rotation_deg=float(np.degrees(np.linalg.norm(step[:3]))),
+        translation_mm=float(np.linalg.norm(step[3:])),
+        normalised=normalised_length(step, covariance, is_free),
     )
 
 

@@ -117,17 +117,14 @@ class RightStripes:
 
     Parameters
     ----------
-    profile
-        Stripe points of the right camera.
     row
-        (R,) the accepted ones.
+        (R,) its accepted points.
     table
         (R, 5) their pixels, normals and sigmas.
     low_px, high_px
         Corners of the rectangle in which they are; infinite and reversed where there is none.
     """
 
-    profile: Profile
     row: IntArray
     table: FloatArray
     low_px: tuple[float, float]
@@ -142,7 +139,7 @@ class RightStripes:
         x, y = table[:, 0], table[:, 1]
         low = float(x.min(initial=np.inf)), float(y.min(initial=np.inf))
         high = float(x.max(initial=-np.inf)), float(y.max(initial=-np.inf))
-        return RightStripes(profile, row, table, low, high)
+        return RightStripes(row, table, low, high)
 
     def spacing_px(self) -> float:
         """Mean distance between stripes: the picture's area over the stripes' length."""
@@ -174,8 +171,6 @@ class Crossings:
         (F,) signed distance of the projected point across that stripe, along its normal.
     sigma_px
         (F,) standard deviation of the residual from the noise of both stripes alone.
-    normal
-        (F, 2) across the right stripe.
     by_point
         (F, 3) derivative of the residual by the point in Sensor, px/mm.
     by_errors
@@ -189,7 +184,6 @@ class Crossings:
     sheet: IntArray
     residual_px: FloatArray
     sigma_px: FloatArray
-    normal: FloatArray
     by_point: FloatArray
     by_errors: FloatArray
 
@@ -253,7 +247,6 @@ def find_crossings(
         sheet=projected.sheet[at],
         residual_px=np.ascontiguousarray(across[:, 0]),
         sigma_px=np.ascontiguousarray(across[:, 1]),
-        normal=across[:, 2:],
         by_point=by_point[:count],
         by_errors=by_errors[:count],
     )

@@ -445,10 +445,9 @@ ROUNDS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Assignment:
-    """Sheet (N,), log-odds (N,), status (N,) of points; undecided ones expected of each sheet."""
+    """Sheet (N,), status (N,) of points; undecided ones expected of each sheet."""
 
     sheet: IntArray
-    odds: FloatArray
     status: IntArray
     undecided: FloatArray
 
@@ -540,10 +539,10 @@ class CrossLabeller:
         n = len(profile)
         pieces = cut_pieces(profile)
         status = np.full(n, int(PointStatus.FLAGGED))
-        sheet, odds = np.full(n, -1), np.full(n, -np.inf)
+        sheet = np.full(n, -1)
         undecided = np.zeros(len(self._source_of))
         if not len(pieces):
-            return _Assignment(sheet, odds, status, undecided)
+            return _Assignment(sheet, status, undecided)
         samples = profile.points_px[pieces.sample]
         hypotheses = hypothesise(samples, possible, self._sensor, self._depths)
         posterior = self._posterior(samples, pieces, hypotheses, pose)
@@ -555,12 +554,12 @@ class CrossLabeller:
         of_piece[~is_explained] = PointStatus.STRAY
         accepted = pieces.of_point >= 0
         piece = pieces.of_point[accepted]
-        status[accepted], odds[accepted] = of_piece[piece], margin[piece]
+        status[accepted] = of_piece[piece]
         assigned = np.where(of_piece == PointStatus.MEASURED, np.array(possible)[best], -1)
         sheet[accepted] = assigned[piece]
         in_doubt = np.where(of_piece == PointStatus.AMBIGUOUS, pieces.size, 0)
         undecided[list(possible)] = in_doubt @ np.exp(posterior)
-        return _Assignment(sheet, odds, status, undecided)
+        return _Assignment(sheet, status, undecided)
 
     def _posterior(
         self,

@@ -103,14 +103,11 @@ class TrackCheck:
         (N,) samples whose pose cannot be right.
     is_broken_step
         (N,) True where the tool cannot have gone from this sample to the next as the track says.
-    resolution_mm
-        Smallest difference that the track's numbers can express: 0 where there is no such step.
     """
 
     faults: tuple[TrackFault, ...]
     is_faulty: BoolArray
     is_broken_step: BoolArray
-    resolution_mm: float
 
     @property
     def jumps(self) -> tuple[TrackFault, ...]:
@@ -143,7 +140,7 @@ def check_track(arm: ArmTrack) -> TrackCheck:
     steps = _judged_steps(places, arm.t_ns[known], resolution)
     events = _events(steps, len(known))
     if not len(events):
-        return TrackCheck((), none, none.copy(), resolution)
+        return TrackCheck((), none, none.copy())
     equal = np.abs(np.diff(places, axis=0)).max(axis=1) < SAME_MM
     found = [
         TrackFault(
@@ -161,7 +158,7 @@ def check_track(arm: ArmTrack) -> TrackCheck:
             broken[fault.first] = True
         else:
             faulty[fault.first : fault.last + 1] = True
-    return TrackCheck(tuple(sorted(found, key=lambda f: f.first)), faulty, broken, resolution)
+    return TrackCheck(tuple(sorted(found, key=lambda f: f.first)), faulty, broken)
 
 
 def _without_repeats(arm: ArmTrack) -> IntArray:

@@ -365,7 +365,7 @@ def _view_bars(fit: CameraFit, held_out: Mapping[str, float]) -> Picture:
             )  # fmt: skip
             axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderpad=0.1)
         axes.axvline(fit.rms_px, color=MUTED, linewidth=0.8, linestyle="--")
-        named_rows(axes, [view.source for view in views], "rms reprojection residual, px")
+        named_rows(axes, [view.source for view in views])
     grey = " Grey bars are views that were left out." if len(fit.used_views) < len(views) else ""
     return Picture(
         chart_markup(figure, "Root mean square residual of each view"),

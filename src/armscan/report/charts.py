@@ -45,17 +45,15 @@ def histogram_chart(
     title: str,
     caption: str,
     curve: tuple[FloatArray, FloatArray, str] | None = None,
-    size: tuple[float, float] = (5.0, 3.2),
 ) -> Picture:
     """Counts of points.
 
     ``series``: what to count; the first lies below the others. ``edges``: (B + 1,) of the bins.
-    ``curve``: x, y and label of a line over the bars; None for none. ``size``: width and height in
-    inches.
+    ``curve``: x, y and label of a line over the bars; None for none.
     """
     bins = edges.tolist()
     with styled():
-        figure = new_figure(*size)
+        figure = new_figure(5.0, 3.2)
         axes = figure.add_subplot()
         for item in series:
             if item.is_outline:
@@ -128,11 +126,11 @@ def image_axes(camera: CameraModel) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def named_rows(axes: Axes, names: Sequence[str], label: str) -> None:
-    """Lay out horizontal bars: a name a row, the first on top."""
+def named_rows(axes: Axes, names: Sequence[str]) -> None:
+    """Lay out horizontal bars of residuals: a name a row, the first on top."""
     axes.set_yticks(range(len(names)), [short(name, 32) for name in names])
     axes.invert_yaxis()
-    axes.set_xlabel(label)
+    axes.set_xlabel("rms reprojection residual, px")
     axes.grid(axis="x")
 
 

@@ -359,7 +359,7 @@ def _pair_bars(fit: StereoFit) -> Picture:
             rms = [_rms((pair.left, pair.right)[side]) for pair in fit.pairs]
             place = rows + 0.19 * (2 * side - 1)
             left.barh(place, rms, color=colour, height=0.36, label=SIDES[side])
-        named_rows(left, [pair.pair.name for pair in fit.pairs], "rms reprojection residual, px")
+        named_rows(left, [pair.pair.name for pair in fit.pairs])
         left.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderpad=0.1, ncols=2)
         colours = [ALERT if pair.is_misfit else ACCENT for pair in fit.pairs]
         right.barh(rows, levels, color=colours, height=0.6)

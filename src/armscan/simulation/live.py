@@ -120,7 +120,7 @@ def _plan(place: str) -> tuple[_Plan, int]:
 
 
 class TwinRig:
-    """One simulated instrument that runs; see `armscan.devices.protocols.SimulatedRig`."""
+    """One simulated instrument that runs; its devices know it as their attribute ``rig``."""
 
     def __init__(self, plan: _Plan) -> None:
         self.twin = build_twin(plan.head, plan.preset, plan.seed)
@@ -172,11 +172,6 @@ class TwinRig:
         """What is before the head."""
         return self._stage.scene
 
-    @property
-    def latency_ns(self) -> int:
-        """Least delay of the arm less that of the cameras: what a latency calibration finds."""
-        return self.lines["arm"].delay_ns - self.lines["camera0"].delay_ns
-
     def show(self, scene: TwinScene) -> None:
         """Put another thing before the head, and lead it there; the count of triggers goes on.
 
@@ -199,7 +194,7 @@ class TwinRig:
             self._presses.append((now_ns, now_ns + round(1e9 * seconds), button))
 
     def inject(self, device: str, fault: Fault, amount: float = 1.0) -> None:
-        """See `SimulatedRig.inject`; raises `OptionError` for other devices and faults."""
+        """Make a device fail: see `FaultyLine.inject`; raises `OptionError` for others."""
         if device not in self.lines or fault not in get_args(Fault) or not amount > 0.0:
             raise OptionError(
                 f"no fault '{fault}' of '{device}' by {amount}",
@@ -441,7 +436,7 @@ class _TwinDevice:
         return self._line.inbox.name
 
     def show(self, scene: TwinScene) -> None:
-        """Put another thing before the head; see `armscan.devices.protocols.SimulatedRig`."""
+        """Put another thing before the head: see `TwinRig.show`."""
         self.rig.show(scene)
 
     def close(self) -> None:

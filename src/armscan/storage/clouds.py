@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from armscan.errors import FileFormatError, OptionError, OutputError
+from armscan.errors import FileFormatError, OptionError, OutputError, listed
 from armscan.geometry.arrays import IntArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
@@ -230,9 +230,8 @@ def cloud_losses(cloud: PointCloud, path: Path, dropped: Sequence[str] = ()) -> 
     told = [name for name in dropped if not any(text.startswith(name) for text in losses)]
     if not told:
         return losses
-    more = f" and {len(told) - MOST_NAMED} more" if len(told) > MOST_NAMED else ""
     word = "column" if len(told) == 1 else "columns"
-    return (*losses, f"the {word} {', '.join(told[:MOST_NAMED])}{more}")
+    return (*losses, f"the {word} {listed(told, MOST_NAMED)}")
 
 
 def write_cloud(path: Path, cloud: PointCloud, *, is_overwriting: bool = False) -> None:

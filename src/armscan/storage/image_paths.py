@@ -11,7 +11,7 @@ from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
 
-from armscan.errors import FileFormatError, OptionError
+from armscan.errors import FileFormatError, OptionError, begun
 from armscan.storage.codec import parse_json, parse_toml
 from armscan.storage.files import (
     files_in,
@@ -52,8 +52,8 @@ def expand_paths(patterns: Iterable[str | Path]) -> tuple[Path, ...]:
     return tuple(found)
 
 
-def named_by(patterns: Iterable[str], names: Sequence[str], where: str) -> tuple[str, ...]:
-    """Names that a list of names and patterns stands for, in the order of ``names``.
+def named_by(patterns: Iterable[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Names that ``--leave-out`` with names and patterns stands for, in the order of ``names``.
 
     Parameters
     ----------
@@ -62,8 +62,6 @@ def named_by(patterns: Iterable[str], names: Sequence[str], where: str) -> tuple
         ``*``, ``?`` and ``[...]`` of either.
     names
         What there is.
-    where
-        The option that the patterns came from, for messages.
 
     Raises
     ------
@@ -74,10 +72,9 @@ def named_by(patterns: Iterable[str], names: Sequence[str], where: str) -> tuple
     for pattern in patterns:
         found = {name for name in names if _is_named(name, pattern)}
         if not found:
-            listed = ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
             raise OptionError(
-                f"'{pattern}' is the name of none of {len(names)} images ({listed})",
-                where=where,
+                f"'{pattern}' is the name of none of {len(names)} images ({begun(names, LISTED)})",
+                where="--leave-out",
                 remedy="give names as reports show them, or a quoted pattern",
             )
         chosen |= found

@@ -418,15 +418,13 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
     )
 
 
-def read_arm_track(folder: Path, arm: ArmModel | None = None) -> tuple[ArmTrack, tuple[str, ...]]:
+def read_arm_track(folder: Path) -> tuple[ArmTrack, tuple[str, ...]]:
     """Read what the arm reported, from a folder with or without images.
 
     Parameters
     ----------
     folder
-        Holds ``arm.csv``, and as a rule ``session.toml``.
-    arm
-        Turns joint angles into poses; ``arm.toml`` of the folder if None.
+        Holds ``arm.csv``, as a rule ``session.toml``, and ``arm.toml`` for joint angles.
 
     Returns
     -------
@@ -442,7 +440,7 @@ def read_arm_track(folder: Path, arm: ArmModel | None = None) -> tuple[ArmTrack,
     """
     said, notes = _said(folder)
     table = read_csv(folder / ARM_FILE)
-    found = _arm_table(table, said, arm if arm is not None else _own_arm_model(folder))
+    found = _arm_table(table, said, _own_arm_model(folder))
     notes += [*said.warnings, *_odd(table, found.extra), *found.warnings]
     return found.track, (*notes, *_assumed_of_arm(found, said))
 

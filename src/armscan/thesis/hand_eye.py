@@ -194,24 +194,18 @@ class TwoStepHandEye:
 
     Parameters
     ----------
-    centre_mm
-        (3,) the sphere's centre in Base.
     side
         1 if the centre lies where the sheet's normal points, -1 if on the other side.
     shifted
         Names of the exposures from which the rotation came.
     centre_misfit_mm
         (n,) distance of each exposure's placed centre from the mean one.
-    left_out
-        Exposures that were not used, with reasons.
     """
 
     tool_from_sensor: Pose[Tool, Sensor]
-    centre_mm: FloatArray
     side: int
     shifted: tuple[str, ...]
     centre_misfit_mm: FloatArray
-    left_out: tuple[str, ...]
 
 
 def calibrate_in_two_steps(
@@ -233,13 +227,13 @@ def calibrate_in_two_steps(
         same for all exposures; None tries both and takes the one that contradicts less.
     """
     check_diameter(diameter_mm)
-    sections, left_out = find_sections(stripes, 0.5 * diameter_mm)
+    sections, _ = find_sections(stripes, 0.5 * diameter_mm)
     if len(sections) < 4:
         return FitFailure(
             f"{len(sections)} usable sections of the sphere, two steps need more", "scan more"
         )
     sides = (1, -1) if side is None else (1 if side > 0 else -1,)
-    solved = [_solve(sections, 0.5 * diameter_mm, s, left_out) for s in sides]
+    solved = [_solve(sections, 0.5 * diameter_mm, s) for s in sides]
     good = [one for one in solved if isinstance(one, TwoStepHandEye)]
     if not good:
         return solved[0]
@@ -280,7 +274,6 @@ def _solve(
     sections: tuple[CircleSection, ...],
     radius_mm: float,
     side: int,
-    left_out: tuple[str, ...],
 ) -> TwoStepHandEye | FitFailure:
     centres = sphere_centres(sections, radius_mm, side)
     poses = [section.stripe.base_from_tool for section in sections]
@@ -300,11 +293,9 @@ def _solve(
     middle = placed.mean(axis=0)
     return TwoStepHandEye(
         pose,
-        middle,
         side,
         tuple(sections[k].stripe.source for k in shifted),
         np.asarray(np.linalg.norm(placed - middle, axis=1)),
-        left_out,
     )
 
 

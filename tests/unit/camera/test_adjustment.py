@@ -8,6 +8,7 @@ from armscan.calibration.cameras.adjustment import (
     Observations,
     State,
     adjust,
+    basis_of,
     damped_step,
     free_basis,
     gather,
@@ -21,7 +22,7 @@ from armscan.geometry.estimate import FitFailure
 from rigs.camera_scene import CAMERA, Scene, make_views
 
 SCENE = Scene(n_views=4, bow_mm=(0.3, -0.2))
-BASIS, _ = free_basis("k1k2p1p2k3", CameraOptions(), with_board_warp=True)
+BASIS = basis_of(SHARED_NAMES, is_aspect_fixed=False)
 
 
 def problem(seed: int = 1) -> tuple[Observations, State]:
@@ -113,7 +114,7 @@ def test_noise_free_views_give_the_truth_back_from_a_poor_start() -> None:
     views, poses = make_views(scene, 4)
     observations = gather(views, "pinhole")
     poor = np.append(CAMERA.parameters * [1.05, 0.96, 1.02, 0.98, 0.5, 0, 0, 0, 0], np.zeros(2))
-    basis, names = free_basis("k1k2p1p2k3", CameraOptions(), with_board_warp=False)
+    basis, names = free_basis("k1k2p1p2k3", CameraOptions())
     result = adjust(observations, State.from_poses(poor, poses), basis)
     assert not isinstance(result, FitFailure)
     assert names == SHARED_NAMES[:9]
@@ -125,7 +126,7 @@ def test_noise_free_views_give_the_truth_back_from_a_poor_start() -> None:
 
 def test_fixed_aspect_and_centre_stay_fixed() -> None:
     options = CameraOptions(is_aspect_fixed=True, is_principal_point_fixed=True)
-    basis, names = free_basis("k1k2", options, with_board_warp=False)
+    basis, names = free_basis("k1k2", options)
     assert names == ("fx_px", "k1", "k2")
     step = basis @ np.array([2.0, 0.1, 0.2])
     assert step.tolist() == [2.0, 2.0, 0.0, 0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]

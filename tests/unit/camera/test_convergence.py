@@ -28,7 +28,7 @@ def test_adjustment_tells_whether_it_reached_the_minimum(noise_px: float) -> Non
     views, poses = make_views(Scene(noise_px=noise_px), 4)
     poor = np.append(CAMERA.parameters * [1.05, 0.96, 1.02, 0.98, 0.5, 0, 0, 0, 0], np.zeros(2))
     start = State.from_poses(poor, poses)
-    basis, _ = free_basis("k1k2p1p2k3", CameraOptions(), with_board_warp=False)
+    basis, _ = free_basis("k1k2p1p2k3", CameraOptions())
     stopped, ended = (adjust(gather(views, "pinhole"), start, basis, max_steps=n) for n in (2, 100))
     assert not isinstance(stopped, FitFailure)
     assert not isinstance(ended, FitFailure)

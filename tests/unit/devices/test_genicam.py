@@ -17,7 +17,7 @@ import pytest
 
 from armscan.devices.contract import check_camera
 from armscan.devices.protocols import Camera, CameraSettings, Frame
-from armscan.devices.registry import find_devices, open_device
+from armscan.devices.registry import open_device, survey_drivers
 from armscan.drivers.genicam import GenICamCamera, RawFrame, image_of
 from armscan.errors import DeviceError, DeviceTakenError
 from armscan.records.exposure import SensorWindow
@@ -38,7 +38,8 @@ def frames_of(camera: Camera, n: int, timeout_s: float = 10.0) -> list[Frame]:
 
 def emulated() -> Camera:
     pytest.importorskip("pypylon", reason="pypylon is not installed (extra pylon)")
-    found = [one.address for one in find_devices("camera") if one.address == "pylon:0815-0000"]
+    there = (device.address for report in survey_drivers() for device in report.found)
+    found = [address for address in there if address == "pylon:0815-0000"]
     if not found:
         pytest.skip("pylon was used before its emulation was switched on")
     camera = open_device("camera", found[0])
@@ -161,7 +162,7 @@ def small(address: str) -> Camera:
 
 
 def test_aravis_keeps_the_contract(fake: FakeGigE) -> None:
-    assert any("Aravis" in one.label for one in find_devices("camera"))
+    assert any("Aravis" in one.label for report in survey_drivers() for one in report.found)
     check_camera(lambda: small(fake.address))
 
 

@@ -137,7 +137,6 @@ def test_whitened_residuals_weigh_as_the_covariance_does() -> None:
     whitening = Whitening(covariance)
     expected = residuals @ np.linalg.solve(covariance, residuals)
     np.testing.assert_allclose(np.sum(whitening(residuals) ** 2), expected)
-    np.testing.assert_allclose(whitening.log_determinant, np.linalg.slogdet(covariance)[1])
     with pytest.raises(np.linalg.LinAlgError):
         Whitening(-covariance)
 

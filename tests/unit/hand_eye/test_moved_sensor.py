@@ -10,7 +10,6 @@ import numpy as np
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
 from armscan.calibration.hand_eye.observations import HandEyeOptions, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import HandEyeCalibration, SensorCalibration
 from rigs.calibrated_head import CalibratedHead
@@ -32,7 +31,7 @@ POOR_CAMERA = 3.0
 
 def _change(one: HandEyeCalibration, other: HandEyeCalibration) -> FloatArray:
     """(6,) difference of two hand-eyes over the sigma of the second."""
-    change = hand_eye_difference(one.tool_from_sensor, other.tool_from_sensor)
+    change = one.tool_from_sensor.step_from(other.tool_from_sensor)
     return np.asarray(change / np.sqrt(np.diag(other.covariance)))
 
 

@@ -24,7 +24,6 @@ from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.search import linear_hand_eye
 from armscan.calibration.hand_eye.surface import (
     PlateSurface,
-    hand_eye_difference,
 )
 from armscan.geometry.arrays import FloatArray
 from rigs.plate_rig import SILENT, TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
@@ -51,7 +50,7 @@ def _fitted(
 
 
 def _error(fit: HandEyeFit) -> FloatArray:
-    return hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+    return fit.calibration.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
 
 
 @pytest.mark.parametrize("count", [5, 6, 12])
@@ -84,7 +83,7 @@ def test_a_bowed_sheet_spoils_the_start_but_not_the_result() -> None:
     rig = replace(_rig(noise=SILENT), bow_mm=0.2)
     stripes, plate = rig.draw(0)
     fit = _fitted(stripes, plate, HandEyeOptions())
-    assert 1e-4 < np.abs(hand_eye_difference(fit.start, TOOL_FROM_SENSOR)).max() < 1.0
+    assert 1e-4 < np.abs(fit.start.step_from(TOOL_FROM_SENSOR)).max() < 1.0
     assert np.abs(_error(fit)).max() < 1e-6
 
 
@@ -105,7 +104,7 @@ def test_two_crossed_sheets_are_used_together() -> None:
     nodes = condense_plate(both, straight_stripes(both), 8)
     start = linear_hand_eye(nodes, plate.plane)
     assert start is not None
-    assert np.abs(hand_eye_difference(start, TOOL_FROM_SENSOR)).max() < 1e-8
+    assert np.abs(start.step_from(TOOL_FROM_SENSOR)).max() < 1e-8
     assert np.abs(_error(_fitted(both, plate))).max() < 1e-8
 
 
@@ -125,7 +124,7 @@ def test_the_refinement_stops_where_scipy_does() -> None:
     start = np.array([2e-3, -1e-3, 3e-3, 0.2, -0.3, 0.1])
     scale = np.array([1e-3] * 3 + [0.1] * 3)
     found = least_squares(whitened, start, x_scale=scale, method="lm", xtol=1e-14, ftol=1e-14)
-    ours = hand_eye_difference(fit.state.tool_from_sensor, TOOL_FROM_SENSOR)
+    ours = fit.state.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
     assert np.abs((found.x - ours) / np.sqrt(np.diag(fit.linear.covariance))).max() < 1e-3
     assert fit.chi2 == pytest.approx(2.0 * found.cost, rel=1e-9)
     np.testing.assert_allclose(
@@ -138,9 +137,7 @@ def test_leaving_a_posture_out_is_predicted_without_solving_again() -> None:
     whole = _fitted(stripes, plate)
     name = whole.postures[3].posture
     rest = _fitted([s for s in stripes if s.posture != name], plate)
-    change = hand_eye_difference(
-        rest.calibration.tool_from_sensor, whole.calibration.tool_from_sensor
-    )
+    change = rest.calibration.tool_from_sensor.step_from(whole.calibration.tool_from_sensor)
     stated = whole.postures[3]
     assert stated.left_out_rotation_deg == pytest.approx(
         np.degrees(np.linalg.norm(change[:3])), rel=0.02
@@ -160,9 +157,7 @@ def test_the_coupling_is_what_a_changed_sensor_does() -> None:
     assert coupling is not None
     for k, step in enumerate(1e-3 * np.eye(3)):
         moved = _fitted([replace(s, points_mm=s.points_mm + step) for s in stripes], plate)
-        change = hand_eye_difference(
-            moved.calibration.tool_from_sensor, fit.calibration.tool_from_sensor
-        )
+        change = moved.calibration.tool_from_sensor.step_from(fit.calibration.tool_from_sensor)
         np.testing.assert_allclose(coupling[:, k] * 1e-3, change, atol=2e-6)
 
 

@@ -18,7 +18,6 @@ from armscan.calibration.hand_eye.observations import (
     PosedStripe,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
@@ -65,7 +64,7 @@ def _raised(plate: PlateReference, by_mm: float) -> PlateReference:
 
 def _error_mm(fit: HandEyeFit | FitFailure) -> float:
     assert isinstance(fit, HandEyeFit)
-    found = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+    found = fit.calibration.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
     return float(np.linalg.norm(found[3:]))
 
 
@@ -241,7 +240,7 @@ def test_a_moved_plate_that_is_solved_along_is_held_by_the_stated_covariance(by_
     given = np.array(plate.plane.coefficients)
     shown = dict(fit.reference)["Plate"].replace("- ", "-").replace("+ ", "+").split()
     assert [float(shown[k]) for k in (0, 2, 4, 6)] == pytest.approx(given, abs=0.2)
-    error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+    error = fit.calibration.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
     assert error @ np.linalg.solve(fit.calibration.covariance, error) < CHI2_999
 
 
@@ -256,7 +255,7 @@ def test_a_tilted_plate_is_named(tilt_deg: float) -> None:
     assert "probed plane and scan disagree" in words
     assert float(words.split("tilted by ")[1].split(" deg")[0]) == pytest.approx(tilt_deg, rel=0.2)
     if isinstance(fit, HandEyeFit):
-        error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+        error = fit.calibration.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
         assert error @ np.linalg.solve(fit.calibration.covariance, error) < CHI2_999
     else:
         assert tilt_deg > 0.1

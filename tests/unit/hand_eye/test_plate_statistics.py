@@ -19,7 +19,6 @@ from armscan.calibration.hand_eye.noise import (
 )
 from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.least_squares import N_DRAWS, normal_draws
 from rigs.plate_bound import cramer_rao, plain_least_squares, scored_densely
@@ -41,7 +40,7 @@ def _runs(rig: PlateRig, options: HandEyeOptions, first: int) -> tuple[FloatArra
     for seed in range(first, first + N_RUNS):
         fit = calibrate_on_plate(*rig.draw(seed), options)
         assert isinstance(fit, HandEyeFit)
-        error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+        error = fit.calibration.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
         errors.append(error)
         squares.append(float(error @ np.linalg.solve(fit.calibration.covariance, error)))
     return np.array(errors), np.array(squares)

@@ -19,7 +19,6 @@ from armscan.calibration.hand_eye.observations import (
 )
 from armscan.calibration.hand_eye.surface import (
     PlateSurface,
-    hand_eye_difference,
     place,
 )
 from armscan.geometry.arrays import FloatArray
@@ -142,7 +141,7 @@ def _runs(options: HandEyeOptions, n_runs: int) -> tuple[FloatArray, FloatArray]
         problem = Problem(nodes, PlateSurface(plate), options)
         fit = estimate(problem, problem.start(TOOL_FROM_SENSOR))
         assert fit is not None
-        error = hand_eye_difference(fit.state.tool_from_sensor, TOOL_FROM_SENSOR)
+        error = fit.state.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
         total = joint_covariance(fit).unknowns[:6, :6]
         sigmas.append([fit.arm_mm, fit.sigma_of("sheet shape")])
         squares.append(float(error @ np.linalg.solve(total, error)))

@@ -19,7 +19,7 @@ from armscan.calibration.hand_eye.observations import (
     condense_sphere,
     find_sections,
 )
-from armscan.calibration.hand_eye.surface import HandEyeState, SphereSurface, hand_eye_difference
+from armscan.calibration.hand_eye.surface import HandEyeState, SphereSurface
 from rigs.sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig, with_wrong_sensor
 
 SENSOR = np.array([0.3, 0.3, 0.3, 5e-3, 5e-3])
@@ -69,7 +69,7 @@ def test_scatter_and_solution_that_swing_settle_in_the_middle(seed: int) -> None
     assert first.is_settled
     again = estimate(problem, first.state, first.noise.sigmas)
     assert again is not None
-    moved = hand_eye_difference(again.state.tool_from_sensor, first.state.tool_from_sensor)
+    moved = again.state.tool_from_sensor.step_from(first.state.tool_from_sensor)
     sigma = np.sqrt(np.diag(first.linear.covariance)[:6])
     assert np.abs(moved / sigma).max() < 0.6
 
@@ -84,7 +84,7 @@ def test_a_sensor_that_is_hardly_known_does_not_lead_a_small_sphere_away() -> No
     assert sum(one.is_settled for one in solutions) > 36
     squares = []
     for one in solutions:
-        error = hand_eye_difference(one.state.tool_from_sensor, HAND_EYE)
+        error = one.state.tool_from_sensor.step_from(HAND_EYE)
         squares.append(float(error @ np.linalg.solve(one.linear.covariance[:6, :6], error)))
     assert 3.5 < float(np.median(squares)) < 9.0
     assert float(np.mean(squares)) < 12.0

@@ -43,7 +43,6 @@ from armscan.calibration.hand_eye.surface import (
     Placed,
     PlateSurface,
     SphereSurface,
-    hand_eye_difference,
 )
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray, IntArray
@@ -327,7 +326,7 @@ def test_postures_that_do_not_show_the_arms_scatter_are_refused(
     found = calibrate_on_plate(stripes, plate, options)
     assert isinstance(found, HandEyeFit) == (count >= least)
     if isinstance(found, HandEyeFit):
-        error = hand_eye_difference(found.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+        error = found.calibration.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
         square = float(error @ np.linalg.solve(found.calibration.covariance, error))
         assert square < 4.0 * REGION
     else:

@@ -14,8 +14,13 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Frame, Pose
 from armscan.geometry.rotations import vector_from_rotation
-from armscan.markers.join_views import JoinedViews, Link, chain_markers, join_views
-from armscan.markers.joint_map import adjust_jointly
+from armscan.markers.join_views import (
+    JoinedViews,
+    Link,
+    adjust_jointly,
+    chain_markers,
+    join_views,
+)
 from armscan.records.points import MarkerSet
 from rigs.marker_scenes import NOISE_MM, Walk, marker_set, scattered, walk
 

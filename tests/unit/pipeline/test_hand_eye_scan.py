@@ -10,7 +10,6 @@ import pytest
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.devices.sources import ScanSource
 from armscan.errors import EstimationError, InputError
 from armscan.geometry.estimate import FitFailure
@@ -168,7 +167,7 @@ def _run(source: ScanSource, **limits: int) -> Run:
 def test_images_and_poses_give_the_hand_eye() -> None:
     """A stripe's plane is known to its noise over the root of its points; ten times that is far."""
     run = _run(DrawnScan(repeats=2))
-    error = hand_eye_difference(run.fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+    error = run.fit.calibration.tool_from_sensor.step_from(TOOL_FROM_SENSOR)
     limit_mm = 10.0 * CENTRE_NOISE_PX * DEPTH_PER_PX_MM / np.sqrt(400.0)
     assert np.abs(error[3:]).max() < 3.0 * limit_mm
     assert np.abs(error[:3]).max() < limit_mm / 33.0

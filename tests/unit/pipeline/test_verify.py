@@ -95,7 +95,6 @@ PLATE = PlateReference(
     covariance=np.diag([1e-5, 1e-5, 0.002]) ** 2,
     rms_mm=0.003,
     n_points=12,
-    source="plate.csv",
 )
 
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from armscan.errors import InputError
 from armscan.geometry.poses import Base, Part, Pose
-from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, Solid
+from armscan.simulation.objects.shapes import Box, FlatPlate, Placed
 from armscan.simulation.optics.scene import Material, SceneObject, Sphere
 
-SOLIDS: dict[str, Solid] = {
+SOLIDS: dict[str, Box | Sphere | FlatPlate] = {
     "box": Box(np.array([30.0, 9.0, 20.0])),
     "ball": Sphere(np.array([1.0, 2.0, 10.0]), 17.48),
     "plate": FlatPlate.draw((200.0, 150.0), 0.015, np.random.default_rng(3)),

@@ -155,7 +155,7 @@ def board_warp_shape(board_mm: FloatArray) -> FloatArray:
 
 
 def free_basis(
-    model: DistortionModel, options: CameraOptions, *, with_board_warp: bool
+    model: DistortionModel, options: CameraOptions
 ) -> tuple[FloatArray, tuple[str, ...]]:
     """Directions (11, F) in the shared unknowns that are solved, and the free parameters' names.
 
@@ -165,8 +165,7 @@ def free_basis(
     if not options.is_principal_point_fixed:
         names += ["cx_px", "cy_px"]
     names += [name for name in PARAMETER_NAMES[4:] if name in DISTORTION_PARAMETERS[model]]
-    solved = names + (list(WARP_NAMES) if with_board_warp else [])
-    return basis_of(solved, is_aspect_fixed=options.is_aspect_fixed), tuple(names)
+    return basis_of(names, is_aspect_fixed=options.is_aspect_fixed), tuple(names)
 
 
 def basis_of(names: Sequence[str], *, is_aspect_fixed: bool) -> FloatArray:

@@ -236,7 +236,7 @@ def assemble(
     fit = CameraFit(
         camera=camera,
         covariance=covariance[:N_CAMERA, :N_CAMERA],
-        free_parameters=free_basis(chosen.model, options, with_board_warp=False)[1],
+        free_parameters=free_basis(chosen.model, options)[1],
         joint_covariance=covariance[np.ix_(rows, rows)],
         views=fits,
         refused_views=prepared.refused + refused,
@@ -573,7 +573,7 @@ def _solve(
     start = starting_state(used, observations, prepared.homographies, model, options)
     if isinstance(start, FitFailure):
         return start
-    basis, _ = free_basis(model, options, with_board_warp=False)
+    basis, _ = free_basis(model, options)
     solution = solve_robustly(observations, start[0], basis, start[1], options.max_steps)
     for _ in range(EXCESS_ROUNDS):
         if isinstance(solution, FitFailure):

@@ -62,7 +62,6 @@ from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
-from armscan.geometry.rotations import vector_from_rotation
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import TwoViews, epipolar_distances_px
@@ -467,9 +466,8 @@ def covariance_of_bow(
         if isinstance(moved, FitFailure):
             return moved
         old, new = solution.state.right_from_left, moved.state.right_from_left
-        turn = vector_from_rotation(new.rotation @ old.rotation.T)
-        shift = new.translation_mm - old.translation_mm
-        by = np.concatenate([moved.state.intrinsics - solution.state.intrinsics, turn, shift])
+        intrinsics = moved.state.intrinsics - solution.state.intrinsics
+        by = np.concatenate([intrinsics, new.step_from(old)])
         found += np.outer(by, by)
     return found
 

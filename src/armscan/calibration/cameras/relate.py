@@ -23,7 +23,7 @@ from armscan.calibration.cameras.distortion import NO_SHARED
 from armscan.calibration.cameras.pairs import MIN_PAIRS, SIDES, SingleCamera, StereoPair
 from armscan.calibration.cameras.robust import FALSE_ALARM, MISFIT_LEVEL, WRONG_LEVEL
 from armscan.calibration.cameras.start import estimate_board_poses
-from armscan.errors import InputError
+from armscan.errors import InputError, begun
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
@@ -569,7 +569,7 @@ def _with_order(
     for pair, k in zip(pairs, partner, strict=True):
         views = pair.given.left, pairs[k].given.right
         examples.append(" with ".join(view.source for view in views if view is not None))
-    listed = ", ".join(examples[:LISTED]) + (", ..." if len(examples) > LISTED else "")
+    listed = begun(examples, LISTED)
     return FitFailure(
         f"the lists of images are not in the same order: {listed} would fit",
         "give both lists in the order in which they were taken",

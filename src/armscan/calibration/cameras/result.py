@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from armscan.errors import OptionError
+from armscan.errors import OptionError, listed
 from armscan.geometry.arrays import (
     ArrayRecord,
     BoolArray,
@@ -494,11 +494,10 @@ def _about_repeats(repeats: Sequence[tuple[str, str]]) -> list[str]:
     """One line, however many they are."""
     if not repeats:
         return []
-    named = [f"{later} (as {earlier})" for later, earlier in repeats[:LISTED]]
-    more = f" and {len(repeats) - LISTED} more" if len(repeats) > LISTED else ""
+    named = listed([f"{later} (as {earlier})" for later, earlier in repeats], LISTED)
     verbs = ("view repeats", "adds") if len(repeats) == 1 else ("views repeat", "add")
     fact = f"{len(repeats)} {verbs[0]} an earlier one and {verbs[1]} little"
-    return [f"{fact}: {', '.join(named)}{more}"]
+    return [f"{fact}: {named}"]
 
 
 def about_coverage(coverage: Coverage) -> list[str]:

@@ -238,7 +238,6 @@ def _evidence(
         start=start,
         stripes=residuals,
         postures=postures,
-        singular_values=conditioning.singular_values,
         reference=(),
         sensor_step=checked.fit.state.sensor,
         sensor_covariance=joint.sensor,

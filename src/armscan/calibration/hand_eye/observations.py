@@ -185,7 +185,6 @@ class PlateReference(ArrayRecord):
     covariance: FloatArray | None = floats(3, 3, default=None)
     rms_mm: float | None = None
     n_points: int = 0
-    source: str = ""
     tip_diameter_mm: float = 0.0
 
 
@@ -444,7 +443,7 @@ class CondensedObservations(ArrayRecord):
     noise_mm2
         (M, 3, 3) covariance by the stripe's own noise.
     sheet, stripe, exposure, posture
-        (M,) light sheet; index into ``sources``, ``rotations``, ``translations_mm``; number of the
+        (M,) light sheet; index into ``rotations``, ``translations_mm``; number of the
         exposure, which the images of one instant share; index into ``postures``.
     rotations, translations_mm
         (S, 3, 3) and (S, 3) ``base_from_tool`` of each stripe.
@@ -464,7 +463,6 @@ class CondensedObservations(ArrayRecord):
     posture: IntArray = ints("M")
     rotations: FloatArray = floats("S", 3, 3)
     translations_mm: FloatArray = floats("S", 3)
-    sources: tuple[str, ...]
     postures: tuple[str, ...]
     dpoint_dsensor: FloatArray | None = floats("N", 3, "P", default=None)
     sensor_covariance: FloatArray | None = floats("P", "P", default=None)
@@ -564,7 +562,6 @@ def condense_plate(
         posture=labelled[:, 2],
         rotations=np.array([one.base_from_tool.rotation for one in stripes]).reshape(-1, 3, 3),
         translations_mm=np.array([o.base_from_tool.translation_mm for o in stripes]).reshape(-1, 3),
-        sources=tuple(stripe.source for stripe in stripes),
         postures=names,
         dpoint_dsensor=np.array(by_sensor) if 0 < len(by_sensor) == len(points) else None,
     )
@@ -641,7 +638,6 @@ def condense_sphere(sections: Sequence[CircleSection], per_stripe: int) -> Conde
         posture=posture_of[owner],
         rotations=np.array([pose.rotation for pose in poses]),
         translations_mm=np.array([pose.translation_mm for pose in poses]),
-        sources=tuple(section.stripe.source for section in sections),
         postures=names,
         dpoint_dsensor=np.concatenate(by_sensor) if len(by_sensor) == len(sections) else None,
     )

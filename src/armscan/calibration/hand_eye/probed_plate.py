@@ -201,16 +201,6 @@ class ProbedPlate(ArrayRecord):
         return float(np.ptp(self.residual_mm[self.is_used]))
 
 
-def plate_from_probing(
-    probed: ProbedPoints,
-    towards_mm: FloatArray | None = None,
-    options: ProbingOptions | None = None,
-) -> PlateReference | FitFailure:
-    """`fit_probed_plate` without its evidence."""
-    fit = fit_probed_plate(probed, towards_mm, options)
-    return fit.reference if isinstance(fit, ProbedPlate) else fit
-
-
 def fit_probed_plate(
     probed: ProbedPoints,
     towards_mm: FloatArray | None = None,
@@ -255,7 +245,6 @@ def fit_probed_plate(
         covariance=plane.covariance,
         rms_mm=float(np.sqrt(np.mean(plane.residuals**2))),
         n_points=int(is_used.sum()),
-        source=probed.source,
         tip_diameter_mm=probed.tip_diameter_mm,
     )
     residual = reference.plane.distance_mm(surface)
@@ -295,7 +284,7 @@ def plate_from_coefficients(
     oriented = face_towards(plane, towards_mm, side)
     if isinstance(oriented, FitFailure):
         return oriented
-    return PlateReference(plane=oriented[0], source=source)
+    return PlateReference(plane=oriented[0])
 
 
 def _fit(points: FloatArray, options: ProbingOptions) -> Estimate[Plane] | FitFailure:

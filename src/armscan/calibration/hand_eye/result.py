@@ -129,8 +129,6 @@ class HandEyeFit(ArrayRecord):
     ----------
     start
         Where the refinement started: on a plate the linear solution.
-    singular_values
-        (6,) of the scaled and whitened system, largest first.
     reference
         What the reference was and how far the data agree with it, as (label, value) for a reader.
     sensor_step, sensor_covariance
@@ -142,7 +140,6 @@ class HandEyeFit(ArrayRecord):
     start: Pose[Tool, Sensor]
     stripes: tuple[StripeResidual, ...]
     postures: tuple[PostureResult, ...]
-    singular_values: FloatArray = floats(None)
     reference: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...] = ()
     sensor_step: FloatArray | None = floats("P", default=None)

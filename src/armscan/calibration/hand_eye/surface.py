@@ -220,12 +220,6 @@ class HandEyeState:
         )
 
 
-def hand_eye_difference(pose: Pose[Tool, Sensor], other: Pose[Tool, Sensor]) -> FloatArray:
-    """(6,) step of `Pose.retract` that leads from ``other`` to ``pose``."""
-    turn: Pose[Tool, Tool] = Pose(pose.rotation @ other.rotation.T, np.zeros(3))
-    return np.concatenate([turn.rotation_vector_rad, pose.translation_mm - other.translation_mm])
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
     """Condensed observations placed in Base, and what their distances depend on.

@@ -22,7 +22,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray, homogeneous
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.least_squares import robust_sigma
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
-from armscan.geometry.rotations import skew, vector_from_rotation
+from armscan.geometry.rotations import skew
 from armscan.models.calibration import CameraCalibration, SecondCamera, SensorCalibration
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.models.light_sheet import LightSheet
@@ -295,7 +295,7 @@ def place_board(
     covariance = np.linalg.inv(information[0] + information[1])
     gain = covariance @ information[1]
     a = first.sensor_from_board
-    pose = a.retract(gain @ _step(a, second.sensor_from_board))
+    pose = a.retract(gain @ second.sensor_from_board.step_from(a))
     follow = first.by_cameras + gain @ (second.by_cameras - first.by_cameras)
     return PlacedBoard(pose, 0.5 * (covariance + covariance.T), follow)
 
@@ -305,7 +305,7 @@ def poses_chi2(left: SeenBoard, right: SeenBoard, cameras: HeadCameras) -> float
     a, b = _in_sensor(left, cameras), _in_sensor(right, cameras)
     follow = b.by_cameras - a.by_cameras
     covariance = a.covariance + b.covariance + follow @ cameras.covariance @ follow.T
-    step = _step(a.sensor_from_board, b.sensor_from_board)
+    step = b.sensor_from_board.step_from(a.sensor_from_board)
     return float(step @ np.linalg.solve(covariance, step))
 
 
@@ -327,13 +327,6 @@ def _in_sensor(seen: SeenBoard, cameras: HeadCameras, bow: BoardBow | None = Non
 def _twice(turn: FloatArray) -> FloatArray:
     """(6, 6) a rotation (3, 3) acting on both halves of a pose's increment."""
     return np.asarray(np.kron(np.eye(2), turn), dtype=np.float64)
-
-
-def _step(a: Pose[Sensor, Board], b: Pose[Sensor, Board]) -> FloatArray:
-    """(6,) step from pose a to pose b: rotation vector from the left, then translation."""
-    return np.concatenate(
-        [vector_from_rotation(b.rotation @ a.rotation.T), b.translation_mm - a.translation_mm]
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

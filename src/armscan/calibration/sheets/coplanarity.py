@@ -69,7 +69,7 @@ def fit_common_plane(stripes: Sequence[StripeObservation]) -> CommonPlane | FitF
         normal_matrix = design.T @ weighted
         step = np.linalg.solve(normal_matrix, weighted.T @ local[:, 2])
         missed = local[:, 2] - design @ step
-        plane = _tilted(plane, step)
+        plane = plane.tilted(step)
     remaining = covariance - design @ np.linalg.solve(normal_matrix, design.T)
     worst = int(np.argmax(np.abs(missed)))
     return CommonPlane(
@@ -79,16 +79,6 @@ def fit_common_plane(stripes: Sequence[StripeObservation]) -> CommonPlane | FitF
         float(np.abs(missed[worst])),
         float(np.sqrt(max(remaining[worst, worst], 0.0))),
     )
-
-
-def _tilted(plane: Plane, step: FloatArray) -> Plane:
-    """Add ``step[0] x + step[1] y + step[2]`` to the plane's height."""
-    normal = plane.axes[2] - step[0] * plane.axes[0] - step[1] * plane.axes[1]
-    normal = normal / np.linalg.norm(normal)
-    first = plane.axes[0] - (plane.axes[0] @ normal) * normal
-    first = first / np.linalg.norm(first)
-    point = plane.point_mm + step[2] * plane.axes[2]
-    return Plane(point, np.stack([first, np.cross(normal, first), normal]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -450,7 +450,7 @@ def choose_print(
     """Whether a set shows its lines better where the target's print is taken away, and how so.
 
     ``stripes_of`` gives the stripes of one of ``n_images`` photographs without a view without laser
-    as it is, or less its print as `predict_print` knows it. Judged as in `choose_channel`.
+    as it is, or less its print as `predict_print` knows it. Judged as in `rank_channels`.
     """
     if not n_images:
         return False, ""

@@ -108,7 +108,6 @@ class _Run:
             cloud=path_text(path),
             quantities=found.quantities,
             notes=sentences((*delivery.warnings, *found.notes, *cleaned, *model, *warned)),
-            n_points=len(found.cloud),
             is_simulated=simulated,
             forced=cloud.forced,
         )

@@ -156,9 +156,7 @@ def read_plate(
         fit = solved(fit_probed_plate(found, towards_mm, ProbingOptions(side=side)), path)
         return fit.reference, fit.warnings
     if side is None:
-        return PlateReference(
-            plane=plane_from_coefficients(found, near_mm), source=path_text(path)
-        ), ()
+        return PlateReference(plane=plane_from_coefficients(found, near_mm)), ()
     return solved(plate_from_coefficients(found, near_mm, side, path_text(path)), path), ()
 
 

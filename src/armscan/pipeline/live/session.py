@@ -123,8 +123,6 @@ class CameraView:
     ----------
     image
         As delivered.
-    lasers
-        Sources that were on; None where it is not known.
     points_px
         (N, 2) stripe points measured in this image, full-sensor pixels.
     sheet
@@ -132,7 +130,6 @@ class CameraView:
     """
 
     image: ImageArray
-    lasers: tuple[str, ...] | None
     points_px: FloatArray
     sheet: IntArray
 
@@ -163,8 +160,6 @@ class LiveSnapshot:
         Median and 95 % of exposure to shown; None before anything was placed.
     brightness
         Of the lines, one a camera and choice of lasers, where exposure times are controlled.
-    n_waiting
-        Elements that wait to be recorded.
     streams
         What was lost, late or doubtful in the stream of each device, in words; empty where nothing.
     faults
@@ -182,7 +177,6 @@ class LiveSnapshot:
     rate_hz: float
     latency_ms: tuple[float, float] | None
     brightness: tuple[tuple[LineBrightness, ...], ...]
-    n_waiting: int
     streams: tuple[str, ...]
     faults: tuple[str, ...]
 
@@ -275,7 +269,7 @@ class LiveSession:
         self._passes: list[_Pass] = []
         self._version = self._n_instants = 0
         self._counts: Counter[LiveStatus] = Counter()
-        self._frames: dict[int, tuple[Frame, tuple[str, ...] | None]] = {}
+        self._frames: dict[int, Frame] = {}
         self._measured: dict[int, tuple[int, CameraView]] = {}
         self._latest: Pose[Base, Tool] | None = None
         self._moved_ns = 0
@@ -462,7 +456,6 @@ class LiveSession:
                 if late
                 else None,
                 brightness=tuple(one.brightness for one in self._controls),
-                n_waiting=self._acquisition.n_waiting,
                 streams=tuple(
                     f"{device.name}: {monitor.counts.words}" if monitor.counts.words else ""
                     for device, monitor in self._acquisition.monitored
@@ -472,11 +465,11 @@ class LiveSession:
 
     def _view(self, camera: int) -> CameraView:
         """The latest image that was measured, with its own stripes, or a much newer one."""
-        frame, lasers = self._frames[camera]
+        frame = self._frames[camera]
         taken_ns, view = self._measured.get(camera, (0, None))
         if view is not None and frame.t_host_ns - taken_ns < NEWER_NS:
             return view
-        return CameraView(frame.image, lasers, np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+        return CameraView(frame.image, np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
     def cloud(self) -> ShownCloud:
         """The live cloud of all passes that were not taken back."""
@@ -533,7 +526,7 @@ class LiveSession:
             if frame is not None:
                 control.show(frame, instant.lasers)
         with self._lock:
-            self._frames |= {k: (one, instant.lasers) for k, one in frames if one is not None}
+            self._frames |= {k: one for k, one in frames if one is not None}
             self._arrivals.append(time.monotonic_ns())
             self._latest = instant.pose
             number = instant.number
@@ -670,7 +663,7 @@ class LiveSession:
                 if frame is not None:
                     seen = found.labelled.status == PointStatus.MEASURED
                     pixels, sheet = found.labelled.profile.points_px, found.labelled.sheet
-                    view = CameraView(frame.image, instant.lasers, pixels[seen], sheet[seen])
+                    view = CameraView(frame.image, pixels[seen], sheet[seen])
                     self._measured[camera] = frame.t_host_ns, view
             depth = np.concatenate(depths)
             self._range_mm = float(np.median(depth)) if len(depth) else None

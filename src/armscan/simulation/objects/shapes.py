@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -14,13 +14,6 @@ from armscan.geometry.poses import Pose
 from armscan.simulation.optics.scene import MISS, OneColour, Surface
 
 GREY = (0.7, 0.7, 0.7)
-
-
-class Solid(Surface, Protocol):
-    """A surface that knows how far a point is from it."""
-
-    def distance_mm(self, points_mm: FloatArray) -> FloatArray:
-        """(N,) signed distance of points (N, 3) from the surface; positive outside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +84,7 @@ class Box(OneColour):
         return normals
 
     def distance_mm(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Solid`."""
+        """(N,) signed distance of points (N, 3) from the surface; positive outside."""
         beyond = np.abs(self._from_centre(points_mm)) - 0.5 * self.size_mm
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
         return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0))
@@ -217,7 +210,7 @@ class FlatPlate(HeightField):
         return result
 
     def distance_mm(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Solid`, over the face and next to it."""
+        """As for `Box`, over the face and next to it."""
         return np.asarray(points_mm[:, 2] - self.height_mm(points_mm[:, 0], points_mm[:, 1]))
 
     def _grid(self) -> tuple[FloatArray, FloatArray]:
@@ -364,7 +357,7 @@ class WavyPlate(HeightField):
         return result
 
     def distance_mm(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Solid`, over the face; true to first order close to it."""
+        """As for `Box`, over the face; true to first order close to it."""
         slope_x, slope_y = self.slopes(points_mm[:, 0], points_mm[:, 1])
         return np.asarray(self._above(points_mm) / np.sqrt(1.0 + slope_x**2 + slope_y**2))
 

@@ -33,7 +33,6 @@ class StripeTruth(ArrayRecord):
     scene's surfaces, as float64.
     """
 
-    laser: str
     points_px: FloatArray = floats("N", 2)
     points_mm: FloatArray = floats("N", 3)
     surface: FloatArray = floats("N")
@@ -73,9 +72,7 @@ def find_stripe(
     hits = tracer(pixels)
     if len(rows) == 0:
         none = np.zeros((0, 2))
-        return StripeTruth(
-            laser=laser.name, points_px=none, points_mm=np.zeros((0, 3)), surface=np.zeros(0)
-        )
+        return StripeTruth(points_px=none, points_mm=np.zeros((0, 3)), surface=np.zeros(0))
     top, left = int(rows.min()), int(columns.min())
     size = (int(rows.max()) - top + 1, int(columns.max()) - left + 1)
     number = np.full(size, -1, dtype=np.int64)
@@ -134,7 +131,6 @@ def _refine(
     hits = tracer(pixels)
     is_lit = scene.laser_light(laser, hits) > 0.0
     return StripeTruth(
-        laser=laser.name,
         points_px=pixels[is_lit],
         points_mm=hits.points_mm[is_lit],
         surface=hits.surface[is_lit].astype(np.float64),

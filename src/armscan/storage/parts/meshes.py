@@ -131,7 +131,7 @@ def _text_polygons(rows: list[list[bytes]], count: int, where: str) -> list[IntA
             "the faces of the PLY file are not understood", where=where, remedy=CUT
         ) from error
     if len(found) < count or not is_whole:
-        raise _short("PLY", len(found), count, where)
+        raise _short(len(found), count, where)
     return found
 
 
@@ -162,12 +162,12 @@ def _binary_polygons(
             if kind[0] == "list":
                 head = np.dtype(order + TYPES[kind[1]])
                 if at + head.itemsize > len(data):
-                    raise _short("PLY", len(found), count, where)
+                    raise _short(len(found), count, where)
                 length = int(np.frombuffer(data, head, 1, at)[0])
                 at += head.itemsize
             item = np.dtype(order + TYPES[kind[2] if kind[0] == "list" else kind[0]])
             if not 0 <= length <= MOST_CORNERS or at + length * item.itemsize > len(data):
-                raise _short("PLY", len(found), count, where)
+                raise _short(len(found), count, where)
             if k == name:
                 corners = np.frombuffer(data, item, length, at).astype(np.int64)
             at += length * item.itemsize
@@ -175,9 +175,9 @@ def _binary_polygons(
     return found
 
 
-def _short(kind: str, held: int, count: int, where: str) -> FileFormatError:
+def _short(held: int, count: int, where: str) -> FileFormatError:
     return FileFormatError(
-        f"the {kind} file holds {held:,} of {count:,} faces", where=where, remedy=CUT
+        f"the PLY file holds {held:,} of {count:,} faces", where=where, remedy=CUT
     )
 
 

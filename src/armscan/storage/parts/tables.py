@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from armscan.errors import FileFormatError, InputError, OptionError
+from armscan.errors import FileFormatError, InputError, OptionError, listed
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.features import SHAPE_KINDS, Shape, across
@@ -106,13 +106,8 @@ def require_face(name: str, part: PartModel, where: str) -> None:
     if name in part.face_names:
         return
     near = get_close_matches(name, part.face_names, 1)
-    hint = f"did you mean '{near[0]}'" if near else f"its faces are {_listed(part.face_names)}"
+    hint = f"did you mean '{near[0]}'" if near else f"its faces are {listed(part.face_names, 12)}"
     raise FileFormatError(f"the part has no face '{name}'", where=where, remedy=hint)
-
-
-def _listed(names: tuple[str, ...], most: int = 12) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def face_table_bytes(found: CadComparison) -> bytes:

@@ -221,7 +221,7 @@ class ProfileFits:
     `armscan.kernels.stripe.profile_fit`. ``sides``: (N, 2) background on the lower and upper side,
     averaged along the line. ``side_sigma``: (N,) standard deviation of the difference of the two
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
-    px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's own
+    px. ``section``: (4,) shape of the line's own
     section: see `estimate_section`. ``is_noise_assumed``: True if there were too few residuals to
     estimate the noise, so that it is the first guess. ``ground``: (N, 2) reflectance under the
     line, weighted as the line lights it, and its standard deviation across the line over that.
@@ -232,16 +232,9 @@ class ProfileFits:
     sides: FloatArray
     side_sigma: FloatArray
     neighbour: FloatArray
-    noise: FloatArray
     section: FloatArray
     is_noise_assumed: bool
     ground: FloatArray
-
-    @property
-    def lean(self) -> FloatArray:
-        """(N,) third-order term of the line's own section."""
-        is_column = self.ridge.table[:, 5] == 0
-        return np.asarray(np.where(is_column, self.section[0], self.section[2]))
 
 
 def fit_ridge(
@@ -315,7 +308,6 @@ def fit_ridge(
         sides,
         background_noise * side_sigma,
         neighbour,
-        noise,
         section,
         is_noise_assumed=noise is guess,
         ground=_ground(plane, ridge.table, values),

@@ -17,7 +17,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.chessboard import board_lattice, fit_board_saddles
+from armscan.vision.targets.chessboard import regular_saddles
 from armscan.vision.targets.crossings import predict_cells
 from armscan.vision.targets.saddle import (
     WINDOW_FRACTION,
@@ -410,11 +410,7 @@ def _tag_corners(
     clear = _clear_sides(target)
     steps = clear * along_x[chosen], clear * along_y[chosen]
     cells = target.corners[number]
-    saddles = fit_board_saddles(grey, cells, start, steps, clear)
-    points_px, covariance, is_good = saddles
-    lattice = board_lattice(grey, cells, saddles, steps)
-    if lattice is not None:
-        is_good[np.flatnonzero(is_good)[lattice.is_off]] = False
+    points_px, covariance, is_good = regular_saddles(grey, cells, start, steps, clear)
     if is_good.sum() >= MIN_CORNERS:
         return TargetView.of_image(
             exposure, target, number[is_good], points_px[is_good], covariance[is_good]

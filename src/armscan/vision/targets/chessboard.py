@@ -548,6 +548,21 @@ def fit_board_saddles(
     return reduced if is_clearer else saddles
 
 
+def regular_saddles(
+    grey: RawGrey,
+    cells: IntArray | FloatArray,
+    corners_px: FloatArray,
+    steps_px: Steps,
+    clear_cells: float,
+) -> Saddles:
+    """As `fit_board_saddles`; none is good that lies off the lattice of the others."""
+    saddles = fit_board_saddles(grey, cells, corners_px, steps_px, clear_cells)
+    lattice = board_lattice(grey, cells, saddles, steps_px)
+    if lattice is not None:
+        saddles.is_good[np.flatnonzero(saddles.is_good)[lattice.is_off]] = False
+    return saddles
+
+
 def _median_sigma(saddles: Saddles) -> float:
     """Of all corners, those that were not measured counting as endless."""
     return float(np.median(np.where(saddles.is_good, saddles.sigma_px, np.inf)))

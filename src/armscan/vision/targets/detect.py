@@ -30,9 +30,8 @@ from armscan.vision.targets.april_grid import (
 )
 from armscan.vision.targets.chessboard import (
     Steps,
-    board_lattice,
     detect_chessboard,
-    fit_board_saddles,
+    regular_saddles,
 )
 from armscan.vision.targets.circle_grid import detect_circle_grid
 from armscan.vision.targets.crossings import predict_cells
@@ -201,11 +200,7 @@ def _corners(
 ) -> TargetView | FitFailure:
     clear_cells = _clear_cells(board)
     cells, start_px, steps = _corners_near(markers, board, clear_cells, grey.shape[:2])
-    saddles = fit_board_saddles(grey, cells, start_px, steps, clear_cells)
-    refined, covariance, is_good = saddles
-    lattice = board_lattice(grey, cells, saddles, steps)
-    if lattice is not None:
-        is_good[np.flatnonzero(is_good)[lattice.is_off]] = False
+    refined, covariance, is_good = regular_saddles(grey, cells, start_px, steps, clear_cells)
     n_corners = int(is_good.sum())
     if n_corners >= MIN_CORNERS:
         column, row = (cells[is_good] - 1).T

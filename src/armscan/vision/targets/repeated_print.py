@@ -141,7 +141,6 @@ class _Cells:
     is_staggered: bool
     camera_from_board: Pose[Any, Board]
     camera: CameraModel
-    binning: int
 
     @staticmethod
     def of(
@@ -167,7 +166,7 @@ class _Cells:
         n = max(int(np.ceil(min(half_px * SAMPLES_PX, most))), 1)
         return _Cells(
             *(points, _kinds(target), half, shift, half / n, n),
-            *(is_staggered, camera_from_board, camera, binning),
+            *(is_staggered, camera_from_board, camera),
         )
 
     @property

@@ -286,7 +286,7 @@ def is_thresholded(exposure: Exposure) -> bool:
     image, full_scale = exposure.image, exposure.full_scale
     if image.ndim > 2:
         return False
-    few = (image[::FEW_PX], np.ascontiguousarray(image[:, ::FEW_PX]))
+    few = (image[::FEW_PX], image[:, ::FEW_PX].copy())
     is_so = _is_black_and_white(few, full_scale)
     is_so = is_so and _is_black_and_white((image,), full_scale, LEAST_WHITE_PX)
     return is_so and _is_black_elsewhere(image, full_scale)

@@ -76,6 +76,7 @@ def observe_stripes(
     sensor: SensorCalibration,
     options: MeasureOptions | None = None,
     *,
+    max_exposures: int = MAX_EXPOSURES,
     n_wanted: int = 0,
     progress: Progress = silent,
 ) -> ObservedStripes:
@@ -95,6 +96,8 @@ def observe_stripes(
         Camera or cameras and sheets.
     options
         Stripe extraction and the depths accepted.
+    max_exposures
+        Of a longer scan, so many are used, evenly spread.
     n_wanted
         Exposures that are kept, for a page that shows them.
     progress
@@ -113,7 +116,7 @@ def observe_stripes(
     poses = exposure_poses(source.rows, source.arm, source.session.clock)
     scan = ScanInstants(source, len(cameras_of(sensor)))
     has_pose = np.array([poses.has_pose[list(one.rows)].all() for one in scan.lit], dtype=np.bool_)
-    chosen = [scan.lit[k] for k in _spread(np.flatnonzero(has_pose), MAX_EXPOSURES)]
+    chosen = [scan.lit[k] for k in _spread(np.flatnonzero(has_pose), max_exposures)]
     postures, merged = _postures(
         [source.rows[one.rows[0]] for one in chosen], [poses.pose(one.rows[0]) for one in chosen]
     )

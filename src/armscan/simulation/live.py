@@ -172,6 +172,11 @@ class TwinRig:
         """What is before the head."""
         return self._stage.scene
 
+    @property
+    def latency_ns(self) -> int:
+        """Least delay of the arm less that of the cameras: what a latency calibration finds."""
+        return self.lines["arm"].delay_ns - self.lines["camera0"].delay_ns
+
     def show(self, scene: TwinScene) -> None:
         """Put another thing before the head, and lead it there; the count of triggers goes on.
 

@@ -69,7 +69,7 @@ def inspect_plane(
         return FitFailure(
             f"of {len(points)} points all but a few lie in one light sheet: one stripe does not "
             "tell how a face lies across it",
-            "measure more exposures of the face",
+            "measure the face from more places: exposures at rest show it in one line",
         )
     middle = points.mean(axis=0)
     start = reference if reference is not None else _search(points, middle, stripe)

@@ -298,7 +298,7 @@ def dominant_flat(points: FloatArray, stripe: IntArray | None = None) -> FloatAr
             return FitFailure(
                 "no face has points of several stripes, and one by itself lies in its light sheet, "
                 "whatever it crosses",
-                "measure more exposures of the face",
+                "measure the face from more places: exposures at rest show it in one line",
             )
     return _polished(points, normals[best], float(offsets[best]))
 

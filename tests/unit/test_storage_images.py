@@ -89,6 +89,26 @@ def test_no_orientation_turns_a_tiff(tmp_path: Path, orientation: int, bits: int
     np.testing.assert_array_equal(read_exposure(path).image, image)
 
 
+def test_an_orientation_of_another_type_turns_no_tiff_either(tmp_path: Path) -> None:
+    """The decoder takes one of four bytes, or of one, as it takes the standard's two."""
+    image, path = noise((20, 31)), tmp_path / "long.tif"
+    short = tiff_bytes(image, (274, 6))
+    entry = struct.pack("<HHIHH", 274, SHORT, 1, 6, 0)
+    assert entry in short
+    for kind in (1, 4):
+        path.write_bytes(short.replace(entry, struct.pack("<HHIHH", 274, kind, 1, 6, 0)))
+        np.testing.assert_array_equal(read_exposure(path).image, image)
+
+
+def test_a_transparent_tiff_is_refused_for_its_colours_are_lost(tmp_path: Path) -> None:
+    """The decoder multiplies them by an alpha of 0."""
+    path, rgba = tmp_path / "clear.tif", noise((20, 31, 4))
+    rgba[:, :, 3] = 0
+    Image.fromarray(rgba, "RGBA").save(path)
+    with pytest.raises(FileFormatError, match="transparent pixels"):
+        read_exposure(path)
+
+
 def test_colours_in_planes_are_read_or_refused(tmp_path: Path) -> None:
     """The decoder takes planes of 16 bits for one after the other pixel."""
     path, planes = tmp_path / "planes.tif", noise((3, 20, 32))

@@ -196,7 +196,7 @@ def inspect_points(
 
     ``rule`` is how they were chosen, in words, after "points".
     """
-    selection = select(cloud, wanted.region, None)
+    selection = select(cloud, wanted.region, None, size_mm=wanted.radii_mm[1])
     points = selection.points_mm
     first = fit_shape(wanted.kind, points)
     if isinstance(first, FitFailure):

@@ -16,7 +16,6 @@ from armscan.inspection.results import (
     describe_deviations,
 )
 from armscan.inspection.selection import (
-    LEAST_CONCENTRATION,
     MIN_POINTS,
     OUTLIER_RULE,
     SEARCH_BAND_MM,
@@ -25,6 +24,7 @@ from armscan.inspection.selection import (
     Selection,
     dominant_flat,
     fit_robustly,
+    least_concentration,
     select,
 )
 from armscan.inspection.uncertainty import FitLinearised, measured_length
@@ -177,9 +177,7 @@ def _unlike(selection: Selection, is_feature: BoolArray, off_mm: FloatArray) -> 
     """
     bands_mm = selection.search_band_mm[is_feature]
     band_mm, n_near = float(np.median(bands_mm)), int((off_mm <= bands_mm).sum())
-    # as far above the part of evenly spread points as without a wider band
-    least = LEAST_CONCENTRATION + (band_mm - SEARCH_BAND_MM) / selection.feature_mm
-    if n_near >= least * len(off_mm):
+    if n_near >= least_concentration(band_mm, selection.feature_mm) * len(off_mm):
         return None
     facts = (
         f"at the best place for one, only {n_near} of {len(off_mm)} points within "
@@ -188,10 +186,9 @@ def _unlike(selection: Selection, is_feature: BoolArray, off_mm: FloatArray) -> 
     remedy = "show where the face is with --region, or give the plane it should be"
     widest = 2.0 * SEARCH_SIGMAS * float(np.median(selection.sigma_mm[is_feature]))
     if widest > selection.feature_mm:
-        # half of it is the widest band
-        remedy = (
-            f"give --feature-mm {widest:.2g}, as the points' stated sigma asks for; or {remedy}"
-        )
+        # half of it is the widest band; rounding must not bring it below
+        own = f"give --feature-mm {1.05 * widest:.2g}, as the points' stated sigma asks for"
+        remedy = f"{own}; or {remedy}"
     return FitFailure(f"there is no flat face: {facts}", remedy)
 
 

@@ -29,11 +29,10 @@ SEARCH_SIGMAS = 2.0
 """The same in the points' stated sigmas, where these are larger: 19 of 20 points lie within."""
 MIN_POINTS = 30
 """Fewest points that make a feature."""
-LEAST_OF_SIZE = 0.1
+LEAST_OF_SIZE = 0.7
 """Of a feature's nominal size, over which its points spread; written in metres they have 0.001."""
-AT_REST_MM, SAMPLED = 0.1, 10_000
-"""More than an arm at rest trembles, and less than a light sheet is thick; points of which the
-distance from the head is taken."""
+AT_REST_MM, SAMPLED = 0.3, 10_000
+"""More than an arm at rest trembles; points of which the distance from the head is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,9 +146,9 @@ class Selection:
 def standings(cloud: PointCloud) -> IntArray:
     """(E,) number of the place of the head at each exposure, rising from 0.
 
-    Exposures that follow each other share it while no point at their distance moves by
-    `AT_REST_MM` from where the head had it at the first of them. Where the cloud does not tell how
-    the head stood, each has one of its own.
+    Exposures that follow each other share it while the head's origin, and marks on two of its axes
+    at the points' distance, stay within `AT_REST_MM` of where they were at the first of them. Where
+    the cloud does not tell where and how the head stood, each has one of its own.
     """
     seen_from_mm, errors = cloud.seen_from_mm, cloud.calibration_errors
     n = len(cloud.exposure_sources)
@@ -210,6 +209,19 @@ def select(
             remedy="measure more points" if region is None else "widen the region",
         )
     return Selection(cloud, rows, (options or InspectionOptions()).feature_mm)
+
+
+MOST_CONCENTRATION = 0.9
+"""Of the points within two sigmas of a surface, which hold 95 % of normal ones."""
+
+
+def least_concentration(band_mm: float, feature_mm: float) -> float:
+    """Part of a feature's points that must lie within a search band as wide as this.
+
+    As far above the part of evenly spread points as within the narrowest band.
+    """
+    wider = (band_mm - SEARCH_BAND_MM) / feature_mm
+    return min(LEAST_CONCENTRATION + wider, MOST_CONCENTRATION)
 
 
 def fit_robustly(

@@ -13,7 +13,6 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Sphere, fit_sphere
 from armscan.inspection.results import PointCounts, SphereInspection, describe_deviations
 from armscan.inspection.selection import (
-    LEAST_CONCENTRATION,
     MIN_POINTS,
     OUTLIER_RULE,
     SEARCH_BAND_MM,
@@ -22,6 +21,7 @@ from armscan.inspection.selection import (
     Selection,
     find_ball,
     fit_robustly,
+    least_concentration,
     select,
 )
 from armscan.inspection.uncertainty import FitLinearised, measured_length
@@ -105,9 +105,7 @@ def _settled(
             )
     near = np.abs(sphere.distance_mm(points[is_feature])) <= band_mm[is_feature]
     middle_mm = float(np.median(band_mm[is_feature]))
-    # As far above the part of evenly spread points as without a wider band.
-    least = LEAST_CONCENTRATION + (middle_mm - SEARCH_BAND_MM) / feature_mm
-    if float(near.mean()) < least:
+    if float(near.mean()) < least_concentration(middle_mm, feature_mm):
         return _not_concentrated(selection, is_feature, int(near.sum()), middle_mm, diameter_mm)
     return _described(selection, is_feature, is_fitted, sphere, diameter_mm)
 

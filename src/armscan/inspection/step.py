@@ -85,7 +85,8 @@ def find_levels(
 def _levels(heights: FloatArray) -> tuple[FloatArray, IntArray]:
     """Local maxima of the heights' density, best filled first, and the points about each."""
     # a stray far away would make too many bins
-    heights = heights[np.abs(heights - np.median(heights)) <= MAX_EXTENT_MM / 2.0]
+    middle = np.partition(heights, len(heights) // 2)[len(heights) // 2]
+    heights = heights[np.abs(heights - middle) <= MAX_EXTENT_MM / 2.0]
     low = float(heights.min())
     bins = np.bincount(((heights - low) / BIN_MM).astype(np.int64))
     width = max(1, round(SEARCH_BAND_MM / BIN_MM))

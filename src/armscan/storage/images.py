@@ -224,6 +224,7 @@ TIFF_DATA_TAGS = {273: 279, 324: 325}
 """Tags of the offsets of strips and tiles, with the tags of their byte counts."""
 
 TIFF_SIZE_TAGS = {256: "width", 257: "height", 258: "bits", 277: "channels"}
+TIFF_WHOLE_TYPES = {1: "B", 3: "H", 4: "I"}
 TIFF_SUBFILE, TIFF_PHOTOMETRIC, TIFF_ORIENTATION, TIFF_PLANES = 254, 262, 274, 284
 TIFF_KIND_TAGS = (TIFF_SUBFILE, TIFF_PHOTOMETRIC, TIFF_PLANES)
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
@@ -309,11 +310,13 @@ def _bmp_defect(data: bytes) -> str:
 @dataclass(frozen=True, slots=True)
 class _Directory:
     """What a TIFF file says of one picture: values of the tags that count here, the place of its
-    orientation in the file (0 for none), and that of the next directory (0 for none).
+    orientation in the file (0 for none) with the code of its type, and the place of the next
+    directory (0 for none).
     """
 
     tags: dict[int, tuple[int, ...]]
     orientation: int
+    orientation_code: str
     following: int
 
     def first(self, tag: int, otherwise: int) -> int:
@@ -326,12 +329,12 @@ def _tiff_directory(data: bytes, place: int) -> _Directory:
     (n_entries,) = struct.unpack_from(f"{order}H", data, place)
     tags: dict[int, tuple[int, ...]] = {}
     known = {*TIFF_DATA_TAGS, *TIFF_DATA_TAGS.values(), *TIFF_SIZE_TAGS, *TIFF_KIND_TAGS}
-    orientation, end = 0, place + 2 + 12 * n_entries
+    orientation, orientation_code, end = 0, "H", place + 2 + 12 * n_entries
     for entry in range(place + 2, end, 12):
         tag, kind, count = struct.unpack_from(f"{order}HHI", data, entry)
         n_bytes = TIFF_TYPE_BYTES.get(kind)
-        if (tag, kind, count) == (TIFF_ORIENTATION, 3, 1):
-            orientation = entry + 8
+        if tag == TIFF_ORIENTATION and kind in TIFF_WHOLE_TYPES and count == 1:
+            orientation, orientation_code = entry + 8, TIFF_WHOLE_TYPES[kind]
         if n_bytes is None or tag not in known:
             continue
         if n_bytes * count > 4:
@@ -341,7 +344,7 @@ def _tiff_directory(data: bytes, place: int) -> _Directory:
         code = {1: "B", 2: "H", 4: "I"}[n_bytes]
         tags[tag] = struct.unpack_from(f"{order}{count}{code}", data, start)
     following = struct.unpack_from(f"{order}I", data, end)[0] if end + 4 <= len(data) else 0
-    return _Directory(tags, orientation, following)
+    return _Directory(tags, orientation, orientation_code, following)
 
 
 def _tiff_order(data: bytes) -> str:
@@ -401,8 +404,8 @@ def _plain_tiff(data: bytes, where: str) -> bytes:
         if fact:
             raise FileFormatError(f"the TIFF file {fact}", where=where, remedy="save it as PNG")
     at = page.orientation
-    upright = struct.pack(f"{_tiff_order(data)}H", 1)
-    return data[:at] + upright + data[at + 2 :] if at else data
+    upright = struct.pack(f"{_tiff_order(data)}{page.orientation_code}", 1)
+    return data[:at] + upright + data[at + len(upright) :] if at else data
 
 
 HEADER = re.compile(rb"P([2356])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d{1,6})" + rb"\s")
@@ -473,8 +476,8 @@ def read_exposure(
     """Read an image file of 8 to 16 bits, grey or colour.
 
     An orientation that a camera wrote into the file is ignored: a lens does not turn with the
-    picture. An alpha channel is dropped if it is opaque everywhere or 0 everywhere, and refused
-    otherwise. A TIFF file that holds several images of one size is refused.
+    picture. An alpha channel is dropped if it is opaque everywhere or, but in TIFF, 0
+    everywhere, and refused otherwise. A TIFF file that holds several images of one size is refused.
 
     Parameters
     ----------
@@ -586,8 +589,10 @@ def _decode(data: bytes, path: Path) -> tuple[ImageArray, int]:
         )
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         alpha = pixels[:, :, 3]
-        # all zero is what writers of four bytes a pixel leave in the one that they do not use
-        if alpha.any() and int(alpha.min()) < np.iinfo(pixels.dtype).max:
+        # all zero is what writers of four bytes a pixel leave in the one that they do not use; of a
+        # TIFF the decoder may have made black what is transparent
+        is_filled = bool(alpha.any()) or image_format(data) == "TIFF"
+        if is_filled and int(alpha.min()) < np.iinfo(pixels.dtype).max:
             raise FileFormatError(
                 "the image has transparent pixels",
                 where=str(path),

@@ -120,6 +120,17 @@ def test_a_light_sheet_that_holds_most_points_is_no_face() -> None:
     assert abs(plane.plane.normal[2]) > 0.999
 
 
+def test_two_groups_far_apart_leave_the_step_of_one_or_none() -> None:
+    """With as many points in both, the median would lie between them, where there is none."""
+    points, exposure = block_stripes(HEIGHT_MM)
+    far = np.concatenate([points, points + np.array([0.0, 0.0, 2e5])])
+    found = inspect_step(cloud_of(far, np.concatenate([exposure, exposure])), HEIGHT_MM)
+    if isinstance(found, FitFailure):
+        assert "points after 1 mm at its ends are left out" in found.reason
+    else:
+        assert found.height.value_mm == pytest.approx(HEIGHT_MM, abs=1e-6)
+
+
 @pytest.mark.parametrize("n_stray", [1, 5, 20])
 def test_strays_of_another_stripe_make_no_face_of_a_light_sheet(n_stray: int) -> None:
     for seed in range(3):

@@ -98,9 +98,9 @@ class FeatureInspection(ArrayRecord):
     half_angle
         Of a cone; else None.
     direction_sigma_rad
-        Standard deviation of the direction along its worst way; NaN where not known, or none.
+        Standard deviation of the direction, as of `Fitted`; NaN where not known, or none.
     centre_sigma_mm
-        Standard deviation of a centre along its worst way; NaN for other kinds.
+        Standard deviation of a centre, as of `Fitted`; NaN for other kinds.
     seen_deg
         Angle about the axis, or about a sphere's middle direction, that the points cover; NaN for
         planes and lines.
@@ -396,19 +396,22 @@ class Fitted:
         return as_angle(self.length(value))
 
     def direction_sigma_rad(self) -> float:
-        """Standard deviation of the direction along its worst way; NaN for a sphere."""
+        """Standard deviation of the direction as of `_worst_sigma`; NaN for a sphere."""
         if self.shape.kind == "sphere":
             return math.nan
         return self._worst_sigma(self.shape.axes[:2], _along)
 
     def centre_sigma_mm(self) -> float:
-        """Standard deviation of a centre along its worst way."""
+        """Standard deviation of a centre as of `_worst_sigma`."""
         return self._worst_sigma(np.eye(3), _at)
 
     def _worst_sigma(
         self, axes: FloatArray, value: Callable[[FloatArray, tuple[Shape, ...]], float]
     ) -> float:
-        """The largest along the principal ways, as the points lie, among unit axes (K, 3)."""
+        """The largest along the principal ways of the points' own errors, among unit axes (K, 3).
+
+        What all points share, as a calibration errs, may be larger along another way.
+        """
         linear = self.linearised()
         shapes = (self.shape,)
         slopes = np.stack([_slopes(shapes, 0, partial(value, axis)) for axis in axes])

@@ -26,6 +26,7 @@ from armscan.models.calibration import (
     ScannerCalibration,
     SensorCalibration,
 )
+from armscan.reconstruction.points import seen_by_both
 from armscan.reconstruction.triangulate import (
     CALIBRATED_DEPTHS,
     StripePoints,
@@ -159,17 +160,22 @@ class BaseTransform:
 
 FIELD_GRID = 40
 """Pixels a side at which a calibration's errors are looked at, of the whole image."""
+USUAL_SIGMA_PX = 0.1
+"""Of stripes before two cameras, which are weighed by it against the sheets."""
 LEAST_MODE = 0.003
 """Part of the errors' variance that may be left out."""
+MOST_MODES = 24
+"""Of a head of many sheets; so many fit a line of a header that any reader takes."""
 
 
 def errors_of_calibration(
     scanner: ScannerCalibration, turns: FloatArray
 ) -> CalibrationErrors | None:
-    """What the calibration of a scanner with one camera may move points of a scan by.
+    """What the calibration of a scanner may move points of a scan by.
 
-    The joint covariance of camera, sheets and hand-eye is carried to points all over the sheets;
-    the largest independent errors there are kept as polynomials. None for other scanners.
+    The joint covariance of cameras, sheets and hand-eye is carried to points all over the sheets,
+    of two cameras to those that both see; the largest independent errors there are kept as
+    polynomials. None for a sensor that delivers points.
 
     Parameters
     ----------
@@ -179,7 +185,7 @@ def errors_of_calibration(
         (E, 3, 3) rotation of Sensor into Base at each exposure.
     """
     sensor = scanner.sensor
-    if sensor is None or sensor.second is not None:
+    if sensor is None:
         return None
     factor = square_root(scanner.covariance, "the scanner's covariance")
     if not factor.shape[1]:  # a calibration that is known for certain
@@ -197,7 +203,7 @@ def errors_of_calibration(
     moves = np.concatenate([move.reshape(-1, move.shape[2]) for _, move in own])
     values, vectors = np.linalg.eigh(moves.T @ moves)
     left = np.cumsum(np.maximum(values, 0.0))
-    kept = vectors[:, left > LEAST_MODE * left[-1]]
+    kept = vectors[:, left > LEAST_MODE * left[-1]][:, -MOST_MODES:]
     n_kept = kept.shape[1]
     middle, half, modes = [], [], []
     for seen, move in own:
@@ -238,9 +244,14 @@ def _moves_of_sheet(
     """Points (M, 3) of a sheet in Sensor, and their moves (M, 3, K) by columns of the factor."""
     number = np.full(len(pixels), sheet, dtype=np.int64)
     points, is_met = intersect_sheets(pixels, number, sensor)
-    points = points[is_met & CALIBRATED_DEPTHS.holds(points, number, sensor)]
-    lens, sheets = lens_numbers(sensor), sheet_numbers(sensor)
-    by_sensor = differentiated(points, np.full(len(points), sheet), lens, sheets)[1]
+    is_met &= CALIBRATED_DEPTHS.holds(points, number, sensor)
+    if sensor.second is None:
+        points = points[is_met]
+        lens, sheets = lens_numbers(sensor), sheet_numbers(sensor)
+        by_sensor = differentiated(points, number[is_met], lens, sheets)[1]
+    else:
+        seen = seen_by_both(pixels[is_met], sheet, sensor, USUAL_SIGMA_PX)
+        points, by_sensor = seen.points_mm, seen.by_sensor
     by_hand_eye = hand_eye.rotation.T @ hand_eye.jacobian(points)
     columns = np.r_[sensor_columns(sensor, sheet), np.arange(-6, 0)]
     return points, np.concatenate([by_sensor, by_hand_eye], axis=2) @ factor[columns]

@@ -21,6 +21,7 @@ from armscan.kernels.fusing import N_PARAMETERS, N_SENSOR, fuse_stripes
 from armscan.kernels.naming import mark_beside
 from armscan.models.calibration import SensorCalibration
 from armscan.models.light_sheet import BOW_TERMS, MAX_FAN, PLANE_PARAMETER_NAMES, LightSheet
+from armscan.models.two_views import TwoViews
 from armscan.reconstruction.epipolar import (
     N_DRIFT,
     Crossings,
@@ -439,6 +440,58 @@ def fuse_points(
         by_distance=by_distance,
         sheet=sheet,
     )
+
+
+def seen_by_both(
+    points_px: FloatArray, sheet: int, sensor: SensorCalibration, sigma_px: float
+) -> StripePoints:
+    """Points of a sheet as two cameras would find them, without noise, and what moves them.
+
+    Parameters
+    ----------
+    points_px
+        (N, 2) pixels of the left image, on stripes that run along the sheet's first axis; ``row``
+        names those that the right camera sees too.
+    sheet
+        Index into ``sensor.sheets``.
+    sensor
+        Two cameras and all sheets.
+    sigma_px
+        Standard deviation of the stripes, by which cameras and sheet are weighed.
+
+    Raises
+    ------
+    InputError
+        If the sensor has one camera.
+    """
+    views, along = TwoViews.of_sensor(sensor), sensor.sheets[sheet].sheet.axes[0]
+    there = project_on_sheets(points_px, np.full(len(points_px), sheet), sensor)
+    rows = np.flatnonzero(there.is_met & views.right.is_inside(there.q_px))
+    there, left_px = there.select(rows), points_px[rows]
+    ahead_mm = there.points_mm + along
+    sigma = np.full(len(rows), sigma_px)
+    left = np.column_stack([_across(views.left.project(ahead_mm) - left_px), sigma])
+    right_px = views.right.project(views.points_right_mm(ahead_mm))
+    right = np.column_stack([there.q_px, _across(right_px - there.q_px), sigma])
+    stripes = RightStripes(np.arange(len(rows)), right, (-np.inf, -np.inf), (np.inf, np.inf))
+    crossings = find_crossings(there, left[:, :2], sigma, stripes, sensor)
+    found = fuse_points(
+        there,
+        crossings,
+        left,
+        sigma[crossings.row],
+        sensor=sensor,
+        missed_px=crossings.residual_px,
+        rows=crossings.at,
+        crossing=np.arange(len(crossings.at)),
+    )
+    return replace(found, row=rows[crossings.at])
+
+
+def _across(along_px: FloatArray) -> FloatArray:
+    """(N, 2) unit vectors square to directions."""
+    turned = np.column_stack([-along_px[:, 1], along_px[:, 0]])
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
 @lru_cache(maxsize=8)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -13,10 +14,12 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.kernels.fusing import N_PARAMETERS, carry_fused
 from armscan.kernels.placing import propagate_points
-from armscan.models.calibration import SensorCalibration
+from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.models.camera import Lens
 from armscan.models.two_views import TwoViews
+from armscan.reconstruction import place
 from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
+from armscan.reconstruction.place import errors_of_calibration
 from armscan.reconstruction.points import fuse_points, triangulate_right
 from armscan.reconstruction.triangulate import (
     StripePoints,
@@ -28,8 +31,9 @@ from armscan.reconstruction.triangulate import (
     shape_mm,
     sheet_numbers,
 )
+from rigs import placing_rig
 from rigs.fisheye import fisheye_sensor
-from rigs.sheet_rig import make_profile
+from rigs.sheet_rig import PROVENANCE, make_profile
 from rigs.stereo_head import StereoHead
 
 SHEET = 5
@@ -123,6 +127,77 @@ def test_derivative_by_each_parameter_equals_differences(column: int) -> None:
     expected = (up - down) / (2.0 * step)
     size = np.abs(expected).max() + 1e-6 / step
     assert np.abs(here.by_sensor[:, :, column] - expected).max() < 2e-3 * size
+
+
+def _seen_by(
+    sensor: SensorCalibration, places: Sequence[tuple[int, FloatArray, FloatArray]]
+) -> FloatArray:
+    """(N, 3) points that a sensor fuses of left and right pixels, each on its sheet."""
+    found = []
+    for sheet, left_px, right_px in places:
+        along = head().sheets[sheet].axes[0]
+        there = project_on_sheets(left_px[None], np.array([sheet]), head().calibration())
+        views, ahead = head().views, there.points_mm + along
+        in_left = views.left.project(ahead) - left_px
+        in_right = views.right.project(views.right_from_left.apply(ahead)) - right_px
+        across = [np.array([[-d[1], d[0]]]) / np.hypot(*d) for d in (in_left[0], in_right[0])]
+        right = RightStripes.of(make_profile("right", [(right_px[None], across[1])], SIGMA_PX))
+        one, sigma = np.zeros(1, dtype=np.int64), np.full(1, SIGMA_PX)
+        there = project_on_sheets(left_px[None], np.array([sheet]), sensor)
+        beside = find_crossings(there, across[0], sigma, right, sensor, reach_px=30.0)
+        points = fuse_points(
+            there,
+            beside,
+            np.column_stack([across[0], sigma]),
+            sigma,
+            sensor=sensor,
+            missed_px=beside.residual_px,
+            rows=one,
+            crossing=one,
+        )
+        found.append(points.points_mm[0])
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("is_cut", "atol"), [(False, 0.002), (True, 0.03)])
+def test_what_two_cameras_err_is_alike_in_points_of_two_sheets(
+    monkeypatch: pytest.MonkeyPatch, *, is_cut: bool, atol: float
+) -> None:
+    """Covariances of each point and between points, of the polynomials and by differences."""
+    monkeypatch.setattr(place, "USUAL_SIGMA_PX", SIGMA_PX)
+    if not is_cut:
+        monkeypatch.setattr(place, "LEAST_MODE", 1e-9)
+        monkeypatch.setattr(place, "MOST_MODES", 1000)
+    sensor = head().calibration()
+    known = placing_rig.scanner().hand_eye
+    known = replace(known, covariance=0.01 * known.covariance, dhand_eye_dsensor=None)
+    scanner = ScannerCalibration(sensor, known, PROVENANCE)
+    places, beside = [], {2: [-5.0, 4.0], 5: [0.0, -3.0], 8: [6.0, 2.0]}
+    for sheet, place_mm in beside.items():
+        there = head().sheets[sheet]
+        left = head().views.left.project((there.origin_mm + place_mm @ there.axes[:2])[None])
+        seen = project_on_sheets(left, np.array([sheet]), sensor)
+        assert head().views.right.is_inside(seen.q_px).all()
+        places.append((sheet, left[0], seen.q_px[0]))
+    points, moves = _seen_by(sensor, places), []
+    for column, sigma in enumerate(np.sqrt(np.diag(sensor.covariance))):
+        step = np.zeros(len(sensor.covariance))
+        step[column] = 0.1 * sigma
+        up, down = (_seen_by(head().calibration(sign * step), places) for sign in (1.0, -1.0))
+        moves.append((up - down).ravel() / (0.2 * sigma))
+    by_sensor = np.stack(moves, axis=1)
+    turn = placing_rig.TOOL_FROM_SENSOR.rotation
+    by_hand_eye = (turn.T @ placing_rig.TOOL_FROM_SENSOR.jacobian(points)).reshape(9, 6)
+    expected = by_sensor @ sensor.covariance @ by_sensor.T
+    expected += by_hand_eye @ known.covariance @ by_hand_eye.T
+    errors = errors_of_calibration(scanner, np.eye(3)[None])
+    assert errors is not None
+    none = np.zeros(3, dtype=np.int64)
+    found = errors.moves_mm(points, np.zeros((3, 3)), none, np.array(list(beside)))
+    told = np.stack([move.ravel() for move in found], axis=1)
+    size = np.sqrt(np.diag(expected))
+    both = np.outer(size, size)
+    np.testing.assert_allclose(told @ told.T / both, expected / both, atol=atol)
 
 
 def test_noises_are_the_moves_by_one_sigma_of_each_stripe() -> None:

@@ -299,7 +299,7 @@ def plate_facts(checked: CheckedFit, plate: PlateSurface) -> tuple[tuple[str, st
     elif reference.covariance is None:
         facts.append(("Plane", "taken as exact: only A, B, C, D were given"))
     else:
-        facts.append(("Plane", "as probed, weighted by its uncertainty"))
+        facts.append(("Plane", "as probed, weighted by its uncertainty and the tip's"))
     if checked.plane_check:
         facts.append(("Plane, checked", checked.plane_check))
     moved = _sensor_in_words(fit)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -396,28 +397,33 @@ class Fitted:
         return as_angle(self.length(value))
 
     def direction_sigma_rad(self) -> float:
-        """Standard deviation of the direction as of `_worst_sigma`; NaN for a sphere."""
+        """Standard deviation of the direction along the worst way; NaN for a sphere."""
         if self.shape.kind == "sphere":
             return math.nan
         return self._worst_sigma(self.shape.axes[:2], _along)
 
     def centre_sigma_mm(self) -> float:
-        """Standard deviation of a centre as of `_worst_sigma`."""
+        """Standard deviation of a centre along the worst way in space."""
         return self._worst_sigma(np.eye(3), _at)
 
     def _worst_sigma(
         self, axes: FloatArray, value: Callable[[FloatArray, tuple[Shape, ...]], float]
     ) -> float:
-        """The largest along the principal ways of the points' own errors, among unit axes (K, 3).
+        """Along the worst of all ways in the span of axes (K, 3).
 
-        What all points share, as a calibration errs, may be larger along another way.
+        The variances along the axes and along their sums tell that along any way.
         """
-        linear = self.linearised()
-        shapes = (self.shape,)
-        slopes = np.stack([_slopes(shapes, 0, partial(value, axis)) for axis in axes])
-        spread = slopes @ np.linalg.solve(linear.jacobian.T @ linear.jacobian, slopes.T)
-        ways = np.linalg.eigh(spread)[1].T @ axes
-        return max(together((self,), partial(value, way)).sigma_mm for way in ways)
+        n = len(axes)
+        own = np.zeros((n, n))
+        for i, j in combinations_with_replacement(range(n), 2):
+            way = axes[i] if i == j else axes[i] + axes[j]
+            own[i, j] = own[j, i] = together((self,), partial(value, way)).sigma_mm ** 2
+        if not np.isfinite(own).all():
+            return math.nan
+        variance = np.diag(own)
+        covariance = 0.5 * (own - variance[:, None] - variance)
+        np.fill_diagonal(covariance, variance)
+        return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
 
 
 def _along(way: FloatArray, shapes: tuple[Shape, ...]) -> float:

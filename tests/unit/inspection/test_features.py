@@ -30,7 +30,7 @@ from armscan.inspection.selection import InspectionOptions
 from armscan.records.cloud import PointCloud
 from armscan.report.inspection.features import feature_report, relation_report
 from rigs.feature_clouds import BALL_MM, BORE_MM, BOSS_MM, CONE_DEG, workpiece
-from rigs.inspection_clouds import cloud_of, random_motion
+from rigs.inspection_clouds import ball_stripes, cloud_of, random_motion, seen_from
 
 OPTIONS = InspectionOptions(feature_mm=0.5)
 BORE = WantedFeature("cylinder", diameter_mm=BORE_MM)
@@ -320,3 +320,35 @@ def test_the_worst_sigma_is_that_of_any_frame(kind: ShapeKind, name: str) -> Non
         )
         sigmas.append(getattr(Fitted(shape, cloud, np.arange(600)), name)())
     assert max(sigmas) == pytest.approx(min(sigmas), rel=0.01)
+
+
+def test_the_worst_sigma_holds_what_a_calibration_errs_along_any_way() -> None:
+    """A ball that is moved as a whole, by 20 um along a diagonal of Sensor, in any frame.
+
+    Along one axis it is 12 um; its points' own errors make less than 1 um.
+    """
+    directions, shift_mm = ball_stripes(30, 40), np.full(3, 0.02 / np.sqrt(3.0))
+    for seed in range(3):
+        turn, place = random_motion(seed) if seed else (np.eye(3), np.zeros(3))
+        cloud = cloud_of(
+            (10.0 * directions) @ turn.T + place,
+            np.repeat(np.arange(30), 40),
+            sigma_mm=1e-9,
+            noise_mm=NOISE_MM,
+            noise_along=directions @ turn.T,
+        )
+        told = seen_from(
+            cloud, np.tile(place + 100.0 * turn[:, 2], (30, 1)), np.tile(turn, (30, 1, 1))
+        )
+        assert told.calibration_errors is not None
+        modes = told.calibration_errors.modes_mm.copy()
+        modes[0, 0, :, 0] = shift_mm
+        moved_mm = turn @ shift_mm
+        known = replace(
+            told,
+            covariance_mm2=told.covariance_mm2 + np.outer(moved_mm, moved_mm),
+            calibration_errors=replace(told.calibration_errors, modes_mm=modes),
+        )
+        ball = Shape(kind="sphere", point_mm=place, axes=np.eye(3), radius_mm=10.0)
+        found = Fitted(ball, known, np.arange(len(directions))).centre_sigma_mm()
+        assert found == pytest.approx(0.02, rel=0.02)

@@ -114,9 +114,11 @@ def main() -> None:
                 arm = own if kind == "arm" else without_habits(own)
                 plate, rng = probed(twin, arm, seed), np.random.default_rng([seed, 2])
                 if isinstance(plate, FitFailure):
+                    print(f"{head} {seed} {kind}: no plate: {plate.reason}")
                     continue
                 fit = calibrate_on_plate(list(posed(seen, arm, rng)), plate, OPTIONS)
                 if isinstance(fit, FitFailure):
+                    print(f"{head} {seed} {kind}: refused: {fit.reason}")
                     continue
                 found = fit.calibration
                 step = found.tool_from_sensor.step_from(twin.truth.tool_from_sensor)
@@ -124,6 +126,8 @@ def main() -> None:
                 limit = REGION * found.diagnostics.region_factor if found.diagnostics else REGION
                 kept.append((square / 6.0, square < limit, step, np.diag(found.covariance)))
         for kind, kept in results.items():
+            if not kept:
+                continue
             claims, inside, steps, variances = (np.array(own) for own in zip(*kept, strict=True))
             shift, stated = steps[:, 3:] ** 2, variances[:, 3:]
             print(

@@ -26,12 +26,9 @@ from armscan.models.calibration import (
     ScannerCalibration,
     SensorCalibration,
 )
-from armscan.reconstruction.points import seen_by_both
+from armscan.reconstruction.points import over_sheet
 from armscan.reconstruction.triangulate import (
-    CALIBRATED_DEPTHS,
     StripePoints,
-    differentiated,
-    intersect_sheets,
     lens_numbers,
     sensor_columns,
     sheet_numbers,
@@ -160,12 +157,13 @@ class BaseTransform:
 
 FIELD_GRID = 40
 """Pixels a side at which a calibration's errors are looked at, of the whole image."""
-USUAL_SIGMA_PX = 0.1
-"""Of stripes before two cameras, which are weighed by it against the sheets."""
 LEAST_MODE = 0.003
-"""Part of the errors' variance that may be left out."""
-MOST_MODES = 24
-"""Of a head of many sheets; so many fit a line of a header that any reader takes."""
+"""Part of the errors' variance that may be left out, of moves as a whole and of what bends."""
+FAR_MOVES = 10.0
+"""Over the median of what points move by."""
+MOST_MODES = 22
+"""Of a head of many sheets: three times as many numbers fit a header's line of 1024 characters,
+which some readers take at most."""
 
 
 def errors_of_calibration(
@@ -173,9 +171,10 @@ def errors_of_calibration(
 ) -> CalibrationErrors | None:
     """What the calibration of a scanner may move points of a scan by.
 
-    The joint covariance of cameras, sheets and hand-eye is carried to points all over the sheets,
-    of two cameras to those that both see; the largest independent errors there are kept as
-    polynomials. None for a sensor that delivers points.
+    The joint covariance of cameras, sheets and hand-eye is carried to points all over the sheets;
+    the largest independent errors there are kept as polynomials. Before two cameras they are those
+    of points that both see, and points that one sees are taken to err alike: of a sheet that both
+    hardly see, those of the first camera. None for a sensor that delivers points.
 
     Parameters
     ----------
@@ -200,10 +199,7 @@ def errors_of_calibration(
     own = [_moves_of_sheet(sensor, k, pixels, hand_eye, factor) for k in range(len(sensor.sheets))]
     if any(len(seen) < len(FIELD_POWERS) for seen, _ in own):
         return None
-    moves = np.concatenate([move.reshape(-1, move.shape[2]) for _, move in own])
-    values, vectors = np.linalg.eigh(moves.T @ moves)
-    left = np.cumsum(np.maximum(values, 0.0))
-    kept = vectors[:, left > LEAST_MODE * left[-1]][:, -MOST_MODES:]
+    kept = _largest_errors(*(np.concatenate(parts) for parts in zip(*own, strict=True)))
     n_kept = kept.shape[1]
     middle, half, modes = [], [], []
     for seen, move in own:
@@ -221,6 +217,31 @@ def errors_of_calibration(
         modes_mm=np.array(modes),
         arm_mm=_of_postures_mm(scanner.hand_eye, np.concatenate([seen for seen, _ in own])),
     )
+
+
+def _largest_errors(points_mm: FloatArray, moves_mm: FloatArray) -> FloatArray:
+    """(K, L) unit combinations of K errors that move points (M, 3) by (M, 3, K), the largest ones.
+
+    What shifts all points alike, as a hand-eye errs, may be many times what turns them, and that
+    many times what bends a scan; but steps know no shift, and lengths no turn. So what is left of
+    the moves without shift, and without shift and turn, counts by its part of its own sum, too.
+    Points that err by far more than most, of a sheet that is seen edge-on, have no part in it.
+    """
+    far = np.sqrt((moves_mm**2).sum(axis=(1, 2)))
+    is_usual = far <= FAR_MOVES * np.median(far)
+    points_mm, moves_mm = points_mm[is_usual], moves_mm[is_usual]
+    n, one = len(points_mm), np.eye(3)
+    turns = np.cross(one, points_mm[:, None] - points_mm.mean(axis=0)).transpose(0, 2, 1)
+    basis = np.linalg.qr(np.concatenate([np.tile(one, (n, 1, 1)), turns], axis=2).reshape(-1, 6))[0]
+    moves = moves_mm.reshape(3 * n, -1)
+    size = np.zeros((moves.shape[1],) * 2)
+    for known in (basis[:, :0], basis[:, :3], basis):
+        left_mm = moves - known @ (known.T @ moves)
+        part = left_mm.T @ left_mm
+        size += part / max(float(np.trace(part)), np.finfo(np.float64).tiny)
+    values, vectors = np.linalg.eigh(size)
+    left = np.cumsum(np.maximum(values, 0.0))
+    return np.asarray(vectors[:, left > LEAST_MODE * left[-1]][:, -MOST_MODES:])
 
 
 def _of_postures_mm(hand_eye: HandEyeCalibration, seen_mm: FloatArray) -> float:
@@ -242,16 +263,7 @@ def _moves_of_sheet(
     factor: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Points (M, 3) of a sheet in Sensor, and their moves (M, 3, K) by columns of the factor."""
-    number = np.full(len(pixels), sheet, dtype=np.int64)
-    points, is_met = intersect_sheets(pixels, number, sensor)
-    is_met &= CALIBRATED_DEPTHS.holds(points, number, sensor)
-    if sensor.second is None:
-        points = points[is_met]
-        lens, sheets = lens_numbers(sensor), sheet_numbers(sensor)
-        by_sensor = differentiated(points, number[is_met], lens, sheets)[1]
-    else:
-        seen = seen_by_both(pixels[is_met], sheet, sensor, USUAL_SIGMA_PX)
-        points, by_sensor = seen.points_mm, seen.by_sensor
+    points, by_sensor = over_sheet(pixels, sheet, sensor)
     by_hand_eye = hand_eye.rotation.T @ hand_eye.jacobian(points)
     columns = np.r_[sensor_columns(sensor, sheet), np.arange(-6, 0)]
     return points, np.concatenate([by_sensor, by_hand_eye], axis=2) @ factor[columns]

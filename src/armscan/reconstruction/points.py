@@ -35,6 +35,7 @@ from armscan.reconstruction.epipolar import (
 )
 from armscan.reconstruction.labels import LabelledInstant, LabelledProfile, PointStatus
 from armscan.reconstruction.triangulate import (
+    CALIBRATED_DEPTHS,
     N_CAMERA,
     N_SHEET,
     DepthRange,
@@ -43,6 +44,7 @@ from armscan.reconstruction.triangulate import (
     gradients,
     lens_numbers,
     meet,
+    sensor_columns,
     sensor_covariance,
     shapes_mm,
     sheet_numbers,
@@ -69,6 +71,11 @@ CONSISTENCY_SIGMAS = 5.0
 BESIDE_ROWS = 3
 """Where the right picture is larger, not every right point has a left one: this many between."""
 N_STRIPES = 2
+USUAL_SIGMA_PX = 0.1
+"""Of stripes before two cameras, where nobody asks for one: of a third or three times that, lengths
+err by 10 % less or more by the calibration."""
+LEAST_OF_BOTH = 20
+"""Points of a sheet, of a grid over the image, that both cameras see."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -442,40 +449,61 @@ def fuse_points(
     )
 
 
-def seen_by_both(
-    points_px: FloatArray, sheet: int, sensor: SensorCalibration, sigma_px: float
-) -> StripePoints:
-    """Points of a sheet as two cameras would find them, without noise, and what moves them.
+def over_sheet(
+    points_px: FloatArray, sheet: int, sensor: SensorCalibration
+) -> tuple[FloatArray, FloatArray]:
+    """Points all over a sheet, and how the sensor's errors move them, as it would be measured.
 
     Parameters
     ----------
     points_px
-        (N, 2) pixels of the left image, on stripes that run along the sheet's first axis; ``row``
-        names those that the right camera sees too.
+        (N, 2) pixels of the first image; those that do not meet the sheet in the depths of its
+        calibration are left out.
     sheet
         Index into ``sensor.sheets``.
     sensor
-        Two cameras and all sheets.
-    sigma_px
-        Standard deviation of the stripes, by which cameras and sheet are weighed.
+        One camera, or two: then those are left out that one camera sees alone, unless both hardly
+        see the sheet.
 
-    Raises
-    ------
-    InputError
-        If the sensor has one camera.
+    Returns
+    -------
+    points_mm
+        (M, 3) in Sensor.
+    by_sensor
+        (M, 3, Q) derivative by what `sensor_columns` names.
+    """
+    number = np.full(len(points_px), sheet, dtype=np.int64)
+    lens, sheets = lens_numbers(sensor), sheet_numbers(sensor)
+    points, is_met = meet(points_px, number, lens, sheets)
+    is_met &= CALIBRATED_DEPTHS.holds(points, number, sensor)
+    points = points[is_met]
+    if sensor.second is not None:
+        both = _seen_by_both(points_px[is_met], sheet, sensor)
+        if len(both) >= LEAST_OF_BOTH:
+            return both.points_mm, both.by_sensor
+    by_sensor = np.zeros((len(points), 3, len(sensor_columns(sensor, sheet))))
+    own = differentiated(points, number[is_met], lens, sheets)[1]
+    by_sensor[:, :, : own.shape[2]] = own
+    return points, by_sensor
+
+
+def _seen_by_both(points_px: FloatArray, sheet: int, sensor: SensorCalibration) -> StripePoints:
+    """Points that two cameras tell of stripes along a sheet's first axis, without noise.
+
+    ``points_px`` (N, 2) are of the left image; those that the right one misses are left out.
     """
     views, along = TwoViews.of_sensor(sensor), sensor.sheets[sheet].sheet.axes[0]
     there = project_on_sheets(points_px, np.full(len(points_px), sheet), sensor)
     rows = np.flatnonzero(there.is_met & views.right.is_inside(there.q_px))
     there, left_px = there.select(rows), points_px[rows]
     ahead_mm = there.points_mm + along
-    sigma = np.full(len(rows), sigma_px)
+    sigma = np.full(len(rows), USUAL_SIGMA_PX)
     left = np.column_stack([_across(views.left.project(ahead_mm) - left_px), sigma])
     right_px = views.right.project(views.points_right_mm(ahead_mm))
     right = np.column_stack([there.q_px, _across(right_px - there.q_px), sigma])
     stripes = RightStripes(np.arange(len(rows)), right, (-np.inf, -np.inf), (np.inf, np.inf))
     crossings = find_crossings(there, left[:, :2], sigma, stripes, sensor)
-    found = fuse_points(
+    return fuse_points(
         there,
         crossings,
         left,
@@ -485,7 +513,6 @@ def seen_by_both(
         rows=crossings.at,
         crossing=np.arange(len(crossings.at)),
     )
-    return replace(found, row=rows[crossings.at])
 
 
 def _across(along_px: FloatArray) -> FloatArray:

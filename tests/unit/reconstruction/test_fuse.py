@@ -18,6 +18,7 @@ from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.models.camera import Lens
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction import place
+from armscan.reconstruction import points as points_module
 from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
 from armscan.reconstruction.place import errors_of_calibration
 from armscan.reconstruction.points import fuse_points, triangulate_right
@@ -163,14 +164,16 @@ def _seen_by(
 def test_what_two_cameras_err_is_alike_in_points_of_two_sheets(
     monkeypatch: pytest.MonkeyPatch, *, is_cut: bool, atol: float
 ) -> None:
-    """Covariances of each point and between points, of the polynomials and by differences."""
-    monkeypatch.setattr(place, "USUAL_SIGMA_PX", SIGMA_PX)
+    """Covariances of each point, between points, and of their differences, by differences.
+
+    The hand-eye errs 20 times as much as the sensor: differences tell whether that hides it.
+    """
+    monkeypatch.setattr(points_module, "USUAL_SIGMA_PX", SIGMA_PX)
     if not is_cut:
         monkeypatch.setattr(place, "LEAST_MODE", 1e-9)
         monkeypatch.setattr(place, "MOST_MODES", 1000)
     sensor = head().calibration()
-    known = placing_rig.scanner().hand_eye
-    known = replace(known, covariance=0.01 * known.covariance, dhand_eye_dsensor=None)
+    known = replace(placing_rig.scanner().hand_eye, dhand_eye_dsensor=None)
     scanner = ScannerCalibration(sensor, known, PROVENANCE)
     places, beside = [], {2: [-5.0, 4.0], 5: [0.0, -3.0], 8: [6.0, 2.0]}
     for sheet, place_mm in beside.items():
@@ -195,9 +198,39 @@ def test_what_two_cameras_err_is_alike_in_points_of_two_sheets(
     none = np.zeros(3, dtype=np.int64)
     found = errors.moves_mm(points, np.zeros((3, 3)), none, np.array(list(beside)))
     told = np.stack([move.ravel() for move in found], axis=1)
+    assert told.shape[1] == place.MOST_MODES or not is_cut
     size = np.sqrt(np.diag(expected))
     both = np.outer(size, size)
     np.testing.assert_allclose(told @ told.T / both, expected / both, atol=atol)
+    apart = points[2] - points[0]
+    along = apart / np.linalg.norm(apart)
+    higher, length = (np.concatenate([-way, 0.0 * way, way]) for way in (np.eye(3)[2], along))
+    for difference in (higher, length):
+        sigma = np.sqrt(difference @ expected @ difference)
+        assert np.linalg.norm(difference @ told) == pytest.approx(
+            sigma, rel=0.15 if is_cut else 0.03
+        )
+
+
+@pytest.mark.parametrize(("n_columns", "n_alike"), [(3072, 11), (1700, 10), (1, 0)])
+def test_a_sheet_that_both_cameras_hardly_see_errs_as_the_first_camera_tells(
+    n_columns: int, n_alike: int
+) -> None:
+    """A right image cut off at some column: the other sheets keep what both cameras tell."""
+    sensor = head().calibration()
+    assert sensor.second is not None
+    right = replace(sensor.second.camera.camera, width_px=n_columns)
+    second = replace(sensor.second, camera=replace(sensor.second.camera, camera=right))
+    known = replace(placing_rig.scanner().hand_eye, dhand_eye_dsensor=None)
+    scanner = ScannerCalibration(replace(sensor, second=second), known, PROVENANCE)
+    errors = errors_of_calibration(scanner, np.eye(3)[None])
+    assert errors is not None
+    whole = errors_of_calibration(ScannerCalibration(sensor, known, PROVENANCE), np.eye(3)[None])
+    assert whole is not None
+    # moves along the depth, in the middle of each sheet: two cameras know it better than one
+    middle, usual = (np.linalg.norm(one.modes_mm[:, 0, 2], axis=1) for one in (errors, whole))
+    assert int((np.abs(middle / usual - 1.0) < 0.015).sum()) == n_alike
+    assert (middle > 0.98 * usual).all()
 
 
 def test_noises_are_the_moves_by_one_sigma_of_each_stripe() -> None:

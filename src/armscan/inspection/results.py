@@ -175,6 +175,8 @@ class SphereInspection(ArrayRecord):
     seen_cap_deg
         Half opening of the smallest cap about the mean direction that holds the points; 180 is
         the whole ball.
+    other
+        Another ball of that diameter among the points that were looked at; None if there is none.
     """
 
     sphere: Sphere
@@ -186,6 +188,7 @@ class SphereInspection(ArrayRecord):
     fitted: Deviations
     nominal: Deviations
     seen_cap_deg: float
+    other: Sphere | None = None
 
 
 class StepInspection(ArrayRecord):

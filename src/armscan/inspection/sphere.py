@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,6 +33,10 @@ LARGEST_MISFIT = 0.02
 points that scatter so much that the search's band is wider add twice what it is wider by."""
 
 SETTLING_ROUNDS = 3
+BESIDE = 0.9
+"""Two balls' centres are that many diameters apart, but for what both err by."""
+LEAST_OTHER = 0.1
+"""Points of another ball, over those of the one that is measured."""
 
 
 def inspect_sphere(
@@ -62,6 +67,28 @@ def inspect_sphere(
     if not 0.0 < diameter_mm < 1e4:
         raise InputError(f"a ball of {diameter_mm:g} mm diameter", remedy="give the diameter in mm")
     selection = select(cloud, region, options, size_mm=diameter_mm)
+    found = _found(selection, diameter_mm)
+    if isinstance(found, FitFailure):
+        return found
+    apart = found.sphere.distance_mm(selection.points_mm)
+    rest = replace(selection, rows=selection.rows[apart > selection.feature_mm])
+    if len(rest.rows) < MIN_POINTS:
+        return found
+    other = _found(rest, diameter_mm)
+    if isinstance(other, FitFailure) or not _is_another(other, found):
+        return found
+    return replace(found, other=other.sphere)
+
+
+def _is_another(other: SphereInspection, found: SphereInspection) -> bool:
+    """True of a ball that is as well seen, and not in the place of the first, where strays are."""
+    apart_mm = float(np.linalg.norm(other.sphere.centre_mm - found.sphere.centre_mm))
+    is_beside = apart_mm > BESIDE * found.nominal_diameter_mm
+    return is_beside and len(other.rows) > LEAST_OTHER * len(found.rows)
+
+
+def _found(selection: Selection, diameter_mm: float) -> SphereInspection | FitFailure:
+    """The ball that most points lie on."""
     points = selection.points_mm
     found = find_ball(points, diameter_mm / 2.0, selection.search_band_mm)
     if isinstance(found, FitFailure):

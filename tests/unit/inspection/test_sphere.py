@@ -14,6 +14,7 @@ from armscan.inspection.results import SphereInspection
 from armscan.inspection.selection import InspectionOptions
 from armscan.inspection.sphere import inspect_sphere
 from armscan.records.cloud import PointCloud
+from armscan.report.inspection.shapes import sphere_report
 from rigs.inspection_clouds import RADIUS_MM, ball_stripes, cloud_of, random_motion
 
 DIAMETER_MM = 2.0 * RADIUS_MM
@@ -72,7 +73,39 @@ def test_a_small_ball_is_found_above_a_large_table_on_a_post() -> None:
     found = inspected(inspect_sphere(cloud, DIAMETER_MM))
     assert found.counts.n_feature == 1200
     assert found.rows.min() == 9300
+    assert found.other is None
     assert found.diameter.value_mm == pytest.approx(DIAMETER_MM, abs=0.003)
+
+
+@pytest.mark.parametrize(("apart_mm", "every", "is_told"), [(150.0, 2, True), (150.0, 20, False)])
+def test_another_ball_of_the_same_size_is_told(
+    apart_mm: float, every: int, *, is_told: bool
+) -> None:
+    """A bar of two balls: the one with more points is measured, and where the other lies is told.
+
+    A twentieth of its points would be no ball, but strays.
+    """
+    beside = (ball(DIAMETER_MM, 0.01, 3) + np.array([apart_mm, 20.0, 0.0]))[::every]
+    cloud = cloud_of(np.concatenate([beside, ball(DIAMETER_MM, 0.01)]))
+    found = inspected(inspect_sphere(cloud, DIAMETER_MM))
+    assert found.rows.min() == len(beside)
+    assert (found.other is not None) == is_told
+    if found.other is not None:
+        off = found.other.centre_mm - CENTRE - [apart_mm, 20.0, 0.0]
+        assert np.abs(off).max() < 0.02
+    shown = sphere_report(found, cloud).warnings
+    assert any("another ball of that diameter" in text for text in shown) == is_told
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_strays_about_a_ball_are_no_other_one(seed: int) -> None:
+    """A halo of reflections, up to 6 mm off its surface, and a floor under it."""
+    rng = np.random.default_rng(seed)
+    outward = ball_stripes(20, 60)
+    halo = CENTRE + outward[::2] * (RADIUS_MM + rng.uniform(-6.0, 6.0, (600, 1)))
+    floor = CENTRE + np.column_stack([rng.uniform(-60.0, 60.0, (3000, 2)), np.full(3000, -20.0)])
+    cloud = cloud_of(np.concatenate([ball(DIAMETER_MM, 0.01, seed), halo, floor]))
+    assert inspected(inspect_sphere(cloud, DIAMETER_MM)).other is None
 
 
 def test_outliers_leave_the_fit_but_not_the_histogram() -> None:

@@ -224,6 +224,11 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
             f"the points cover a cap of only {found.seen_cap_deg:.0f} degrees half opening, where "
             "centre and diameter are poorly told apart; scan more of the ball"
         )
+    if found.other is not None:
+        warnings.append(
+            f"another ball of that diameter is centred at {triple(found.other.centre_mm)} mm; the "
+            "one with more points was measured: show which is meant with --region"
+        )
     return InspectionReport(
         title="Ball inspected",
         subtitle=point_subtitle(found.counts, cloud),

@@ -42,6 +42,8 @@ LARGEST_SCATTER_MM = 0.2
 """Of an arm at the ends of a stripe, from which a refusal is right: 0.25 mm is the software's."""
 TYPICAL_TILT = np.radians(25.0)
 """Of plates against the optical axis: by its sine a turn about a point behind shows."""
+TIP_VARIANCE = 3.0 / 20.0
+"""Of a centre found by twenty touches, along one direction, over that of a touch."""
 MOST_BEHIND_MM = 400.0
 GROUPS = {"rotation": (0, 1, 2), "translation": (3, 4, 5)}
 
@@ -349,9 +351,10 @@ def probed_places(made: Instrument) -> FloatArray:
 
 
 def probed(made: Instrument, waves: Waves, rng: np.random.Generator) -> PlateReference:
-    """The plate as touches show it."""
+    """The plate as touches show it, all of them shifted by what the tip's calibration errs."""
     places = probed_places(made)
     heights = waves.height(places) + made.references.probing_mm * rng.normal(size=len(places))
+    heights += made.references.probing_mm * np.sqrt(TIP_VARIANCE) * made.rng(31).normal()
     fitted = fit_plane(PLATE.apply(np.column_stack([places, heights])))
     assert isinstance(fitted, Estimate)
     plane = fitted.value
@@ -423,8 +426,8 @@ def hand_eye_bound(
         whole = np.zeros((len(design), len(design)))
         whole[: len(covariance), : len(covariance)] = covariance
         whole[len(covariance) :, len(covariance) :] = (
-            np.eye(len(touched)) * made.references.probing_mm**2
-        )
+            np.eye(len(touched)) + TIP_VARIANCE
+        ) * made.references.probing_mm**2
         waves = Waves.draw(made, np.random.default_rng(12345), 300, 1.0)
         shape = waves.features(np.concatenate([*places, touched]))
         covariance = whole + made.references.flatness_mm**2 * shape @ shape.T

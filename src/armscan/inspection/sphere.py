@@ -33,8 +33,12 @@ LARGEST_MISFIT = 0.02
 points that scatter so much that the search's band is wider add twice what it is wider by."""
 
 SETTLING_ROUNDS = 3
+PLACES = 4
+"""Where a ball is looked for, if the places before are none."""
 BESIDE = 0.9
 """Two balls' centres are that many diameters apart, but for what both err by."""
+AS_ROUND, EXACT_MM = 3.0, 1e-6
+"""Scatter of another ball's points, over that of the first's, and of points without any."""
 LEAST_OTHER = 0.1
 """Points of another ball, over those of the one that is measured."""
 
@@ -81,26 +85,54 @@ def inspect_sphere(
 
 
 def _is_another(other: SphereInspection, found: SphereInspection) -> bool:
-    """True of a ball that is as well seen, and not in the place of the first, where strays are."""
+    """True of a ball that is as well seen and as round as the first, and not in its place.
+
+    Strays lie about the first; a post of that diameter is round one way only.
+    """
     apart_mm = float(np.linalg.norm(other.sphere.centre_mm - found.sphere.centre_mm))
-    is_beside = apart_mm > BESIDE * found.nominal_diameter_mm
-    return is_beside and len(other.rows) > LEAST_OTHER * len(found.rows)
+    off_mm, usual_mm = (
+        float(np.sqrt(np.mean(one.fitted.deviations_mm[one.is_fitted] ** 2)))
+        for one in (other, found)
+    )
+    return (
+        apart_mm > BESIDE * found.nominal_diameter_mm
+        and len(other.rows) > LEAST_OTHER * len(found.rows)
+        and off_mm < AS_ROUND * usual_mm + EXACT_MM
+    )
 
 
 def _found(selection: Selection, diameter_mm: float) -> SphereInspection | FitFailure:
-    """The ball that most points lie on."""
-    points = selection.points_mm
-    found = find_ball(points, diameter_mm / 2.0, selection.search_band_mm)
-    if isinstance(found, FitFailure):
-        return found
-    centre, n_near = found
-    if n_near < MIN_POINTS:
-        return FitFailure(
-            f"there is no ball of {diameter_mm:g} mm: the best place for one has {n_near} of "
-            f"{len(points)} points on it, {MIN_POINTS} are needed",
-            "check the diameter, or show where the ball is with --region",
-        )
-    return _settled(selection, Sphere(centre, diameter_mm / 2.0), diameter_mm)
+    """The ball that most points lie on, of the places where points do gather on one.
+
+    A post or another ball of nearly that size may have more points in the band: places that turn
+    out to be no ball are left out in turn.
+    """
+    rest, radius_mm = selection, diameter_mm / 2.0
+    refused: list[FitFailure] = []
+    while len(refused) < PLACES and len(rest.rows) >= MIN_POINTS:
+        place = find_ball(rest.points_mm, radius_mm, rest.search_band_mm)
+        if isinstance(place, FitFailure):
+            refused.append(place)
+            break
+        ball, n_near = Sphere(place[0], radius_mm), place[1]
+        if n_near < MIN_POINTS:
+            refused.append(_no_place(n_near, len(rest.rows), diameter_mm))
+            break
+        found = _settled(rest, ball, diameter_mm)
+        if isinstance(found, SphereInspection):
+            return replace(found, counts=replace(found.counts, n_region=len(selection.rows)))
+        refused.append(found)
+        is_away = np.abs(ball.distance_mm(rest.points_mm)) > rest.feature_mm
+        rest = replace(rest, rows=rest.rows[is_away])
+    return refused[0]
+
+
+def _no_place(n_near: int, n_points: int, diameter_mm: float) -> FitFailure:
+    return FitFailure(
+        f"there is no ball of {diameter_mm:g} mm: the best place for one has {n_near} of "
+        f"{n_points} points on it, {MIN_POINTS} are needed",
+        "check the diameter, or show where the ball is with --region",
+    )
 
 
 def _settled(
@@ -175,7 +207,7 @@ def _described(
         n_region=len(selection.rows),
         n_feature=len(feature),
         n_fitted=int(is_fitted.sum()),
-        feature_rule=f"points {near}; it was found by its diameter, anywhere in the cloud",
+        feature_rule=f"points {near}; it was found by its diameter, anywhere among those given",
         fit_rule=OUTLIER_RULE,
     )
     text = f"all {len(feature)} points {near}"

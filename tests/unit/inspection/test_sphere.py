@@ -94,7 +94,7 @@ def test_another_ball_of_the_same_size_is_told(
         off = found.other.centre_mm - CENTRE - [apart_mm, 20.0, 0.0]
         assert np.abs(off).max() < 0.02
     shown = sphere_report(found, cloud).warnings
-    assert any("another ball of that diameter" in text for text in shown) == is_told
+    assert any("another ball, of 34.9" in text for text in shown) == is_told
 
 
 @pytest.mark.parametrize("seed", range(6))

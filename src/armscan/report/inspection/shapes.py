@@ -226,8 +226,9 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
         )
     if found.other is not None:
         warnings.append(
-            f"another ball of that diameter is centred at {triple(found.other.centre_mm)} mm; the "
-            "one with more points was measured: show which is meant with --region"
+            f"another ball, of {2.0 * found.other.radius_mm:.4g} mm, is centred at "
+            f"{triple(found.other.centre_mm)} mm; measured was the one on which most points lie: "
+            "show which is meant with --region"
         )
     return InspectionReport(
         title="Ball inspected",

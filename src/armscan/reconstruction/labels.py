@@ -58,7 +58,7 @@ _WORDS = {
     PointStatus.NO_RAY: "no ray meets the sheet",
     PointStatus.OUT_OF_DEPTH: "too far outside the calibrated depths",
     PointStatus.AMBIGUOUS: "on several sheets about as likely",
-    PointStatus.STRAY: "on no sheet: stray light",
+    PointStatus.STRAY: "given to no sheet: stray light, or a line that nothing names",
     PointStatus.SHARED: "in the other camera's point",
     PointStatus.INCONSISTENT: "contradicted by the other camera",
     PointStatus.NO_LASER_RAY: "beside an unbroken line: a reflection",

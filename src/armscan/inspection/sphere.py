@@ -105,7 +105,8 @@ def _found(selection: Selection, diameter_mm: float) -> SphereInspection | FitFa
     """The ball that most points lie on, of the places where points do gather on one.
 
     A post or another ball of nearly that size may have more points in the band: places that turn
-    out to be no ball are left out in turn.
+    out to be no ball are left out of the search in turn. Each is judged by all points about it:
+    what the search has left of a post may be as round as a ball.
     """
     rest, radius_mm = selection, diameter_mm / 2.0
     refused: list[FitFailure] = []
@@ -118,9 +119,9 @@ def _found(selection: Selection, diameter_mm: float) -> SphereInspection | FitFa
         if n_near < MIN_POINTS:
             refused.append(_no_place(n_near, len(rest.rows), diameter_mm))
             break
-        found = _settled(rest, ball, diameter_mm)
+        found = _settled(selection, ball, diameter_mm)
         if isinstance(found, SphereInspection):
-            return replace(found, counts=replace(found.counts, n_region=len(selection.rows)))
+            return found
         refused.append(found)
         is_away = np.abs(ball.distance_mm(rest.points_mm)) > rest.feature_mm
         rest = replace(rest, rows=rest.rows[is_away])

@@ -108,6 +108,23 @@ def test_strays_about_a_ball_are_no_other_one(seed: int) -> None:
     assert inspected(inspect_sphere(cloud, DIAMETER_MM)).other is None
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_dense_post_hides_no_ball_and_is_none(seed: int) -> None:
+    """Posts of nearly its diameter, most points on them: what is left of one is no ball either."""
+    rng = np.random.default_rng(seed)
+    posts = []
+    for k in range(2):
+        angle, height = rng.uniform(0.0, 2.0 * np.pi, 6000), rng.uniform(-18.0, 18.0, 6000)
+        radius = RADIUS_MM * rng.uniform(0.97, 1.03) + rng.normal(0.0, 0.01, 6000)
+        post = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
+        posts.append(CENTRE + post + [80.0 * (k + 1), 0.0, 0.0])
+    assert isinstance(inspect_sphere(cloud_of(np.concatenate(posts)), DIAMETER_MM), FitFailure)
+    both = cloud_of(np.concatenate([*posts, ball(DIAMETER_MM, 0.01, seed)]))
+    found = inspected(inspect_sphere(both, DIAMETER_MM))
+    assert np.abs(found.sphere.centre_mm - CENTRE).max() < 0.02
+    assert found.other is None
+
+
 def test_outliers_leave_the_fit_but_not_the_histogram() -> None:
     points = ball(DIAMETER_MM, 0.005)
     outward = (points - CENTRE) / np.linalg.norm(points - CENTRE, axis=1)[:, None]

@@ -40,14 +40,14 @@ RUN = "import sys; from armscan.cli import main; sys.exit(main())"
 STRIPES_KEPT = f"""
 from dataclasses import replace
 from pathlib import Path
-from armscan.pipeline import targets
-real, kept = targets.extract_stripes, {{}}
+from armscan.pipeline import measure
+real, kept = measure.extract_stripes, {{}}
 def again(exposure, *others):
     number = int(Path(exposure.source).stem) % {IMAGES}
     if number not in kept:
         kept[number] = real(exposure, *others)
     return replace(kept[number], source=exposure.source)
-targets.extract_stripes = again
+measure.extract_stripes = again
 """
 """Images are decoded, but stripes extracted once of each of those that repeat."""
 MB = 1024.0

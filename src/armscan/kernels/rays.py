@@ -395,3 +395,108 @@ def sheet_gradients(points: Table, sheet: Ints, sheets: Table, gradients: TableO
         height_of(points[i, 0], points[i, 1], points[i, 2], sheets[sheet[i]], surface)
         for a in range(3):
             gradients[i, a] = surface[1 + a]
+
+
+POSE = 6
+"""Unknowns of a view: rotation-vector increment (rad, Sensor frame, on the left), translation."""
+CAMERA_AND_BOW = 11
+"""Shared unknowns: the camera's nine parameters, and the board's bow along its two axes, mm."""
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def board_rows(
+    board: Floats, bow: Floats, pose: Floats, shared: Floats, is_fisheye: bool, rows: TableOut
+) -> bool:
+    """Prediction of one target point and its derivatives; False behind the camera.
+
+    ``board``: (3,) mm. ``bow``: (2,) how far the two bows lift it. ``pose``: (12,) rotation, row by
+    row, and translation. ``shared``: (11,). ``rows``: (2, 18) output, for u and v: derivatives by
+    the shared unknowns and the view's pose, and the prediction, px.
+    """
+    height = board[2] + bow[0] * shared[9] + bow[1] * shared[10]
+    tx = pose[0] * board[0] + pose[1] * board[1] + pose[2] * height
+    ty = pose[3] * board[0] + pose[4] * board[1] + pose[5] * height
+    tz = pose[6] * board[0] + pose[7] * board[1] + pose[8] * height
+    z = tz + pose[11]
+    if not z > 0.0:
+        return False
+    x, y = (tx + pose[9]) / z, (ty + pose[10]) / z
+    xx, xy, yy, radial = lens_slopes(x, y, shared, is_fisheye)
+    scale, q = radial_base(x * x + y * y, is_fisheye)
+    u, v, r2 = scale * x, scale * y, x * x + y * y
+    p1, p2 = shared[6], shared[7]
+    distorted_x = x * radial + p1 * 2.0 * x * y + p2 * (r2 + 2.0 * x * x)
+    distorted_y = y * radial + p1 * (r2 + 2.0 * y * y) + p2 * 2.0 * x * y
+    for i in range(2):
+        focal = shared[i]
+        along, across = (u, v) if i == 0 else (v, u)
+        own, other = (distorted_x, xy) if i == 0 else (distorted_y, yy)
+        by_x, by_y = focal * (xx if i == 0 else xy) / z, focal * other / z
+        by_z = -(by_x * x + by_y * y)
+        row = rows[i]
+        row[0], row[1] = (own, 0.0) if i == 0 else (0.0, own)
+        row[2], row[3] = (1.0, 0.0) if i == 0 else (0.0, 1.0)
+        row[4], row[5], row[8] = focal * along * q, focal * along * q * q, focal * along * q * q * q
+        row[6 + i] = focal * 2.0 * along * across
+        row[7 - i] = focal * (q + 2.0 * along * along)
+        by_height = by_x * pose[2] + by_y * pose[5] + by_z * pose[8]
+        row[9], row[10] = by_height * bow[0], by_height * bow[1]
+        row[11] = ty * by_z - tz * by_y
+        row[12] = tz * by_x - tx * by_z
+        row[13] = tx * by_y - ty * by_x
+        row[14], row[15], row[16] = by_x, by_y, by_z
+        row[17] = focal * own + shared[2 + i]
+    return True
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def sum_views(
+    points: Table,
+    whitening: Table,
+    board: Table,
+    bow: Table,
+    starts: Ints,
+    poses: Table,
+    shared: Floats,
+    is_fisheye: bool,
+    basis: Table,
+    weights: Floats,
+    sums: TableOut,
+) -> bool:
+    """Normal equations of target points, view by view; False if one lies behind the camera.
+
+    ``points``: (N, 2) px. ``whitening``: (N, 4) rows of the inverse of their sigmas' root.
+    ``board``, ``bow``: (N, 3), (N, 2), and ``poses``: (V, 12), as for `board_rows`. ``starts``:
+    (V + 1,) first point of each view. ``shared``: (11,). ``basis``: (11, F) directions that are
+    solved. ``weights``: (N,). ``sums``: (V, S S), S = F + 7, zeros; output: the upper halves of
+    products of the free unknowns', the pose's and the residual's columns.
+    """
+    n_free = basis.shape[1]
+    size = n_free + POSE + 1
+    raw, white = np.zeros((2, CAMERA_AND_BOW + POSE + 1)), np.zeros((2, size))
+    free = np.zeros((2, size))
+    for v in range(poses.shape[0]):
+        for n in range(starts[v], starts[v + 1]):
+            if not board_rows(board[n], bow[n], poses[v], shared, is_fisheye, raw):
+                return False
+            if weights[n] == 0.0:
+                continue
+            for i in range(2):
+                for j in range(n_free):
+                    free[i, j] = 0.0
+                for k in range(CAMERA_AND_BOW):
+                    for j in range(n_free):
+                        free[i, j] += raw[i, k] * basis[k, j]
+                for j in range(POSE):
+                    free[i, n_free + j] = raw[i, CAMERA_AND_BOW + j]
+                free[i, size - 1] = points[n, i] - raw[i, CAMERA_AND_BOW + POSE]
+            root = math.sqrt(weights[n])
+            for i in range(2):
+                by_u, by_v = root * whitening[n, 2 * i], root * whitening[n, 2 * i + 1]
+                for j in range(size):
+                    white[i, j] = by_u * free[0, j] + by_v * free[1, j]
+            for i in range(size):
+                first, second = white[0, i], white[1, i]
+                for j in range(i, size):
+                    sums[v, i * size + j] += first * white[0, j] + second * white[1, j]
+    return True

@@ -2,6 +2,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from armscan.calibration.cameras.adjustment import (
     SHARED_NAMES,
@@ -15,10 +16,12 @@ from armscan.calibration.cameras.adjustment import (
     joint_covariance,
     linearise,
     moved,
+    normal_equations,
     predict,
 )
 from armscan.calibration.cameras.result import CameraOptions
 from armscan.geometry.estimate import FitFailure
+from armscan.models.camera import Lens
 from rigs.camera_scene import CAMERA, Scene, make_views
 
 SCENE = Scene(n_views=4, bow_mm=(0.3, -0.2))
@@ -139,3 +142,38 @@ def test_impossible_states_have_no_prediction() -> None:
     assert predict(observations, behind) is None
     assert predict(observations, negative) is None
     assert isinstance(adjust(observations, behind, BASIS), FitFailure)
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_one_pass_over_the_points_sums_what_the_prediction_says(lens: Lens) -> None:
+    """The compiled pass beside NumPy's, with weights, points without a say and a fixed aspect."""
+    observations, state = problem(4)
+    observations = replace(observations, lens=lens)
+    if lens == "fisheye":
+        shared = state.shared.copy()
+        shared[6:8] = 0.0
+        state = State(shared, state.rotations, state.translations_mm)
+    rng = np.random.default_rng(5)
+    weights = rng.uniform(0.0, 2.0, len(observations.points_px))
+    weights[::7] = 0.0
+    basis = basis_of(["fx_px", "cy_px", "k1", "p2", "k3", "bow_y_mm"], is_aspect_fixed=True)
+    prediction = predict(observations, state)
+    equations = linearise(observations, state, basis, weights)
+    assert prediction is not None
+    assert equations is not None
+    predicted, by_shared, by_pose = prediction
+    twin = normal_equations(observations, predicted, by_shared @ basis, by_pose, weights)
+    for name in ("chi2", "shared", "cross", "pose", "shared_gradient", "pose_gradient"):
+        ours, theirs = np.asarray(getattr(equations, name)), np.asarray(getattr(twin, name))
+        largest = np.abs(theirs).max(axis=0)
+        assert np.all(np.abs(ours - theirs) <= 1e-9 * (largest + 1e-12)), name
+
+
+def test_a_board_behind_the_camera_has_no_equations() -> None:
+    observations, state = problem()
+    behind = state.translations_mm.copy()
+    behind[2, 2] *= -1.0
+    turned = State(state.shared, state.rotations, behind)
+    weights = np.zeros(len(observations.points_px))
+    assert linearise(observations, turned, BASIS, weights) is None
+    assert predict(observations, turned) is None

@@ -23,6 +23,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import Minimum, minimise
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, skew
+from armscan.kernels.rays import sum_views
 from armscan.models.camera import PARAMETER_NAMES, CameraModel, Lens
 from armscan.vision.targets.target import TargetView
 
@@ -230,12 +231,41 @@ def predict(
 def linearise(
     observations: Observations, state: State, basis: FloatArray, weights: FloatArray
 ) -> NormalEquations | None:
-    """Form the normal equations at ``state``; ``weights`` (N,) multiply each point's chi2."""
-    prediction = predict(observations, state)
-    if prediction is None:
+    """Form the normal equations at ``state``; ``weights`` (N,) multiply each point's chi2.
+
+    Those of `normal_equations` of what `predict` says, in one pass over the points.
+    """
+    if not np.isfinite(state.shared).all() or min(state.shared[:2]) <= 0.0:
         return None
-    predicted, by_shared, by_pose = prediction
-    return normal_equations(observations, predicted, by_shared @ basis, by_pose, weights)
+    n, f = observations.n_views, basis.shape[1]
+    size = f + 7
+    sums = np.zeros((n, size * size))
+    is_possible = sum_views(
+        observations.points_px,
+        observations.whitening.reshape(-1, 4),
+        observations.board_mm,
+        observations.board_warp_shape,
+        np.array(observations.starts),
+        np.concatenate([state.rotations.reshape(n, 9), state.translations_mm], axis=1),
+        state.shared,
+        observations.lens == "fisheye",
+        np.ascontiguousarray(basis),
+        weights,
+        sums,
+    )
+    if not is_possible:
+        return None
+    blocks = sums.reshape(n, size, size)
+    total = blocks.sum(axis=0)
+    shared, pose = np.triu(total[:f, :f]), np.triu(blocks[:, f:-1, f:-1])
+    return NormalEquations(
+        float(total[-1, -1]),
+        shared + np.triu(shared, 1).T,
+        blocks[:, :f, f:-1],
+        pose + np.triu(pose, 1).transpose(0, 2, 1),
+        total[:f, -1],
+        blocks[:, f:-1, -1],
+    )
 
 
 def normal_equations(

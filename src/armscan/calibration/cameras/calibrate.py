@@ -152,10 +152,13 @@ def repeated_views(views: Sequence[TargetView]) -> dict[int, int]:
 
 
 def _is_repeated(a: TargetView, b: TargetView) -> bool:
-    _, in_a, in_b = np.intersect1d(a.point_index, b.point_index, return_indices=True)
-    if not len(in_a):
+    if np.array_equal(a.point_index, b.point_index):
+        shift = a.points_px - b.points_px
+    else:
+        _, in_a, in_b = np.intersect1d(a.point_index, b.point_index, return_indices=True)
+        shift = a.points_px[in_a] - b.points_px[in_b]
+    if not len(shift):
         return False
-    shift = a.points_px[in_a] - b.points_px[in_b]
     rms = float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
     return rms < NEAR_PX_PER_WIDTH * a.width_px
 

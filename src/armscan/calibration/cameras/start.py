@@ -340,21 +340,28 @@ def starting_state(
     return _with_distortion(state, observations, trusted, model), trusted
 
 
+_FOCAL_VIEWS = 24
+"""So many views, evenly spread, choose a fisheye's focal length to start from."""
+
+
 def _fisheye_start(
     views: Sequence[TargetView], observations: Observations
 ) -> tuple[State, BoolArray] | FitFailure:
     """Poses before a fisheye without distortion, of the focal length at which boards fit best."""
-    best, least, size = None, np.inf, np.array([observations.width_px, observations.height_px])
+    size = np.array([observations.width_px, observations.height_px])
+    judges = views[:: -(-len(views) // _FOCAL_VIEWS)]
+    best, least = None, np.inf
     for focal in FISHEYE_FOCALS * size.max():
         shared = np.array([focal, focal, *(0.5 * (size - 1.0)), *np.zeros(7)])
         camera = observations.camera(shared[:9])
-        poses, rms = zip(*(_flat_pose(view, camera) for view in views), strict=True)
-        if (middle := float(np.median(rms))) < least:
-            trusted = np.asarray(np.array(rms) <= SUSPECT_HOMOGRAPHY * middle)
-            best, least = (State.from_poses(shared, poses), trusted), middle
+        middle = float(np.median([_flat_pose(view, camera)[1] for view in judges]))
+        if middle < least:
+            best, least = shared, middle
     if best is None:
         return FitFailure("the points do not fit a flat target before a fisheye lens")
-    return best
+    camera = observations.camera(best[:9])
+    poses, rms = zip(*(_flat_pose(view, camera) for view in views), strict=True)
+    return State.from_poses(best, poses), np.asarray(np.array(rms) <= SUSPECT_HOMOGRAPHY * least)
 
 
 def _flat_pose(view: TargetView, camera: CameraModel) -> tuple[Pose[Sensor, Board], float]:

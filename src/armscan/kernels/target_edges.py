@@ -18,30 +18,71 @@ from armscan.kernels.arrays import (
     IntsOut,
     Table,
     TableOut,
+    Three,
     Two,
     compiled,
 )
 
 NEWTON_STEPS = 8
-_AT_REST_RAD = 1e-6
+_COMMON_STEPS = 3
+"""Taken of all pixels of a rim together; the few that have not settled go on one by one."""
+_AT_REST_RAD = 1e-4
 """Newton steps double the digits, and the distance is stationary: the next one is for nothing."""
-_SMALL_RAD = 0.01
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
 def direction_angle(c: float, s: float) -> float:
     """Angle of a vector to 2e-8 rad (Abramowitz and Stegun 4.4.49), for sorting into sectors."""
     x, y = abs(c), abs(s)
-    t = min(x, y) / max(x, y, 1e-300)
+    is_steep = y > x
+    t = x / y if is_steep else y / (x if x > 1e-300 else 1e-300)
     r = t * t
     a = 0.0429096138 + r * (-0.0161657367 + r * 0.0028662257)
     a = 0.1999355085 + r * (-0.1420889944 + r * (0.1065626393 + r * (-0.0752896400 + r * a)))
     a = t * (1.0 + r * (-0.3333314528 + r * a))
-    if y > x:
-        a = 0.5 * math.pi - a
-    if c < 0.0:
-        a = math.pi - a
+    a = 0.5 * math.pi - a if is_steep else a
+    a = math.pi - a if c < 0.0 else a
     return -a if s < 0.0 else a
+
+
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def _rim_step(x: float, y: float, p: float, q: float, c: float, s: float) -> Three:
+    """A Newton step to the nearest point (p c, q s) of a rim: its c and s, and the step, rad."""
+    focal = q * q - p * p
+    slope = focal * s * c + p * x * s - q * y * c
+    bend = focal * (c * c - s * s) + p * x * c + q * y * s
+    least = 0.1 * p * p
+    step = slope / (bend if bend > least else least)
+    step = step if step > -0.3 else -0.3
+    step = step if step < 0.3 else 0.3
+    norm = 1.0 / math.sqrt(1.0 + step * step)
+    return (c + s * step) * norm, (s - c * step) * norm, abs(step)
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def _measure_rim(p: float, q: float, count: int, near: TableOut) -> None:
+    """Distance and angle of ``count`` pixels from an ellipse of half axes p and q.
+
+    ``near``: (7, M) x and y along the axes, px; output: cosine and sine of the nearest rim point's
+    parametric angle, the last step, rad; the distance, px, and the angle, rad.
+    """
+    x, y, c, s, last = near[0], near[1], near[2], near[3], near[4]
+    for k in range(count):
+        norm = 1.0 / math.sqrt(q * x[k] * q * x[k] + p * y[k] * p * y[k])
+        c[k], s[k] = q * x[k] * norm, p * y[k] * norm
+    for _ in range(_COMMON_STEPS):
+        for k in range(count):
+            c[k], s[k], last[k] = _rim_step(x[k], y[k], p, q, c[k], s[k])
+    for k in range(count):
+        for _ in range(NEWTON_STEPS - _COMMON_STEPS):
+            if last[k] < _AT_REST_RAD:
+                break
+            c[k], s[k], last[k] = _rim_step(x[k], y[k], p, q, c[k], s[k])
+    distance, angle = near[5], near[6]
+    for k in range(count):
+        outward = (x[k] - p * c[k]) * q * c[k] + (y[k] - q * s[k]) * p * s[k]
+        distance[k] = outward / math.sqrt(q * c[k] * q * c[k] + p * s[k] * p * s[k])
+        angle[k] = direction_angle(c[k], s[k])
 
 
 @compiled(error_model="numpy")
@@ -64,6 +105,7 @@ def collect_band(
     the pixels of all boxes around the bands.
     """
     count = 0
+    near = np.empty((7, 0))
     for i in range(rims.shape[0]):
         centre_u, centre_v, p, q = rims[i, 0], rims[i, 1], rims[i, 2], rims[i, 3]
         pu, pv, qu, qv = rims[i, 4], rims[i, 5], rims[i, 6], rims[i, 7]
@@ -81,7 +123,10 @@ def collect_band(
         inner_y = max(q - width[i] - 0.5, 0.1) ** -2.0
         outer_x = (p + width[i] + 0.5) ** -2.0
         outer_y = (q + width[i] + 0.5) ** -2.0
-        focal = q * q - p * p
+        n_box = max(last_u - first_u + 1, 0) * max(last_v - first_v + 1, 0)
+        if n_box > near.shape[1]:
+            near = np.empty((7, n_box))
+        n_near = 0
         for v in range(first_v, last_v + 1):
             for u in range(first_u, last_u + 1):
                 du, dv = u - centre_u, v - centre_v
@@ -91,29 +136,22 @@ def collect_band(
                     continue
                 if x * x * outer_x + y * y * outer_y > 1.0:
                     continue
-                norm = 1.0 / math.sqrt(q * x * q * x + p * y * p * y)
-                c, s = q * x * norm, p * y * norm
-                for _ in range(NEWTON_STEPS):
-                    slope = focal * s * c + p * x * s - q * y * c
-                    bend = focal * (c * c - s * s) + p * x * c + q * y * s
-                    step = min(max(slope / max(bend, 0.1 * p * p), -0.3), 0.3)
-                    square = step * step
-                    norm = 1.0 - square * (0.5 - 0.375 * square)
-                    if abs(step) > _SMALL_RAD:
-                        norm = 1.0 / math.sqrt(1.0 + square)
-                    c, s = (c + s * step) * norm, (s - c * step) * norm
-                    if abs(step) < _AT_REST_RAD:
-                        break
-                outward = (x - p * c) * q * c + (y - q * s) * p * s
-                distance = outward / math.sqrt(q * c * q * c + p * s * p * s)
-                if abs(distance) > width[i]:
-                    continue
-                place[count] = v * n_columns + u
-                ellipse[count] = i
-                found[0, count] = distance
-                found[1, count] = direction_angle(c, s)
-                found[2, count] = 1.0 + (slope_u * du + slope_v * dv)
-                count += 1
+                near[0, n_near], near[1, n_near] = x, y
+                place[count + n_near] = v * n_columns + u
+                n_near += 1
+        _measure_rim(p, q, n_near, near)
+        first = count
+        for k in range(n_near):
+            if abs(near[5, k]) > width[i]:
+                continue
+            at = place[first + k]
+            du, dv = at % n_columns - centre_u, at // n_columns - centre_v
+            place[count] = at
+            ellipse[count] = i
+            found[0, count] = near[5, k]
+            found[1, count] = near[6, k]
+            found[2, count] = 1.0 + (slope_u * du + slope_v * dv)
+            count += 1
     return count
 
 

@@ -119,6 +119,14 @@ def extents(points: FloatArray) -> FloatArray:
     return np.stack([columns.min(axis=1), columns.max(axis=1)])
 
 
+def row_lengths(rows: FloatArray) -> FloatArray:
+    """(N,) lengths of rows (N, D), as ``norm(axis=1)``, which takes six times as long of three."""
+    squares = np.zeros(len(rows))
+    for column in rows.T:
+        squares = squares + column * column
+    return np.asarray(np.sqrt(squares))
+
+
 def homogeneous(points: FloatArray) -> FloatArray:
     """Points (N, D) with a last coordinate of 1, (N, D + 1); of normalised (x, y) the rays."""
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)

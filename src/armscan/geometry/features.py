@@ -17,7 +17,14 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, floats, frozen_floats
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    FloatArray,
+    IntArray,
+    floats,
+    frozen_floats,
+    row_lengths,
+)
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.least_squares import minimise
 from armscan.geometry.rotations import rotation_from_vector
@@ -146,7 +153,7 @@ def _round(local: FloatArray, shape: Shape, dimensions: int) -> tuple[Field, ...
     """About a point (3) or an axis (2)."""
     across = local.copy()
     across[:, dimensions:] = 0.0
-    length = np.linalg.norm(across, axis=1)
+    length = row_lengths(across)
     normal = across / np.maximum(length, np.finfo(np.float64).tiny)[:, None]
     return (Field(length - shape.radius_mm, normal, -np.ones((len(local), 1))),)
 
@@ -223,8 +230,8 @@ def linearise(shape: Shape, points_mm: FloatArray, *, with_plane: bool = False) 
     fields = model.field(local, shape)
     rows = []
     for one in fields:
-        motion = np.concatenate([-one.normal, -np.cross(local, one.normal)], axis=1)
-        rows.append(np.concatenate([motion[:, model.motions], one.by_size], axis=1))
+        motion = [_by_motion(local, one.normal, k) for k in model.motions]
+        rows.append(np.column_stack([*motion, one.by_size]))
     normals = np.concatenate([one.normal for one in fields])
     return Linearised(
         np.concatenate([one.off_mm for one in fields]),
@@ -232,6 +239,14 @@ def linearise(shape: Shape, points_mm: FloatArray, *, with_plane: bool = False) 
         normals @ shape.axes,
         np.tile(np.arange(len(local)), len(fields)),
     )
+
+
+def _by_motion(local: FloatArray, normal: FloatArray, motion: int) -> FloatArray:
+    """(N,) change of distances along normals (N, 3) at points (N, 3), by one of `MOTIONS`."""
+    if motion < 3:
+        return -normal[:, motion]
+    j, k = (motion - 2) % 3, (motion - 1) % 3
+    return np.asarray(local[:, k] * normal[:, j] - local[:, j] * normal[:, k])
 
 
 def moved(shape: Shape, step: FloatArray, *, with_plane: bool = False) -> Shape:
@@ -364,6 +379,7 @@ def _settled(points: FloatArray, start: Shape) -> tuple[float, Shape] | None:
 def _polished(points: FloatArray, shape: Shape, chi2: float) -> tuple[float, Shape]:
     """Chi2 and the shape from which the next step is the shortest."""
     best, shortest, n_longer = (chi2, shape), np.inf, 0
+    hessians: list[FloatArray] = []
     for _ in range(LAST_STEPS):
         shape = centred_on(shape, points)
         found = _system(points, shape)
@@ -379,7 +395,11 @@ def _polished(points: FloatArray, shape: Shape, chi2: float) -> tuple[float, Sha
             slow, n_longer = True, n_longer + 1
             if n_longer > MOST_LONGER or size <= np.finfo(np.float64).eps:
                 break
-        shape = moved(shape, _newton(points, shape, system) if slow else step)
+        if slow:
+            if len(hessians) < MOST_HESSIANS:
+                hessians.append(_hessian(points, shape, system))
+            step = -np.linalg.lstsq(hessians[-1], system.right, rcond=1e-14)[0] * system.scale
+        shape = moved(shape, step)
     return best
 
 
@@ -390,8 +410,12 @@ NEWTON_DIFFERENCE = 1e-5
 """Part of the step that changes a residual by 1, per root of points: the Hessian's differences."""
 
 
-def _newton(points: FloatArray, shape: Shape, system: _Normal) -> FloatArray:
-    """Newton's step, the second derivatives of chi2 by differences of its gradient."""
+MOST_HESSIANS = 2
+"""So near the end the second one holds for all further steps."""
+
+
+def _hessian(points: FloatArray, shape: Shape, system: _Normal) -> FloatArray:
+    """Second derivatives of chi2, in the system's units, by differences of its gradient."""
     n, width = len(system.right), NEWTON_DIFFERENCE * float(np.sqrt(len(points)))
     hessian = np.zeros((n, n))
     for k in range(n):
@@ -399,8 +423,7 @@ def _newton(points: FloatArray, shape: Shape, system: _Normal) -> FloatArray:
         ahead, behind = linearise(moved(shape, by), points), linearise(moved(shape, -by), points)
         change = ahead.jacobian.T @ ahead.off_mm - behind.jacobian.T @ behind.off_mm
         hessian[:, k] = system.scale * change / (2.0 * width)
-    right = np.linalg.lstsq(0.5 * (hessian + hessian.T), system.right, rcond=1e-14)[0]
-    return np.asarray(-right * system.scale)
+    return 0.5 * (hessian + hessian.T)
 
 
 def centred_on(shape: Shape, points_mm: FloatArray) -> Shape:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import ArrayRecord, FloatArray, floats, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, FloatArray, floats, frozen_floats, row_lengths
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.least_squares import levenberg_marquardt, robust_sigma
 
@@ -317,13 +317,13 @@ def _solve_round(
 
 
 def _off_round(points: FloatArray, state: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(points - state[:-1], axis=1) - state[-1])
+    return np.asarray(row_lengths(points - state[:-1]) - state[-1])
 
 
 def _round_system(points: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals (N,) and their derivative (N, D + 1)."""
     towards = state[:-1] - points
-    length = np.maximum(np.linalg.norm(towards, axis=1), 1e-300)
+    length = np.maximum(row_lengths(towards), 1e-300)
     jacobian = np.column_stack([towards / length[:, None], -np.ones(len(points))])
     return length - state[-1], jacobian
 
@@ -340,7 +340,7 @@ def _taubin(points: FloatArray) -> FloatArray | None:
     if abs(curvature) < 1e-12:
         return None
     centre = middle - axes[-1, 1:] / (2.0 * curvature)
-    return np.array([*centre, float(np.linalg.norm(points - centre, axis=1).mean())])
+    return np.array([*centre, float(row_lengths(points - centre).mean())])
 
 
 def _least_median(points: FloatArray) -> FloatArray | None:

@@ -6,10 +6,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import combinations_with_replacement
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from armscan.errors import OptionError
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, bools, ints
@@ -48,7 +49,7 @@ from armscan.inspection.selection import (
     select,
 )
 from armscan.inspection.sphere import cap_deg
-from armscan.inspection.uncertainty import FitLinearised, measured_length
+from armscan.inspection.uncertainty import FitErrors, FitLinearised
 from armscan.records.cloud import PointCloud
 
 FORMS = {
@@ -376,7 +377,7 @@ def _seen_deg(shape: Shape, points: FloatArray) -> float:
     return 360.0 - math.degrees(float(gaps.max()))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Fitted:
     """A fitted shape with the rows (N,) of the cloud that it was fitted to."""
 
@@ -387,6 +388,11 @@ class Fitted:
     def linearised(self) -> Linearised:
         """The fit about its optimum, of a circle with its plane."""
         return linearise(self.shape, self.cloud.points_mm[self.rows], with_plane=True)
+
+    @cached_property
+    def errors(self) -> FitErrors:
+        """What its parameters err by, for all lengths that follow from them."""
+        return _errors_of((self,))
 
     def length(self, value: Callable[[Shape], float]) -> MeasuredLength:
         """A length that follows from the shape."""
@@ -446,25 +452,22 @@ def together(
 
     What an exposure errs moves all of them: their errors are not independent, and are not taken so.
     """
-    parts = [fit.linearised() for fit in fits]
-    width = sum(part.jacobian.shape[1] for part in parts)
-    jacobian = np.zeros((sum(len(part.off_mm) for part in parts), width))
-    slope = np.zeros(width)
-    row = column = 0
     shapes = tuple(fit.shape for fit in fits)
-    for k, part in enumerate(parts):
-        n, p = part.jacobian.shape
-        jacobian[row : row + n, column : column + p] = part.jacobian
-        slope[column : column + p] = _slopes(shapes, k, value)
-        row, column = row + n, column + p
+    slope = np.concatenate([_slopes(shapes, k, value) for k in range(len(fits))])
+    errors = fits[0].errors if len(fits) == 1 else _errors_of(fits)
+    return errors.measured(value(shapes), slope)
+
+
+def _errors_of(fits: tuple[Fitted, ...]) -> FitErrors:
+    """What the parameters of all fits err by, one fit's after the other's."""
+    parts = [fit.linearised() for fit in fits]
     linear = FitLinearised(
-        jacobian,
+        block_diag(*(part.jacobian for part in parts)),
         np.concatenate([part.directions for part in parts]),
         np.concatenate([part.off_mm for part in parts]),
-        slope,
     )
     rows = np.concatenate([fit.rows[part.point] for fit, part in zip(fits, parts, strict=True)])
-    return measured_length(value(shapes), linear, fits[0].cloud, rows)
+    return FitErrors.of(linear, fits[0].cloud, rows)
 
 
 def _slopes(

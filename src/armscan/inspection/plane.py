@@ -148,9 +148,8 @@ def _inspected(
         )
         used = feature[is_fitted]
         height = float(reference.distance_mm(plane.point_mm[None, :])[0])
-        offset = measured_length(
-            height, linearised_plane(plane, cloud.points_mm[used]), cloud, used
-        )
+        linear = linearised_plane(plane, cloud.points_mm[used])
+        offset = measured_length(height, OFFSET_OF_PLANE, linear, cloud, used)
         sine = np.linalg.norm(np.cross(plane.normal, reference.normal))
         tilt = 1000.0 * math.asin(min(1.0, float(sine)))
         is_on = np.abs(plane.distance_mm(selection.points_mm)) <= SEARCH_BAND_MM
@@ -214,14 +213,16 @@ def _facing(plane: Plane, towards: FloatArray) -> Plane:
     return Plane(plane.point_mm, plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
 
 
+OFFSET_OF_PLANE = np.array([0.0, 0.0, 1.0])
+"""Derivatives of the offset at the plane's point by the parameters of `linearised_plane`: turns
+about its axes, and that offset."""
+
+
 def linearised_plane(plane: Plane, points_mm: FloatArray) -> FitLinearised:
-    """The fit of a plane to points (N, 3) about its optimum; the length is the offset at
-    ``plane.point_mm``.
-    """
+    """The fit of a plane to points (N, 3) about its optimum."""
     local = (points_mm - plane.point_mm) @ plane.axes.T
     return FitLinearised(
         -np.column_stack([local[:, 0], local[:, 1], np.ones(len(local))]),
         np.tile(plane.normal, (len(local), 1)),
         local[:, 2],
-        np.array([0.0, 0.0, 1.0]),
     )

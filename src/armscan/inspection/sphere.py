@@ -217,7 +217,9 @@ def _described(
     return SphereInspection(
         sphere=sphere,
         nominal_diameter_mm=diameter_mm,
-        diameter=measured_length(2.0 * sphere.radius_mm, linear, cloud, feature[is_fitted]),
+        diameter=measured_length(
+            2.0 * sphere.radius_mm, DIAMETER_OF_SPHERE, linear, cloud, feature[is_fitted]
+        ),
         rows=feature,
         is_fitted=is_fitted,
         counts=counts,
@@ -238,8 +240,12 @@ def _described(
     )
 
 
+DIAMETER_OF_SPHERE = np.array([0.0, 0.0, 0.0, 2.0])
+"""Derivatives of the diameter by the parameters of `linearised_sphere`: centre and radius."""
+
+
 def linearised_sphere(sphere: Sphere, points_mm: FloatArray) -> FitLinearised:
-    """The fit of a sphere to points (N, 3) about its optimum; the length is the diameter."""
+    """The fit of a sphere to points (N, 3) about its optimum."""
     offset = points_mm - sphere.centre_mm
     distance = np.linalg.norm(offset, axis=1)
     outward = offset / distance[:, None]
@@ -247,7 +253,6 @@ def linearised_sphere(sphere: Sphere, points_mm: FloatArray) -> FitLinearised:
         np.column_stack([-outward, -np.ones(len(outward))]),
         outward,
         distance - sphere.radius_mm,
-        np.array([0.0, 0.0, 0.0, 2.0]),
     )
 
 

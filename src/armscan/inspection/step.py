@@ -483,6 +483,6 @@ def _height(
     by_parameters[-2:] = -cosine, cosine
     residuals = flat @ faces.normal - np.where(is_upper, faces.upper_mm, faces.lower_mm)
     directions = np.tile(normal, (len(flat), 1))
-    fit = FitLinearised(jacobian, directions, residuals, by_parameters)
+    fit = FitLinearised(jacobian, directions, residuals)
     rows = search.selection.rows[used]
-    return measured_length(height_mm, fit, search.selection.cloud, rows)
+    return measured_length(height_mm, by_parameters, fit, search.selection.cloud, rows)

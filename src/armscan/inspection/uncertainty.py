@@ -55,31 +55,22 @@ class FitLinearised:
         (N, 3) unit vector along which each point's error changes its residual.
     residuals_mm
         (N,) at the optimum.
-    length_by_parameters
-        (P,) derivative of the length that is asked for.
     """
 
     jacobian: FloatArray
     directions: FloatArray
     residuals_mm: FloatArray
-    length_by_parameters: FloatArray
 
 
 def measured_length(
-    value_mm: float, fit: FitLinearised, cloud: PointCloud, rows: IntArray
+    value_mm: float, slope: FloatArray, fit: FitLinearised, cloud: PointCloud, rows: IntArray
 ) -> MeasuredLength:
     """A length with both of its standard deviations.
 
-    ``rows`` (N,) are those in the cloud of the points of the fit.
+    ``slope``: (P,) its derivatives by the fit's parameters. ``rows``: (N,) those in the cloud of
+    the points of the fit.
     """
-    numbers = cloud.exposure[rows]
-    n = len(np.unique(numbers))
-    groups = [exposure_blocks(numbers, n)]
-    groups += [exposure_blocks(numbers, most) for most in COARSE_BLOCKS if n >= 2 * most]
-    scatter = [_jackknife_mm(fit, block, count) for block, count in groups]
-    known = [sigma for sigma in scatter if math.isfinite(sigma)]
-    largest = max(known, default=math.nan)
-    return MeasuredLength(value_mm, largest, _propagated_mm(fit, cloud, rows))
+    return FitErrors.of(fit, cloud, rows).measured(value_mm, slope)
 
 
 def exposure_blocks(exposure: IntArray, most: int) -> tuple[IntArray, int]:
@@ -90,53 +81,90 @@ def exposure_blocks(exposure: IntArray, most: int) -> tuple[IntArray, int]:
     return (number * blocks // n if n else number), blocks
 
 
-def influence_along(fit: FitLinearised) -> FloatArray:
-    """(N,) derivative of the length by each point's error along its direction, up to one sign."""
-    information = fit.jacobian.T @ fit.jacobian
-    return np.asarray(fit.jacobian @ np.linalg.solve(information, fit.length_by_parameters))
+def influence_along(jacobian: FloatArray, slope: FloatArray) -> FloatArray:
+    """(N,) derivative of a length by each point's error along its direction, up to one sign.
+
+    ``jacobian``: (N, P) that of the fit. ``slope``: (P,) that of the length by its parameters.
+    """
+    return np.asarray(jacobian @ np.linalg.solve(jacobian.T @ jacobian, slope))
 
 
-def _jackknife_mm(fit: FitLinearised, block: IntArray, n_blocks: int) -> float:
-    """Delete-a-block jackknife of the length, linearised about the optimum."""
+@dataclass(frozen=True, slots=True, eq=False)
+class FitErrors:
+    """What the parameters of one fit err by, for any length that follows from them.
+
+    From the scatter of exposures it is told by a delete-a-block jackknife, linearised about the
+    optimum. From the points' covariances: what exposures share of them is what the residuals tell.
+    The stripes' own noise is taken out of the covariances and counted point by point, each with the
+    correlation length that neighbours along the stripe share; a cloud that does not tell it is
+    taken as independent from point to point. What the calibration errs, alike in all exposures, is
+    carried to the length as it is, if the cloud tells it apart. The rest shifts an exposure as a
+    whole (see `_SharedErrors`).
+
+    Parameters
+    ----------
+    jacobian
+        (N, P) of the fit.
+    changes
+        (B, P) changes of the parameters without one of B blocks of exposures, for each kind of
+        block that tells.
+    errors, shared
+        Of the points and of exposures as wholes; None for a single exposure, for an error of the
+        sensor stretches it, which a shift cannot tell.
+    """
+
+    jacobian: FloatArray
+    changes: tuple[FloatArray, ...]
+    errors: _ExposureErrors | None
+    shared: _SharedErrors | None
+
+    @staticmethod
+    def of(fit: FitLinearised, cloud: PointCloud, rows: IntArray) -> FitErrors:
+        """``rows`` (N,) are those in the cloud of the points of the fit."""
+        numbers = cloud.exposure[rows]
+        n = len(np.unique(numbers))
+        groups = [exposure_blocks(numbers, n)]
+        groups += [exposure_blocks(numbers, most) for most in COARSE_BLOCKS if n >= 2 * most]
+        changes = [_jackknifed(fit, block, count) for block, count in groups]
+        errors = shared = None
+        if n >= 2 and cloud.covariance_mm2[rows].any():
+            errors = _ExposureErrors.of(fit, cloud, rows)
+            shared = _SharedErrors.of(fit, errors)
+        told = tuple(one for one in changes if one is not None)
+        return FitErrors(fit.jacobian, told, errors, shared)
+
+    def measured(self, value_mm: float, slope: FloatArray) -> MeasuredLength:
+        """A length whose derivatives by the parameters are ``slope`` (P,)."""
+        spreads = [change @ slope - (change @ slope).mean() for change in self.changes]
+        scatter = [math.sqrt((len(one) - 1) / len(one) * float(one @ one)) for one in spreads]
+        return MeasuredLength(value_mm, max(scatter, default=math.nan), self._propagated_mm(slope))
+
+    def _propagated_mm(self, slope: FloatArray) -> float:
+        if self.errors is None or self.shared is None:
+            return math.nan
+        influence = influence_along(self.jacobian, slope)
+        private = float(influence**2 @ self.errors.private_mm2)
+        by_calibration = influence @ self.errors.common_mm
+        variance = private + float(by_calibration @ by_calibration)
+        return math.sqrt(max(variance + self.shared.variance_mm2(self.errors, influence), 0.0))
+
+
+def _jackknifed(fit: FitLinearised, block: IntArray, n_blocks: int) -> FloatArray | None:
+    """(B, P) changes of the parameters without a block each; None where they do not tell."""
     if n_blocks < MIN_BLOCKS:
-        return math.nan
+        return None
     p = fit.jacobian.shape[1]
     normal = np.zeros((n_blocks, p, p))
     right = np.zeros((n_blocks, p))
     for i in range(p):
         right[:, i] = np.bincount(block, fit.jacobian[:, i] * fit.residuals_mm, n_blocks)
-        for j in range(p):
-            normal[:, i, j] = np.bincount(block, fit.jacobian[:, i] * fit.jacobian[:, j], n_blocks)
+        for j in range(i + 1):
+            sums = np.bincount(block, fit.jacobian[:, i] * fit.jacobian[:, j], n_blocks)
+            normal[:, i, j] = normal[:, j, i] = sums
     remaining = normal.sum(axis=0) - normal
     if not np.all(np.linalg.cond(remaining) < 1e12):
-        return math.nan
-    change = np.linalg.solve(remaining, right[:, :, None])[:, :, 0] @ fit.length_by_parameters
-    spread = change - change.mean()
-    return float(np.sqrt((n_blocks - 1) / n_blocks * (spread @ spread)))
-
-
-def _propagated_mm(fit: FitLinearised, cloud: PointCloud, rows: IntArray) -> float:
-    """From the points' covariances; what exposures share of them is what the residuals tell.
-
-    The stripes' own noise is taken out of the covariances and counted point by point, each with the
-    correlation length that neighbours along the stripe share; a cloud that does not tell it is
-    taken as independent from point to point. What the calibration errs, alike in all exposures, is
-    carried to the length as it is, if the cloud tells it apart. The rest shifts an exposure as a
-    whole. No cloud tells whether that is new in each exposure, in each visit (exposures that
-    follow each other without a gap), drifts from one to the next, or is one for all, and whether
-    exposures turn besides. Each of these ways and sizes counts by how likely it makes the
-    residuals' sums over exposures: the variance is the mean over them (Bayesian model averaging,
-    Hoeting et al. 1999). NaN for a single exposure: an error of the sensor stretches it, and a
-    shift cannot tell.
-    """
-    if len(np.unique(cloud.exposure[rows])) < 2 or not cloud.covariance_mm2[rows].any():
-        return math.nan
-    errors = _ExposureErrors.of(fit, cloud, rows)
-    influence = influence_along(fit)
-    private = float(influence**2 @ errors.private_mm2)
-    by_calibration = influence @ errors.common_mm
-    variance = private + float(by_calibration @ by_calibration)
-    return math.sqrt(max(variance + _shared_mm2(fit, errors, influence), 0.0))
+        return None
+    return np.asarray(np.linalg.solve(remaining, right[:, :, None])[:, :, 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,40 +257,65 @@ class _ExposureErrors:
         return [np.eye(n), same, *(np.exp(-apart / pace) for pace in PACES), np.ones((n, n))]
 
 
-def _shared_mm2(fit: FitLinearised, errors: _ExposureErrors, influence: FloatArray) -> float:
-    """Variance of the length by what exposures err as a whole."""
-    n = len(errors.number)
-    pulls = _sums(errors.exposure, n, influence[:, None] * errors.moves)
-    shifts = np.einsum("nij,nj->ni", errors.root_mm, pulls[:, :3])
-    scores = _Scores.of(fit, errors)
-    ways = errors.ways()
-    sizes = _sizes(len(ways) - 1)
-    mixed = np.column_stack([sizes, np.maximum(1.0 - sizes.sum(axis=1), 0.0)])
-    y, noise, by = scores.whitened(np.arange(6) < 3)
-    terms = np.stack([_spread(by, way) for way in ways])
-    prior = _log_prior(sizes.sum(axis=1), 1.0)
-    chance = _log_likelihood(y, noise + np.tensordot(mixed, terms, axes=1)) + prior
-    variance = _weights(chance) @ (
-        mixed @ [_spread(shifts.reshape(1, -1), way)[0, 0] for way in ways]
-    )
-    best = np.tensordot(mixed[int(np.argmax(chance))], np.stack(ways), 1)
-    return float(variance) + _turned_mm2(errors, scores, pulls[:, 3:], best)
+@dataclass(frozen=True, slots=True, eq=False)
+class _SharedErrors:
+    """How likely each way and size is in which exposures may err as wholes, by the residuals.
+
+    No cloud tells whether a shift is new in each exposure, in each visit (exposures that follow
+    each other without a gap), drifts from one to the next, or is one for all, and whether exposures
+    turn besides. Each of these ways and sizes counts by how likely it makes the residuals' sums
+    over exposures: a variance is the mean over them (Bayesian model averaging, Hoeting et al.
+    1999).
+
+    Parameters
+    ----------
+    shifts
+        (n, n) correlations of exposures' shifts, one a way, and the size of each in the mean.
+    turns
+        The same of turns, beside shifts of the likeliest ways.
+    """
+
+    shifts: tuple[tuple[float, FloatArray], ...]
+    turns: tuple[tuple[float, FloatArray], ...]
+
+    @staticmethod
+    def of(fit: FitLinearised, errors: _ExposureErrors) -> _SharedErrors:
+        scores, ways = _Scores.of(fit, errors), errors.ways()
+        sizes = _sizes(len(ways) - 1)
+        mixed = np.column_stack([sizes, np.maximum(1.0 - sizes.sum(axis=1), 0.0)])
+        y, noise, by = scores.whitened(np.arange(6) < 3)
+        terms = np.stack([_spread(by, way) for way in ways])
+        prior = _log_prior(sizes.sum(axis=1), 1.0)
+        chance = _log_likelihood(y, noise + np.tensordot(mixed, terms, axes=1)) + prior
+        best = np.tensordot(mixed[int(np.argmax(chance))], np.stack(ways), 1)
+        mean = _weights(chance) @ mixed
+        shifts = tuple(zip(mean.tolist(), ways, strict=True))
+        return _SharedErrors(shifts, _likely_turns(scores, ways[:2], best))
+
+    def variance_mm2(self, errors: _ExposureErrors, influence: FloatArray) -> float:
+        """Variance of a length that N points influence so, by what exposures err as wholes."""
+        pulls = _sums(errors.exposure, len(errors.number), influence[:, None] * errors.moves)
+        shifts = np.einsum("nij,nj->ni", errors.root_mm, pulls[:, :3]).reshape(1, -1)
+        turns = (pulls[:, 3:] * errors.usual_mm[:, None]).reshape(1, -1)
+        return sum(
+            size * float(_spread(moves, way)[0, 0])
+            for moves, ways in ((shifts, self.shifts), (turns, self.turns))
+            for size, way in ways
+        )
 
 
-def _turned_mm2(
-    errors: _ExposureErrors, scores: _Scores, pulls: FloatArray, shifts: FloatArray
-) -> float:
-    """The same by turns of exposures, beside shifts of the likeliest covariance (n, n)."""
-    turned = (pulls * errors.usual_mm[:, None]).reshape(1, -1)
+def _likely_turns(
+    scores: _Scores, ways: list[FloatArray], shifts: FloatArray
+) -> tuple[tuple[float, FloatArray], ...]:
+    """Mean size of exposures' turns, one a way, beside shifts of a covariance (n, n)."""
     y, noise, by = scores.whitened(np.ones(6, dtype=np.bool_))
     is_shift = np.arange(by.shape[1]) % 6 < 3
     base = noise + _spread(by[:, is_shift], shifts)
-    ways = errors.ways()[:2]
     spread = [_spread(by[:, ~is_shift], way) for way in ways]
     covariances = np.concatenate([base + TURN_SIZES[:, None, None] * one for one in spread])
-    variances = np.concatenate([TURN_SIZES * _spread(turned, way)[0, 0] for way in ways])
-    prior = np.tile(_log_prior(TURN_SIZES, -0.5), 2)
-    return float(_weights(_log_likelihood(y, covariances) + prior) @ variances)
+    prior = np.tile(_log_prior(TURN_SIZES, -0.5), len(ways))
+    weights = _weights(_log_likelihood(y, covariances) + prior).reshape(len(ways), -1)
+    return tuple(zip((weights @ TURN_SIZES).tolist(), ways, strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

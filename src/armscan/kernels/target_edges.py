@@ -105,7 +105,7 @@ def collect_band(
     the pixels of all boxes around the bands.
     """
     count = 0
-    near = np.empty((7, 0))
+    near = np.zeros((7, 0))
     for i in range(rims.shape[0]):
         centre_u, centre_v, p, q = rims[i, 0], rims[i, 1], rims[i, 2], rims[i, 3]
         pu, pv, qu, qv = rims[i, 4], rims[i, 5], rims[i, 6], rims[i, 7]
@@ -125,7 +125,7 @@ def collect_band(
         outer_y = (q + width[i] + 0.5) ** -2.0
         n_box = max(last_u - first_u + 1, 0) * max(last_v - first_v + 1, 0)
         if n_box > near.shape[1]:
-            near = np.empty((7, n_box))
+            near = np.zeros((7, n_box))
         n_near = 0
         for v in range(first_v, last_v + 1):
             for u in range(first_u, last_u + 1):

@@ -26,10 +26,10 @@ from armscan.inspection.conformity import (
     check_spread,
     worst,
 )
-from armscan.inspection.plane import inspect_plane, linearised_plane
+from armscan.inspection.plane import OFFSET_OF_PLANE, inspect_plane, linearised_plane
 from armscan.inspection.results import MeasuredLength, PlaneInspection, SphereInspection
 from armscan.inspection.selection import InspectionOptions
-from armscan.inspection.sphere import inspect_sphere, linearised_sphere
+from armscan.inspection.sphere import DIAMETER_OF_SPHERE, inspect_sphere, linearised_sphere
 from armscan.inspection.uncertainty import FitLinearised, influence_along
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.scan import ScanReconstruction
@@ -142,7 +142,7 @@ def verify_on_ball(
         by_standard=np.full((len(used), 1), -u_radius),
     )
     return _judged(
-        _Evidence(measured, used, fit, found.diameter, standard, region),
+        _Evidence(measured, used, fit, DIAMETER_OF_SPHERE, found.diameter, standard, region),
         found,
         ("diameter", "fitted minus nominal diameter (P_Size.Sph.All of ISO 10360-8)"),
         found.diameter.value_mm - diameter_mm,
@@ -188,6 +188,7 @@ def verify_on_plate(
             measured,
             used,
             linearised_plane(found.plane, points),
+            OFFSET_OF_PLANE,
             offset,
             standard,
             region,
@@ -211,11 +212,14 @@ class _Standard:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evidence:
-    """What the checks look at: the fit's points, the fitted length, the standard, the options."""
+    """What the checks look at: the fit and its points, the length that follows from it with its
+    derivatives ``slope`` (P,) by the fit's parameters, the standard, the region.
+    """
 
     measured: Measured
     used: IntArray
     fit: FitLinearised
+    slope: FloatArray
     length: MeasuredLength
     standard: _Standard
     region: Box | None
@@ -246,7 +250,7 @@ def _judged(
         directions = np.zeros((len(cloud), 3))
         directions[used] = fit.directions
         effect = distance_by_calibration(scan, scanner, directions)[used]
-        gradient = effect.T @ influence_along(fit)
+        gradient = effect.T @ influence_along(fit.jacobian, evidence.slope)
         sigma_mm = math.sqrt(max(0.0, float(gradient @ scanner.covariance @ gradient)))
         s = evidence.standard
         tools_mm = scan.poses.translations_mm[np.array(scan.image_rows)[exposure]]

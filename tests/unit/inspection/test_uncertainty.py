@@ -16,7 +16,7 @@ from armscan.geometry.shapes import Plane, fit_sphere
 from armscan.inspection.features import Fitted, together
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import MeasuredLength
-from armscan.inspection.sphere import inspect_sphere, linearised_sphere
+from armscan.inspection.sphere import DIAMETER_OF_SPHERE, inspect_sphere, linearised_sphere
 from armscan.inspection.step import inspect_step
 from armscan.inspection.uncertainty import measured_length
 from armscan.records.cloud import FIELD_POWERS, CalibrationErrors, PointCloud
@@ -339,7 +339,8 @@ def length_of(kind: str, cloud: PointCloud) -> MeasuredLength:
     ball = fit_sphere(cloud.points_mm)
     assert not isinstance(ball, FitFailure)
     linear = linearised_sphere(ball.value, cloud.points_mm)
-    return measured_length(2.0 * ball.value.radius_mm, linear, cloud, np.arange(len(cloud)))
+    diameter = 2.0 * ball.value.radius_mm
+    return measured_length(diameter, DIAMETER_OF_SPHERE, linear, cloud, np.arange(len(cloud)))
 
 
 @pytest.mark.parametrize("kind", ["plane", "step", "ball"])

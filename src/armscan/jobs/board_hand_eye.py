@@ -195,7 +195,7 @@ def _photographs(source: LookSource, image_options: ImageOptions) -> _Views:
     if source.poses is None:
         raise OptionError("photographs need a table of poses", remedy="give --poses")
     paths = expand_paths(source.images)
-    poses = read_robot_poses(source.poses, source.euler or EULER)
+    poses = read_robot_poses(source.poses, source.euler or EULER, paths)
     if len(poses) != len(paths):
         raise InputError(
             f"{len(paths)} photographs but {len(poses)} poses",
@@ -289,11 +289,12 @@ def _readings(looks: Sequence[BoardLook], source: LookSource, views: _Views) -> 
         return
     row_of = dict(zip(views.postures, views.rows, strict=True))
     rows = [row_of[look.posture] for look in looks]
-    for words, remedy, turns, shifts in other_table_readings(source.poses, source.euler or EULER):
+    paths, euler = expand_paths(source.images), source.euler or EULER
+    for words, remedy, turns, shifts in other_table_readings(source.poses, euler, paths):
         yield words, remedy, turns[rows], shifts[rows]
-    names = [path.as_posix() for path in expand_paths(source.images)]
-    line_of = np.argsort(sorted(range(len(names)), key=names.__getitem__))[rows]
-    poses = read_robot_poses(source.poses, source.euler or EULER)
+    plainly = sorted(range(len(paths)), key=lambda k: paths[k].as_posix())
+    line_of = np.argsort(plainly)[rows]
+    poses = read_robot_poses(source.poses, euler, [paths[k] for k in plainly])
     if not np.array_equal(line_of, rows):
         yield (
             "giving the poses to the photographs as a plain sort lists these (10 before 2)",

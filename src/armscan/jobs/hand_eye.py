@@ -511,7 +511,7 @@ def _from_profiles(source: StripeSource, artefact: Artefact) -> HandEyeInputs:
         raise OptionError("profiles need a table of poses", remedy="give --poses")
     files = [path for name in source.profiles for path in profile_files(Path(name))]
     profiles = read_profiles(files)
-    poses = read_robot_poses(source.poses, source.euler)
+    poses = read_robot_poses(source.poses, source.euler, files)
     stripes = posed_stripes_from_profiles(profiles, poses)
     plate, notes = _reference(artefact, np.array([pose.translation_mm for pose in poses]))
     seen = ObservedStripes(stripes, (), (), ())

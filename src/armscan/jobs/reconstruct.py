@@ -467,9 +467,9 @@ def _delivered(
     scanner = read_scanner_calibration(calibration)
     profiles = read_profiles(names)
     points = scan_spool(scanner)
-    poses = read_robot_poses(table.path, table.euler)
-    scan = place_profiles(profiles, poses, scanner, volume, points=points)
     files = [path for name in names for path in profile_files(Path(name))]
+    poses = read_robot_poses(table.path, table.euler, files)
+    scan = place_profiles(profiles, poses, scanner, volume, points=points)
     provenance = job.provenance(
         (*files, table.path, calibration),
         (table,),

@@ -183,3 +183,54 @@ def test_the_reference_profiles_and_poses_are_read(folder: str, table: str, coun
         *range(1, count + 1)
     ]
     assert all(len(item) > 100 and not item.points_mm[:, 1].any() for item in profiles)
+
+
+FILES = [Path("scans/1.png"), Path("scans/2.png"), Path("scans/10.png")]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "10.png 10 2 3 0 0 0|1.png 1 2 3 0 0 0|extra.png 7 7 7 0 0 0|2.png 2 2 3 0 0 0",
+        "image,x,y,z,qx,qy,qz,qw|1.png,1,2,3,0,0,0,1|10.png,10,2,3,0,0,0,1|2.png,2,2,3,0,0,0,1",
+        'filename; x; y; z; a; b; c|"a b\\1.png"; 1; 2; 3; 0; 0; 0|'
+        "q/10.png; 10; 2; 3; 0; 0; 0|2.png; 2; 2; 3; 0; 0; 0",
+        "name,x_m,y_m,z_m,a,b,c|2,.002,.002,.003,0,0,0|10,.01,.002,.003,0,0,0|1,.001,.002,.003,0,0,0",
+        "2.png 1 0 0 2 0 1 0 2 0 0 1 3|1.png 1 0 0 1 0 1 0 2 0 0 1 3|"
+        "10.png 1 0 0 10 0 1 0 2 0 0 1 3",
+    ],
+)
+def test_poses_that_name_their_files_go_to_these_whatever_the_order(
+    tmp_path: Path, text: str
+) -> None:
+    path = written(tmp_path, "p.txt", text.replace("|", "\n"))
+    poses = read_robot_poses(path, "extrinsic-xyz", FILES)
+    assert [pose.translation_mm.round(9).tolist() for pose in poses] == [
+        [1.0, 2.0, 3.0],
+        [2.0, 2.0, 3.0],
+        [10.0, 2.0, 3.0],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1.png 1 2 3 0 0 0\n2.png 1 2 3 0 0 0\n", "there is no pose of 10.png"),
+        ("pose1 1 2 3 0 0 0\npose2 1 2 3 0 0 0\n", "no pose of 1.png and 2 more files"),
+        ("1.png 1 2 3 0 0 0\na/1.png 1 2 3 0 0 0\n", "two poses of 1.png"),
+        ("1.png 1 2 3 0 0 0\n2.png\n", "p.txt, line 2"),
+        ("image,foo,bar\n1.png,1,2\n", "the header foo,bar is not understood"),
+    ],
+)
+def test_names_that_do_not_go_with_the_files_are_refused(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    with pytest.raises(FileFormatError) as caught:
+        read_robot_poses(written(tmp_path, "p.txt", text), "extrinsic-xyz", FILES)
+    assert said in str(caught.value)
+
+
+def test_poses_without_names_come_as_they_stand(tmp_path: Path) -> None:
+    path = written(tmp_path, "p.txt", "9 2 3 0 0 0\n1 2 3 0 0 0\n")
+    given = [pose.translation_mm[0] for pose in read_robot_poses(path, "extrinsic-xyz", FILES)]
+    assert given == [9.0, 1.0]

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, Final, get_args
 
 import numpy as np
@@ -172,6 +172,8 @@ HEADERS = (
 METRES = re.compile(r"^x[_ (\[]*m\b", re.IGNORECASE)
 """The first word of a header whose positions are in metres."""
 METRES_COMMENT = re.compile(rb"^[ \t]*#.*\bmet(re|er)s\b", re.IGNORECASE | re.MULTILINE)
+NAME_TITLES = {"file", "filename", "file_name", "image", "image_name", "img", "name", "photo"}
+"""What the column of files' names is called, before those of the poses."""
 OF_MATRIX = re.compile(r"^[a-z]+_?[0-4]_?[0-4]$", re.IGNORECASE)
 """Names of a matrix's numbers, which stand row by row."""
 NUMBER = re.compile(r"^[+-]?\.?\d|^[+-]?(nan|inf)", re.IGNORECASE)
@@ -190,7 +192,9 @@ BLOCK_TOLERANCE = 1e-4
 """A printed matrix of four decimals is made exact when it is this near to a rotation."""
 
 
-def read_robot_poses(path: Path, convention: EulerConvention) -> tuple[Pose[Base, Tool], ...]:
+def read_robot_poses(
+    path: Path, convention: EulerConvention, files: Sequence[Path] = ()
+) -> tuple[Pose[Base, Tool], ...]:
     """Read poses ``base_from_tool``.
 
     Text with one pose a line, separated by commas or blanks, with or without a header; ``#`` starts
@@ -201,13 +205,16 @@ def read_robot_poses(path: Path, convention: EulerConvention) -> tuple[Pose[Base
     a row; or x, y, z and a quaternion, whose order the header says. Positions are in metres under a
     header that begins with ``x_m`` or ``x [m]``, and where a comment says ``metres``.
 
+    Where a line begins with the name of a file, poses are given to ``files`` by their names, and
+    come in the order of these; other lines are left. Else they come as they stand.
+
     Raises
     ------
     FileFormatError
         If the file is missing, cut, or a pose is none of these or not finite, or positions are in
-        metres under the name of millimetres.
+        metres under the name of millimetres, or names are missing or given twice.
     """
-    table, where = _read_table(path), str(path)
+    table, where = _read_table(path, files), str(path)
     positions, rotations = table.poses(convention)
     refuse_beyond_reach(positions, where)
     if are_surely_metres(rotations, positions):
@@ -221,13 +228,13 @@ def read_robot_poses(path: Path, convention: EulerConvention) -> tuple[Pose[Base
 
 
 def other_table_readings(
-    path: Path, convention: EulerConvention
+    path: Path, convention: EulerConvention, files: Sequence[Path] = ()
 ) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
     """Other ways to read a table that `read_robot_poses` has read with a convention.
 
     What is read otherwise, what to type, and (N, 3, 3) and (N, 3) of ``base_from_tool`` then.
     """
-    table = _read_table(path)
+    table = _read_table(path, files)
     if len(table.rows[0]) != N_ANGLES:
         if not table.is_metres:
             rotations, positions = table.poses(convention)[::-1]
@@ -254,12 +261,16 @@ def other_table_readings(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PoseTable:
-    """Numbers of poses as they are written; ``places`` are their lines, for messages."""
+    """Numbers of poses as they are written; ``places`` are their lines, for messages.
+
+    ``names`` are those of files with which the lines begin; empty where they begin with numbers.
+    """
 
     header: list[str]
     rows: list[list[float]]
     places: list[str]
     is_metres: bool
+    names: list[str]
 
     def is_rad(self, convention: EulerConvention) -> bool:
         """Whether angles are in radians; rotation vectors are, unless the header says else."""
@@ -271,15 +282,39 @@ class _PoseTable:
         positions, rotations = _poses_of(self, convention)
         return (1000.0 if self.is_metres else 1.0) * positions, rotations
 
+    def of_files(self, files: Sequence[Path], where: str) -> _PoseTable:
+        """The lines that name these files, in their order; all of them where none is named."""
+        if not self.names or not files:
+            return self
+        lines = {name: k for k, name in enumerate(self.names)}
+        for k, name in enumerate(self.names):
+            if lines[name] != k:
+                raise FileFormatError(
+                    f"there are two poses of {name}", where=where, remedy="name each file once"
+                )
+        found = [
+            next((lines[n] for n in (file.name, file.stem) if n in lines), -1) for file in files
+        ]
+        missing = [file.name for file, line in zip(files, found, strict=True) if line < 0]
+        if missing:
+            raise FileFormatError(
+                f"there is no pose of {missing[0]}"
+                + (f" and {len(missing) - 1} more files" if len(missing) > 1 else ""),
+                where=where,
+                remedy="name each file in the table as it is called, or leave the names out and "
+                "give one pose a file, in the files' order",
+            )
+        rows, places = [self.rows[k] for k in found], [self.places[k] for k in found]
+        return _PoseTable(self.header, rows, places, self.is_metres, self.names)
 
-def _read_table(path: Path) -> _PoseTable:
+
+def _read_table(path: Path, files: Sequence[Path]) -> _PoseTable:
     data, where = read_bytes(path), str(path)
     is_json = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
-    header, rows, places = _from_json(data, where) if is_json else _from_text(data, where)
-    if not rows:
+    table = _from_json(data, where) if is_json else _from_text(data, where)
+    if not table.rows:
         raise FileFormatError("the file holds no pose", where=where, remedy=HOW_TO_WRITE)
-    is_metres = bool(header and METRES.match(header[0])) or bool(METRES_COMMENT.search(data))
-    return _PoseTable(header, rows, places, is_metres)
+    return table.of_files(files, where)
 
 
 def _poses_of(given: _PoseTable, convention: EulerConvention) -> tuple[FloatArray, FloatArray]:
@@ -320,7 +355,7 @@ def _poses_of(given: _PoseTable, convention: EulerConvention) -> tuple[FloatArra
     return matrices[:, :, 3], _from_matrices(turns, places)
 
 
-def _from_json(data: bytes, where: str) -> tuple[list[str], list[list[float]], list[str]]:
+def _from_json(data: bytes, where: str) -> _PoseTable:
     text = data.decode("utf-8-sig", errors="replace").lstrip()
     if text.startswith("["):
         data = f'{{"{JSON_KEY}": {text}}}'.encode()
@@ -331,7 +366,7 @@ def _from_json(data: bytes, where: str) -> tuple[list[str], list[list[float]], l
         )
     places = [f"{where}, pose {k}" for k in range(1, len(rows) + 1)]
     flat = [_numbers(_flat(row), place) for row, place in zip(rows, places, strict=True)]
-    return [], flat, places
+    return _PoseTable([], flat, places, bool(METRES_COMMENT.search(data)), [])
 
 
 def _flat(row: Any) -> list[Any]:
@@ -341,7 +376,7 @@ def _flat(row: Any) -> list[Any]:
     return [value for item in row for value in (item if isinstance(item, list) else [item])]
 
 
-def _from_text(data: bytes, where: str) -> tuple[list[str], list[list[float]], list[str]]:
+def _from_text(data: bytes, where: str) -> _PoseTable:
     try:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -351,25 +386,62 @@ def _from_text(data: bytes, where: str) -> tuple[list[str], list[list[float]], l
     header: list[str] = []
     rows: list[list[float]] = []
     places: list[str] = []
+    names: list[str] = []
+    is_named = False
     for number, whole in enumerate(lines, start=1):
-        line = whole.split("#")[0].replace('"', "").strip().rstrip(",;")
-        words = [word for word in re.split(r"[\s,;\[\]]+", line) if word]
+        line, place = whole.split("#")[0].replace('"', "").strip(), f"{where}, line {number}"
+        words = _words(line)
         if not words:
             continue
-        if _has_decimal_commas(line):
+        if not rows and not header and not any(map(NUMBER.match, words)):
+            is_named = words[0].lower() in NAME_TITLES
+            line = _after_first(line) if is_named else line
+            header = _header(line.rstrip(",;"), _words(line), place)
+            continue
+        if is_named or not (rows or _is_number(words[0])):
+            is_named = True
+            names.append(_file_of(line))
+            line = _after_first(line)
+        if _has_decimal_commas(line.rstrip(",;")):
             raise FileFormatError(
                 "the numbers have commas as decimal signs",
-                where=f"{where}, line {number}",
+                where=place,
                 remedy="write them with decimal points, as 12.5",
             )
-        if not rows and not header and not any(map(NUMBER.match, words)):
-            header = _header(line, words, f"{where}, line {number}")
-            continue
-        places.append(f"{where}, line {number}")
-        rows.append(_numbers(words, places[-1]))
-    if rows and all(len(row) == 4 for row in rows):
-        return header, *_joined(rows, places)
-    return header, rows, places
+        places.append(place)
+        rows.append(_numbers(_words(line), place))
+    if rows and not names and all(len(row) == 4 for row in rows):
+        rows, places = _joined(rows, places)
+    is_metres = bool(header and METRES.match(header[0])) or bool(METRES_COMMENT.search(data))
+    return _PoseTable(header, rows, places, is_metres, names)
+
+
+def _words(line: str) -> list[str]:
+    return [word for word in re.split(r"[\s,;\[\]]+", line) if word]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+_FIRST = re.compile(r"([^,;]*[^,;\s])\s*[,;]\s*|(\S+)\s+")
+"""A name with which a line begins: to its first comma or semicolon, else to its first blank."""
+
+
+def _file_of(line: str) -> str:
+    """Last part of the file's name with which a line begins."""
+    first = _FIRST.match(line)
+    name = (first[1] or first[2]) if first else line
+    return PureWindowsPath(name.strip()).name
+
+
+def _after_first(line: str) -> str:
+    first = _FIRST.match(line)
+    return line[first.end() :] if first else ""
 
 
 def _has_decimal_commas(line: str) -> bool:

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from armscan.errors import FileFormatError
 from armscan.geometry.rotations import EulerConvention
+from armscan.records.recording import PoseForm
 from armscan.storage.points import read_profiles
-from armscan.storage.recordings.robot_poses import read_robot_poses
+from armscan.storage.recordings.robot_poses import read_robot_poses, rotations_of_form
 from rigs.photographs import DATA, needs
 
 YAML = "%YAML:1.0\n---\nscan_line: [ 1.5e+00, 0., .Nan, 2.,\n    0., -3.5, 4., 0., -6. ]\n"
@@ -234,3 +235,24 @@ def test_poses_without_names_come_as_they_stand(tmp_path: Path) -> None:
     path = written(tmp_path, "p.txt", "9 2 3 0 0 0\n1 2 3 0 0 0\n")
     given = [pose.translation_mm[0] for pose in read_robot_poses(path, "extrinsic-xyz", FILES)]
     assert given == [9.0, 1.0]
+
+
+@pytest.mark.parametrize("decimals", [4, 5, 6])
+@pytest.mark.parametrize("form", ["quaternion", "matrix"])
+def test_rotations_that_are_written_with_few_decimals_are_read(
+    form: PoseForm, decimals: int
+) -> None:
+    """As rounding leaves them; one wrong digit is still found."""
+    true = Rotation.random(300, np.random.default_rng(decimals))
+    exact = np.roll(true.as_quat(), 1, axis=1)
+    if form == "matrix":
+        exact = true.as_matrix().reshape(-1, 9)
+    rounded, places = exact.round(decimals), [str(k) for k in range(300)]
+    found = Rotation.from_matrix(rotations_of_form(rounded, form, "extrinsic-xyz", places))
+    assert (found * true.inv()).magnitude().max() < 2.0 * 10.0**-decimals
+    changed = rounded.copy()
+    largest = int(np.argmax(np.abs(changed[7])))
+    changed[7, largest] -= 6.0 * 10.0**-decimals * np.sign(changed[7, largest])
+    if 6.0 * 10.0**-decimals > 5e-5:
+        with pytest.raises(FileFormatError):
+            rotations_of_form(changed, form, "extrinsic-xyz", places)

@@ -40,6 +40,16 @@ ORTHONORMAL_TOLERANCE = 1e-5
 """Six decimals of nine numbers leave up to about 3e-6, more than a `Pose` allows; what passes is
 made exact before it becomes one."""
 FULL_TURNS_DEG = 720.0
+FEWEST_DECIMALS = 4
+"""With which rotations are read as they are rounded: their last digit is 0.1 mrad."""
+
+
+def _last_digit(numbers: FloatArray) -> float:
+    """1e-4 or less: the size of the last decimal that any of the numbers has."""
+    for decimals in range(FEWEST_DECIMALS, 9):
+        if np.array_equal(np.round(numbers, decimals), numbers):
+            return float(10.0**-decimals)
+    return 0.0
 
 
 def rotations_of_form(
@@ -48,7 +58,8 @@ def rotations_of_form(
     """Rotations (N, 3, 3) of numbers (N, C) in the order of `FORM_COLUMNS`.
 
     A quaternion is w, x, y, z (Hamilton, active), of either sign and norm 1 within 1e-6; a matrix
-    is row by row and orthonormal within 1e-5, and the nearest rotation is taken.
+    is row by row and orthonormal within 1e-5, and the nearest rotation is taken; where all numbers
+    are rounded to less, to four decimals at least, within what rounding does.
 
     Numbers are finite; ``places`` (N,) name file and line of each, for messages.
     """
@@ -88,11 +99,13 @@ def _from_quaternions(numbers: FloatArray, places: Sequence[str]) -> FloatArray:
     if not len(numbers):
         return np.zeros((0, 3, 3))
     norms = np.linalg.norm(numbers, axis=1)
-    wrong = np.abs(norms - 1.0) > NORM_TOLERANCE
+    # half a digit of each, times at most the sum of all four: 2
+    tolerance = max(NORM_TOLERANCE, 1.01 * _last_digit(numbers))
+    wrong = np.abs(norms - 1.0) > tolerance
     if wrong.any():
         row = int(np.argmax(wrong))
         raise FileFormatError(
-            f"the quaternion's norm is {norms[row]:.8g}, not 1 within {NORM_TOLERANCE:g}",
+            f"the quaternion's norm is {norms[row]:.8g}, not 1 within {tolerance:.0e}",
             where=places[row],
             remedy="write qw,qx,qy,qz with seven decimals or more, each in its own column",
         )
@@ -102,7 +115,9 @@ def _from_quaternions(numbers: FloatArray, places: Sequence[str]) -> FloatArray:
 def _from_matrices(matrices: FloatArray, places: Sequence[str]) -> FloatArray:
     defect = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
     is_mirrored = np.linalg.det(matrices) < 0.0
-    wrong = (defect > ORTHONORMAL_TOLERANCE) | is_mirrored
+    # of two rows, half a digit of each number, times at most the sum of three: 1.8
+    tolerance = max(ORTHONORMAL_TOLERANCE, 1.8 * _last_digit(matrices))
+    wrong = (defect > tolerance) | is_mirrored
     if wrong.any():
         row = int(np.argmax(wrong))
         fact = (

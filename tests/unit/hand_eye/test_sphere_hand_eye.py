@@ -9,14 +9,25 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
-from armscan.calibration.hand_eye.observations import HandEyeOptions, condense_sphere, find_sections
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    PosedStripe,
+    condense_sphere,
+    find_sections,
+)
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.surface import HandEyeState, SphereSurface, place
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import (
+    EulerConvention,
+    euler_from_rotations,
+    rotation_from_vector,
+    rotations_from_euler,
+    vector_from_rotation,
+)
 from rigs.sphere_rig import (
     CENTRE_MM,
     DIAMETER_MM,
@@ -348,16 +359,67 @@ def test_a_constant_stand_off_leaves_two_hand_eyes() -> None:
     assert "vary the stand-off" in failure.remedy
 
 
-def test_postures_in_the_wrong_order_are_refused() -> None:
+def reposed(stripes: list[PosedStripe], poses: list[Pose[Base, Tool]]) -> list[PosedStripe]:
+    return [
+        replace(stripe, base_from_tool=pose) for stripe, pose in zip(stripes, poses, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_postures_in_a_wrong_order_are_refused_and_no_reading_is_blamed(seed: int) -> None:
+    rig, rng = SphereRig(), np.random.default_rng(SEED + seed)
+    stripes = rig.stripes(turned_poses(rig, 10), rng)
+    poses = [stripes[k].base_from_tool for k in rng.permutation(10)]
+    failure = calibrate_on_sphere(reposed(stripes, poses), DIAMETER_MM, QUICK)
+    assert isinstance(failure, FitFailure)
+    assert "would leave" not in failure.reason
+    assert "convention of the arm's angles" in failure.remedy
+
+
+def test_poses_of_the_next_exposure_are_named() -> None:
     rig = SphereRig()
     stripes = rig.stripes(turned_poses(rig, 10), np.random.default_rng(SEED))
-    mixed = [
-        replace(stripe, base_from_tool=other.base_from_tool)
-        for stripe, other in zip(stripes, stripes[1:] + stripes[:1], strict=True)
-    ]
-    failure = calibrate_on_sphere(mixed, DIAMETER_MM, QUICK)
+    poses = [stripe.base_from_tool for stripe in stripes]
+    failure = calibrate_on_sphere(reposed(stripes, poses[1:] + poses[:1]), DIAMETER_MM, QUICK)
     assert isinstance(failure, FitFailure)
-    assert "convention of the arm's angles" in failure.remedy
+    assert "giving each exposure the pose of the one before it would leave 0.0" in failure.reason
+    assert "no pose is missing" in failure.remedy
+
+
+@pytest.mark.parametrize(
+    ("true", "read", "words", "advice"),
+    [
+        (
+            "intrinsic-zxz",
+            "extrinsic-xyz",
+            "were read as extrinsic-xyz, reading them as intrinsic-zxz would leave 0.0",
+            'rotation = "intrinsic-zxz"',
+        ),
+        (
+            "extrinsic-xyz",
+            "intrinsic-zxz",
+            "were read as intrinsic-zxz, reading them as extrinsic-xyz would leave 0.0",
+            'rotation = "extrinsic-xyz"',
+        ),
+        ("extrinsic-xyz", "intrinsic-zyx", "angles in the other order", "if intrinsic-zyx was"),
+        ("intrinsic-zyx", "extrinsic-xyz", "angles in the other order", "convention intrinsic-zyx"),
+    ],
+)
+def test_a_misread_convention_is_named(
+    true: EulerConvention, read: EulerConvention, words: str, advice: str
+) -> None:
+    """Angles of the middle turn have both signs: of intrinsic-zxz one is written in two ways."""
+    rig = SphereRig()
+    stripes = rig.stripes(turned_poses(rig, 10), np.random.default_rng(SEED))
+    angles = euler_from_rotations(np.array([s.base_from_tool.rotation for s in stripes]), true)
+    poses = [
+        Pose[Base, Tool](turn, stripe.base_from_tool.translation_mm)
+        for turn, stripe in zip(rotations_from_euler(angles, read), stripes, strict=True)
+    ]
+    failure = calibrate_on_sphere(reposed(stripes, poses), DIAMETER_MM, QUICK)
+    assert isinstance(failure, FitFailure)
+    assert words in failure.reason
+    assert advice in failure.remedy
 
 
 def test_bad_input() -> None:

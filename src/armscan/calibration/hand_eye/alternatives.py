@@ -551,14 +551,18 @@ def other_readings(
     for read in names if convention is None else (convention,):
         angles = euler_from_rotations(rotations, read)
         for meant in names:
-            if meant != read:
-                words = f"if the angles were read as {read}, reading them as {meant}"
-                remedy = (
-                    f"give the rotation convention {meant}: of a recording in session.toml, "
-                    f'[pose] rotation = "{meant}"; of robot poses with --euler'
-                )
-                for branch in (angles, _other_branch(angles, read)):
-                    yield words, remedy, rotations_from_euler(branch, meant), translations
+            if meant == read:
+                continue
+            words = f"if the angles were read as {read}, reading them as {meant}"
+            remedy = (
+                f"give the rotation convention {meant}: of a recording in session.toml, "
+                f'[pose] rotation = "{meant}"; of robot poses with --euler'
+            )
+            if convention is None and {read, meant} == REVERSED:
+                words = f"taking the angles in the other order ({read} for {meant}, or vice versa)"
+                remedy += f"; or {read}, if {meant} was given"
+            for branch in _branches(angles, read):
+                yield words, remedy, rotations_from_euler(branch, meant), translations
     yield from _as_radians(rotations, translations, convention)
     quaternions = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
     for shift, order, was in ((1, "qx,qy,qz,qw", "qw first"), (-1, "qw,qx,qy,qz", "qw last")):
@@ -611,6 +615,27 @@ def _as_radians(
                 rotations_from_euler(angles, meant),
                 translations,
             )
+
+
+REVERSED: set[EulerConvention] = {"extrinsic-xyz", "intrinsic-zyx"}
+"""The same three turns, in reversed order: which of them was read makes no difference."""
+
+
+def _branches(angles_rad: FloatArray, convention: EulerConvention) -> Iterator[FloatArray]:
+    """Ways to write the same rotations as angles (N, 3): one way, the other, and of both what is
+    nearest to the first one's.
+    """
+    other = _other_branch(angles_rad, convention)
+    yield angles_rad
+    yield other
+    for first in (angles_rad[0], other[0]):
+        far = [
+            np.abs(np.remainder(one - first + np.pi, 2.0 * np.pi) - np.pi).sum(axis=1)
+            for one in (angles_rad, other)
+        ]
+        is_near = far[0] <= far[1]
+        if is_near.any() and not is_near.all():
+            yield np.where(is_near[:, None], angles_rad, other)
 
 
 def _other_branch(angles_rad: FloatArray, convention: EulerConvention) -> FloatArray:

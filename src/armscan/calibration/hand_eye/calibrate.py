@@ -8,7 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.calibration.hand_eye.alternatives import find_free_plane, find_mirror
+from armscan.calibration.hand_eye.alternatives import (
+    BETTER,
+    find_free_plane,
+    find_mirror,
+    other_readings,
+)
 from armscan.calibration.hand_eye.checks import (
     LIKELIER,
     MOST_OPEN_MM,
@@ -341,7 +346,9 @@ def _search(
             found = minimise_distances(few, state, np.eye(n))
             kept.append(state if found is None else found.state)
     refused = _refuse_far(few, kept[0])
-    if refused is None:
+    if refused is not None:
+        refused = _misread(few, sections, refused, _typical_mm(few, kept[0]))
+    else:
         refused = _refuse_open(few, conditioning_at(few, kept[0]), 2.0 * radius_mm)
     return tuple(kept) if refused is None else refused
 
@@ -393,6 +400,27 @@ def _refuse_far(problem: Problem, state: HandEyeState) -> FitFailure | None:
         "check the convention of the arm's angles, the order of poses and profiles, the "
         "sphere's diameter, and that the sphere did not move",
     )
+
+
+def _misread(
+    few: Problem, sections: Sequence[CircleSection], refused: FitFailure, typical_mm: float
+) -> FitFailure:
+    """The refusal, with another way to read the poses that would do if there is one."""
+    given = [section.stripe.base_from_tool for section in sections]
+    rotations = np.array([pose.rotation for pose in given])
+    translations = np.array([pose.translation_mm for pose in given])
+    radius_mm = float(few.surface.start[3])
+    for words, remedy, turns, shifts in other_readings(rotations, translations):
+        read = [
+            replace(one, stripe=replace(one.stripe, base_from_tool=Pose(turn, shift)))
+            for one, turn, shift in zip(sections, turns, shifts, strict=True)
+        ]
+        problem = replace(few, observations=condense_sphere(read, START_PIECES))
+        found = [(_typical_mm(problem, each), each) for each in minima_on_sphere(read, radius_mm)]
+        left_mm, state = min(found, key=lambda one: one[0])
+        if left_mm < BETTER * typical_mm and left_mm <= problem.far_mm(problem.place(state)):
+            return FitFailure(f"{refused.reason}; {words} would leave {left_mm:.3f} mm", remedy)
+    return refused
 
 
 def _typical_mm(problem: Problem, state: HandEyeState) -> float:

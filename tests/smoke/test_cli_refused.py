@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import pytest
 
 from armscan.calibration.cameras import result
@@ -116,6 +117,29 @@ def test_a_forced_camera_marks_all_that_rests_on_it(
 def test_documents_that_were_not_refused_bear_no_mark(calibrated: Bench) -> None:
     assert "forced" not in calibrated.camera.read_text()
     assert "(forced)" not in page_of(calibrated.camera.with_suffix(".html"))
+
+
+def test_images_of_another_size_may_be_left_out(
+    calibrated: Bench, fails: Fails, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A telephone's upright photographs among the others: all are named, and leaving them out
+    is enough.
+    """
+    folder = tmp_path / "photographs"
+    shutil.copytree(calibrated.folder / "camera", folder)
+    for name in ("view1.png", "view3.png"):
+        turned = cv2.rotate(cv2.imread(str(folder / name)), cv2.ROTATE_90_CLOCKWISE)
+        cv2.imwrite(str(folder / name), turned)
+    words = ["calibrate", "camera", str(folder), "--target", TARGET]
+    words += ["-o", str(tmp_path / "c.json"), "--json"]
+    said = fails(*words, writes=tmp_path)
+    assert "view1.png" in said
+    assert "view3.png" in said
+    assert "view1.png" not in fails(*words, "--leave-out", "view1.png", writes=tmp_path)
+    assert main([*words, "--leave-out", "view[13].png"]) == 0
+    views = json.loads(capsys.readouterr().out)["views"]
+    assert not {"view1.png", "view3.png"} & {view["source"] for view in views}
+    assert len(views) > 3
 
 
 def test_images_are_left_out_by_pattern(

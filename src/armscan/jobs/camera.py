@@ -34,7 +34,7 @@ from armscan.storage.documents import (
     recorded_options,
 )
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
-from armscan.storage.images import ImageOptions, check_same_size, read_exposures
+from armscan.storage.images import ImageOptions, of_one_size, read_exposures
 from armscan.storage.observations import pack_observations, read_observations
 from armscan.storage.recording import read_recording, recording_tables
 from armscan.thesis.ellipse import with_printed_centres
@@ -86,11 +86,13 @@ def calibrate_camera(
         )
     places = job.places(".json", beside=(".npz", ".html"))
     read = _camera_images(images, scan, image_options)
-    check_same_size(read.exposures)
     sources = [exposure.source for exposure in read.exposures]
     options = replace(options, leave_out=named_by(options.leave_out, sources))
-    plate = settle_target(read.exposures, plate)
-    found = find_targets(read.exposures, plate, cache=job.cache, progress=job.progress)
+    exposures = of_one_size(read.exposures, options.leave_out)
+    seen = {exposure.source for exposure in exposures}
+    options = replace(options, leave_out=tuple(one for one in options.leave_out if one in seen))
+    plate = settle_target(exposures, plate)
+    found = find_targets(exposures, plate, cache=job.cache, progress=job.progress)
     run = calibrate_camera_from_found(found, plate, options, progress=job.progress)
     inputs = (*read.paths, *read.tables)
     by_source = dict(zip(sources, read.exposures, strict=True))

@@ -44,9 +44,11 @@ from armscan.storage.points import markers_csv, stripes_csv
 from armscan.thesis.two_cameras import DecodedLine, find_coded_lines, parse_code
 from armscan.vision.rings import RingDetection, RingOptions, detect_rings, perimeter_limits
 from armscan.vision.stripe.extract import extract_stripes, load_stripe_method
+from armscan.vision.stripe.flags import colour_contrast, least_contrast
 from armscan.vision.stripe.image import (
     COLOURS,
     StripeOptions,
+    colour_excess,
     find_laser_colour,
     line_strengths,
     split_channels,
@@ -208,13 +210,14 @@ def _clearest(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shown:
-    """What a channel shows of some images: accepted points of long lines (N, 2) of each, and how
-    many points are accepted and flagged in all.
+    """What a channel shows of some images: accepted points of long lines (N, 2) of each, how many
+    points are accepted and flagged in all, and how many more on long lines have no colour.
     """
 
     long_px: Sequence[FloatArray]
     n_good: int
     n_flagged: int
+    n_plain: int
 
     @property
     def n_long(self) -> int:
@@ -226,7 +229,29 @@ def _shown_in(channel: LaserColour, judges: Sequence[Exposure], stripes: StripeO
     profiles = [extract_stripes(exposure, chosen) for exposure in judges]
     n_good = sum(int(profile.is_accepted.sum()) for profile in profiles)
     n_all = sum(len(profile) for profile in profiles)
-    return _Shown([_long_lines(profile) for profile in profiles], n_good, n_all - n_good)
+    lines = [_long_lines(profile) for profile in profiles]
+    n_long = sum(map(len, lines))
+    if channel in COLOURS:
+        lines = _coloured(lines, channel, judges)
+    n_plain = n_long - sum(map(len, lines))
+    return _Shown([line.points_px for line in lines], n_good, n_all - n_good, n_plain)
+
+
+def _coloured(
+    lines: Sequence[Profile], colour: LaserColour, judges: Sequence[Exposure]
+) -> list[Profile]:
+    """Lines of each image without what hardly has the laser's colour, beside all the images' lines.
+
+    An image without the laser shows edges of metal, which have a lens's and a sensor's fringes.
+    """
+    contrasts = []
+    for line, exposure in zip(lines, judges, strict=True):
+        gate = colour_excess(split_channels(exposure, None), colour)
+        at = exposure.window.to_image(line.points_px)
+        sigma = float(np.median(line.width_px)) / exposure.window.binning if len(line) else 1.0
+        contrasts.append(colour_contrast(gate, np.hstack([at, line.normals_px]), sigma))
+    least = least_contrast(np.concatenate(contrasts))
+    return [line.select(own > least) for line, own in zip(lines, contrasts, strict=True)]
 
 
 def _shown_by(
@@ -241,7 +266,7 @@ def _of_family(
     colour: LaserColour, shown: Mapping[LaserColour, _Shown], judges: Sequence[Exposure]
 ) -> LaserColour:
     """The colour itself, or its difference of most points where that shows much more of its lines,
-    and what the colour shows, too.
+    and what the colour shows, too. What the colour shows without having it counts against it.
     """
     own = shown[colour]
     across = sum(max(exposure.width_px, exposure.height_px) for exposure in judges)
@@ -249,7 +274,8 @@ def _of_family(
     better = [
         channel
         for channel, other in shown.items()
-        if MUCH_MORE * own.n_long < other.n_long <= most
+        if channel != colour
+        and MUCH_MORE * (own.n_long - own.n_plain) < other.n_long <= most
         and _n_near(own, other) >= KEPT * own.n_long
     ]
     return max(better, key=lambda channel: shown[channel].n_long, default=colour)
@@ -264,12 +290,12 @@ def _n_near(own: _Shown, other: _Shown) -> int:
     )
 
 
-def _long_lines(profile: Profile) -> FloatArray:
-    """Accepted points (N, 2) of segments that are hardly edges or blots."""
+def _long_lines(profile: Profile) -> Profile:
+    """Accepted points of segments that are hardly edges or blots."""
     _, number, count = np.unique(
         profile.segment[profile.is_accepted], return_inverse=True, return_counts=True
     )
-    return profile.points_px[profile.is_accepted][count[number] >= LONG]
+    return profile.select(profile.is_accepted).select(count[number] >= LONG)
 
 
 NAMED, LISTED = 5, 40

@@ -40,7 +40,7 @@ from armscan.storage.documents import (
     stereo_document,
 )
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
-from armscan.storage.images import ImageOptions, check_same_size, read_exposures
+from armscan.storage.images import ImageOptions, of_one_size, read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording
 from armscan.vision.targets.detect import settle_target
@@ -78,20 +78,18 @@ def calibrate_stereo(
     places = job.places(".json", beside=(".npz", ".html"))
     given = _given(*cameras)
     read = _stereo_images(left, right, scan, image_options)
-    for side in (0, 1):
-        check_same_size([one for pair in read.pairs if (one := pair[side]) is not None])
     hashes = {source: fingerprint(path).sha256 for source, path in read.paths.items()}
     if given is not None and options.intrinsics == "prior":
         _check_not_the_same(given, hashes)
-    by_source = {one.source: one for pair in read.pairs for one in pair if one is not None}
-    left_out = named_by(options.leave_out, list(by_source))
-    options = replace(options, leave_out=left_out)
-    exposures = list(by_source.values())
+    every = [one.source for pair in read.pairs for one in pair if one is not None]
+    options = replace(options, leave_out=named_by(options.leave_out, every))
+    pairs = _of_one_size(read.pairs, options.leave_out)
+    by_source = {one.source: one for pair in pairs for one in pair if one is not None}
+    left_out = tuple(one for one in options.leave_out if one in by_source)
+    options, exposures = replace(options, leave_out=left_out), list(by_source.values())
     plate = settle_target(exposures, plate)
     found = find_targets(exposures, plate, cache=job.cache, progress=job.progress)
-    run = calibrate_stereo_from_found(
-        read.pairs, found, plate, options, given, progress=job.progress
-    )
+    run = calibrate_stereo_from_found(pairs, found, plate, options, given, progress=job.progress)
     inputs = (*read.paths.values(), *(path for path in cameras if path is not None))
     parents = tuple(one.provenance for one in given or ())
     used = (plate, options, image_options)
@@ -120,6 +118,15 @@ def calibrate_stereo(
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     summary = _stereo_summary(run, written, is_simulated=read.is_simulated)
     return replace(with_old_layout(summary, plate), forced=provenance.forced)
+
+
+def _of_one_size(pairs: Sequence[ExposedPair], leave_out: Sequence[str]) -> list[ExposedPair]:
+    """Pairs without those of which an image that is left out has not its camera's size."""
+    kept: set[str] = set()
+    for side in (0, 1):
+        seen = [one for pair in pairs if (one := pair[side]) is not None]
+        kept.update(one.source for one in of_one_size(seen, leave_out))
+    return [pair for pair in pairs if all(one is None or one.source in kept for one in pair)]
 
 
 def _given(left: Path | None, right: Path | None) -> Given | None:

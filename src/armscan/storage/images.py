@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import FileFormatError, InputError, OptionError
+from armscan.errors import FileFormatError, InputError, OptionError, listed
 from armscan.geometry.arrays import ImageArray, IntArray
 from armscan.records.exposure import Exposure
 from armscan.storage.files import path_text, read_bytes
@@ -535,24 +535,48 @@ def read_exposures(
     )
 
 
+NAMED = 5
+"""Images that a message names."""
+
+
 def check_same_size(exposures: Sequence[Exposure]) -> None:
     """Raise if images that one camera took differ in size.
 
     Raises
     ------
     InputError
-        Naming the first image that differs from the majority.
+        Naming the images that differ from the majority.
     """
     sizes = Counter((exposure.width_px, exposure.height_px) for exposure in exposures)
     if len(sizes) < 2:
         return
     usual = sizes.most_common(1)[0][0]
-    odd = next(item for item in exposures if (item.width_px, item.height_px) != usual)
+    odd = [item for item in exposures if (item.width_px, item.height_px) != usual]
+    width, height = odd[0].width_px, odd[0].height_px
+    more = listed([item.source for item in odd[1:]], NAMED)
+    also = f" (another size, too: {more})" if more else ""
     raise InputError(
-        f"the image is {odd.width_px} x {odd.height_px} px, others are {usual[0]} x {usual[1]} px",
-        where=odd.source,
-        remedy="give images of one camera in its full size, none cropped, scaled or turned",
+        f"the image is {width} x {height} px, others are {usual[0]} x {usual[1]} px{also}",
+        where=odd[0].source,
+        remedy="give images of one camera in its full size, none cropped, scaled or turned, "
+        "or leave it out",
     )
+
+
+def of_one_size(exposures: Sequence[Exposure], leave_out: Sequence[str]) -> tuple[Exposure, ...]:
+    """Images of one camera; of those left out, by source, only what has the size of the others.
+
+    Raises
+    ------
+    InputError
+        If those that are not left out differ in size.
+    """
+    used = [exposure for exposure in exposures if exposure.source not in leave_out]
+    check_same_size(used)
+    if not used:
+        return tuple(exposures)
+    size = (used[0].width_px, used[0].height_px)
+    return tuple(item for item in exposures if (item.width_px, item.height_px) == size)
 
 
 def source_names(paths: Sequence[Path]) -> tuple[str, ...]:

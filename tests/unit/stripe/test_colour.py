@@ -126,6 +126,23 @@ def test_white_things_before_a_wall_of_the_lasers_colour_cost_no_line() -> None:
     assert (np.abs(row - 350.0 - 0.1 * column) < 1.0).sum() > 620
 
 
+def test_wide_white_things_do_not_tell_how_wide_the_laser_is() -> None:
+    """Sheets and folds in the room are wide, bright and many; the line is narrow on a dark box."""
+    rng = np.random.default_rng(11)
+    y, x = np.mgrid[:480, :640]
+    folds = sum(np.exp(-0.5 * ((y - v) / 12.0) ** 2) for v in range(20, 480, 60))
+    room = 250.0 * folds * (np.abs(x - 320.0) > 80.0)
+    line_at = 320.0 + 0.05 * y
+    stripe = 150.0 * np.exp(-0.5 * ((x - line_at) / 1.7) ** 2)
+    light = room[..., None] + stripe[..., None] * np.array([1.0, 0.1, 0.1]) + 20.0
+    image = np.clip(light + rng.normal(0.0, 2.0, light.shape), 0.0, 255.0).astype(np.uint8)
+    profile = extract_stripes(Exposure(image, "room"), StripeOptions(laser_colour="red"))
+    column, row = profile.points_px[profile.is_accepted].T
+    error = column - 320.0 - 0.05 * row
+    assert (np.abs(error) < 1.0).sum() > 450
+    assert np.sqrt((error[np.abs(error) < 1.0] ** 2).mean()) < SAME_PX
+
+
 def test_line_of_another_colour_is_left_out() -> None:
     laser = SCENE.expose_red(3, overdrive=1.0).image.copy()
     other = StripeScene((line(10.0),), 320, 240).expose(4).image

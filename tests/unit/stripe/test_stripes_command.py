@@ -191,6 +191,34 @@ def test_light_that_all_colours_have_in_common_is_taken_off(
     assert len(written(out, capsys)[1]) < 0.7 * 3 * 320
 
 
+def test_edges_of_metal_where_no_laser_is_do_not_hide_a_difference(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of the images are without laser; bright rails have a lens's fringe of its colour."""
+    folder, rng = tmp_path / "rails", np.random.default_rng(5)
+    folder.mkdir()
+    y, x = np.mgrid[:480, :640]
+    rails = [
+        sum(np.exp(-0.5 * ((x - u - fringe) / 2.0) ** 2) for u in (30, 60, 90, 550, 580, 610))
+        for fringe in (0.2, 0.0, 0.0)
+    ]
+    metal = 200.0 * np.stack(rails, axis=2)
+    stripe = np.exp(-0.5 * ((y - 240.0 - 0.03 * x) / 1.5) ** 2) * (np.abs(x - 320.0) < 200.0)
+    for k, peak in enumerate((0.0, 180.0, 0.0, 60.0)):
+        image = metal + peak * stripe[..., None] * np.array([1.0, 0.1, 0.1]) + 30.0
+        write_colour(folder / f"{k}.png", image + rng.normal(0.0, 1.5, image.shape))
+    out = tmp_path / "lines.csv"
+    assert main(["stripes", str(folder), "-o", str(out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    with out.open(newline="") as file:
+        good = [row for row in csv.DictReader(file) if row["accepted"] == "1"]
+    assert report["laser_colour"] in {"red-green", "red-blue", "red-excess"}
+    assert {row["image"] for row in good} == {"1.png", "3.png"}
+    away = [float(row["y_px"]) - 240.0 - 0.03 * float(row["x_px"]) for row in good]
+    assert len(away) > 0.9 * 2 * 400
+    assert np.mean(np.abs(away) < 0.5) > 0.99
+
+
 def test_views_without_laser_are_taken_off(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -66,14 +66,14 @@ from armscan.kernels.stripe.section import (
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.stripe.fit import start_noise
-from armscan.vision.stripe.flags import MERGED_SIGMAS, close_gaps, is_short
-from armscan.vision.stripe.image import (
-    NORMAL_SCALE,
-    StripeOptions,
-    StripePlane,
+from armscan.vision.stripe.flags import (
+    MERGED_SIGMAS,
+    close_gaps,
     has_laser_colour,
     is_on_known_ground,
+    is_short,
 )
+from armscan.vision.stripe.image import NORMAL_SCALE, StripeOptions, StripePlane
 from armscan.vision.stripe.ridge import (
     FAINTEST_SHARE,
     LONGEST_RUN_PX,

@@ -25,10 +25,13 @@ from armscan.vision.stripe.fit import ProfileFits, fit_ridge
 from armscan.vision.stripe.flags import (
     MERGED_SIGMAS,
     close_gaps,
+    has_laser_colour,
     is_cut_off,
+    is_on_known_ground,
     is_saturated,
     is_short,
     mark,
+    near_laser_colour,
 )
 from armscan.vision.stripe.image import (
     EVEN,
@@ -38,8 +41,6 @@ from armscan.vision.stripe.image import (
     StripePlane,
     check_background,
     colour_planes,
-    has_laser_colour,
-    is_on_known_ground,
     is_thresholded,
     laid_under,
     lit_plane,
@@ -189,7 +190,9 @@ def _find(
         blur = BLUR_PX
         image, level = less_noisy(image)
     runs = find_candidates(image, level)
-    sigma = options.line_sigma_px or find_line_sigma(image, runs, level, blur)
+    sigma = options.line_sigma_px
+    if sigma is None:
+        sigma = find_line_sigma(image, runs, level, blur, near_laser_colour(plane.gate))
     if _is_too_thin(plane, sigma):
         return _find(exposure, bare, whole, options, threshold)
     if options.method == "fit":

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is doubtful about each stripe point, and ends of lines that are cut at a slant."""
+"""What is doubtful about each stripe point, its colour and ground, and ends cut at a slant."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,20 @@ from armscan.kernels.stripe.section import (
 )
 from armscan.records.profile import StripeFlag
 from armscan.vision.stripe.fit import ProfileFits
-from armscan.vision.stripe.ridge import SHORTEST_PX, chain_extents
+from armscan.vision.stripe.image import (
+    LINE_SHARE,
+    RIDGE_QUANTILE,
+    RIDGE_STEP_PX,
+    MaskImage,
+    ridge_height,
+)
+from armscan.vision.stripe.ridge import (
+    SHORTEST_PX,
+    FloatImage,
+    chain_extents,
+    mean_along,
+    strong_median,
+)
 
 MERGED_SIGMAS = 20.0
 """Where two lines cross at a small angle they run as one over about this many sigmas."""
@@ -160,3 +174,80 @@ def _count_cut(inwards: FloatArray, sigma_px: float) -> int:
 def _robust_std(values: FloatArray) -> float:
     """Standard deviation of most of the values."""
     return robust_sigma(values - np.median(values))
+
+
+CORE_SIGMAS = 3.0
+BESIDE_SIGMAS = (5.0, 8.0)
+LEAST_CORE_PX = 3.0
+COLOUR_HALF = 4
+"""Neighbours over which the excess of the laser's colour is averaged."""
+NOISE_FACTOR = 4.0
+LEAST_SHARE = 0.25
+
+
+def near_laser_colour(gate: FloatImage | None) -> MaskImage | None:
+    """Mask (H, W), 1 near the strongest thin lines of the laser's colour; None if it is not known.
+
+    The white core of an over-exposed line has no colour, but a halo near it that has.
+
+    ``gate``: (H, W) colour excess.
+    """
+    height = np.zeros((0, 0), np.float32) if gate is None else ridge_height(gate)
+    if gate is None or not height.size:
+        return None
+    s = RIDGE_STEP_PX
+    near = np.zeros(gate.shape, np.uint8)
+    near[s:-s, s:-s] = height > LINE_SHARE * float(np.quantile(height, RIDGE_QUANTILE))
+    return np.asarray(cv2.dilate(near, np.ones((2 * s + 1, 2 * s + 1), np.uint8)), np.uint8)
+
+
+def colour_contrast(gate: FloatImage, table: FloatArray, line_sigma_px: float) -> FloatArray:
+    """(N,) by how much the colour excess near the ridge stands out from both sides.
+
+    The core of a saturated line is white; its halo keeps the colour. So the strongest excess within
+    three sigmas is compared with the excess farther out.
+
+    ``gate``: (H, W) colour excess. ``table``: Ridge points (N, 4 or more), their places in the
+    image and normals first. ``line_sigma_px``: Typical sigma of the lines.
+    """
+    core = max(CORE_SIGMAS * line_sigma_px, LEAST_CORE_PX)
+    inside = _across(gate, table, np.arange(-core, core + 0.5, 1.0)).max(axis=1)
+    far = np.linspace(BESIDE_SIGMAS[0], BESIDE_SIGMAS[1], 4) * max(line_sigma_px, 1.0)
+    beside = np.maximum(
+        np.median(_across(gate, table, -far), axis=1), np.median(_across(gate, table, far), axis=1)
+    )
+    return np.asarray(inside - beside)
+
+
+def has_laser_colour(
+    gate: FloatImage, table: FloatArray, chain: IntArray, line_sigma_px: float
+) -> BoolArray:
+    """(N,) True where `colour_contrast`, averaged along the line, is no noise and no fringe.
+
+    ``chain``: (N,) of the ridge points; the others as for `colour_contrast`.
+    """
+    contrast = colour_contrast(gate, table, line_sigma_px)
+    contrast = mean_along(contrast, np.ones(len(table)), chain, COLOUR_HALF)
+    step = np.abs(np.diff(gate[::7, :], axis=1))
+    noise = 1.05 * float(np.median(step)) if step.size else 0.0
+    return np.asarray(contrast > max(NOISE_FACTOR * noise, least_contrast(contrast)))
+
+
+def least_contrast(contrast: FloatArray) -> float:
+    """What of the contrasts (N,) of ridges has the laser's colour: a share of the strong ones'."""
+    return LEAST_SHARE * strong_median(np.maximum(contrast, 0.0))
+
+
+def is_on_known_ground(unknown: MaskImage, table: FloatArray, line_sigma_px: float) -> BoolArray:
+    """(N,) False where the view without laser was saturated within three sigmas of the ridge."""
+    if unknown.size == 1:
+        return np.ones(len(table), dtype=np.bool_)
+    core = max(CORE_SIGMAS * line_sigma_px, LEAST_CORE_PX)
+    return np.asarray(_across(unknown, table, np.arange(-core, core + 0.5, 1.0)).max(axis=1) == 0)
+
+
+def _across(gate: FloatImage | MaskImage, table: FloatArray, offsets: FloatArray) -> FloatArray:
+    height, width = gate.shape
+    x = np.rint(table[:, :1] + table[:, 2:3] * offsets).astype(np.int64)
+    y = np.rint(table[:, 1:2] + table[:, 3:4] * offsets).astype(np.int64)
+    return gate[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(np.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias, TypeGuard
+from typing import Any, TypeAlias, TypeGuard
 
 import cv2
 import numpy as np
@@ -328,6 +328,8 @@ SPOTS = 4.0
 CLIPPED = 250.0
 """Of 255, `NORMAL_SCALE`: a little less where a view without laser was taken off."""
 MEASURED = 300
+MOST = 0.5
+APART = 1.5
 STRONG_SHARE = 0.4
 REACH_PX = 30.0
 STEP_PX = 0.5
@@ -339,13 +341,20 @@ LOPSIDED = 1.8
 
 
 def find_line_sigma(
-    image: FloatImage, runs: FloatArray, level: ImageLevel, blur_px: float = 0.0
+    image: FloatImage,
+    runs: FloatArray,
+    level: ImageLevel,
+    blur_px: float = 0.0,
+    near: NDArray[np.uint8] | None = None,
 ) -> float:
     """Median sigma of the brighter lines from their full width at half height, in px.
 
+    Where most of the brighter lines have not the laser's colour, as sheets of paper and folds of
+    cloth in the room, and are of another width, those that have it tell.
+
     ``image``: (H, W) float32. ``runs``: (N, 3) candidates; a sample of them is measured across the
     local ridge direction. ``level``: Background and threshold. ``blur_px``: Sigma by which the
-    image was blurred.
+    image was blurred. ``near``: (H, W) 1 near what has the laser's colour; None if not known.
     """
     points = _strongest(image, runs)
     if not len(points):
@@ -357,7 +366,19 @@ def find_line_sigma(
     bright &= half_widths < REACH_PX
     if not bright.any():
         return FALLBACK_PX
-    return float(_sigmas(np.median(half_widths[bright], keepdims=True), blur_px)[0])
+    sigma = float(_sigmas(np.median(half_widths[bright], keepdims=True), blur_px)[0])
+    if near is None or _at(near, points[bright]).mean() > MOST:
+        return sigma
+    own = find_line_sigma(image, runs[_at(near, runs) > 0], level, blur_px)
+    # of fewer points and less certain; a fit in the line's own width mends less
+    return own if max(own, sigma) > APART * min(own, sigma) else sigma
+
+
+def _at(image: NDArray[Any], points: FloatArray) -> NDArray[Any]:
+    """Pixels (N,) of an image (H, W) at points (N, 2 or more)."""
+    last = np.array(image.shape[::-1]) - 1
+    column, row = np.rint(points[:, :2]).astype(np.int64).clip(0, last).T
+    return np.asarray(image[row, column])
 
 
 def _sigmas(half_widths: FloatArray, blur_px: float = 0.0) -> FloatArray:
@@ -399,9 +420,7 @@ def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
 
 def _is_clipped(image: FloatImage, points: FloatArray) -> bool:
     """Whether most of the points (N, 6) lie where the camera is at its white: of print few do."""
-    last = np.array(image.shape[::-1]) - 1
-    column, row = np.rint(points[:, :2]).astype(np.int64).clip(0, last).T
-    return float((image[row, column] >= CLIPPED).mean()) > 0.5
+    return float((_at(image, points) >= CLIPPED).mean()) > MOST
 
 
 def _strong(points: FloatArray) -> FloatArray:

@@ -18,10 +18,13 @@ lies off it by many times the scatter of the rest.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import (
@@ -33,7 +36,7 @@ from armscan.geometry.arrays import (
     floats,
     homogeneous,
 )
-from armscan.models.camera import FISHEYE_FOCALS, CameraModel
+from armscan.models.camera import FISHEYE_FOCALS, NEAR_AXIS, WIDEST_RAD, CameraModel
 from armscan.vision.targets.saddle import Grey32
 
 _BLUR_PX = 1.2
@@ -189,30 +192,44 @@ _FLAT = 0.01
 """Residuals of a homography, over the extent of the cells around, below which none is asked for."""
 
 
-def find_lattices(crossings: Crossings) -> list[Lattice]:
-    """Lattices of at least `_MIN_CELLS` crossings, the largest first."""
+def find_lattices(crossings: Crossings) -> Iterator[Lattice]:
+    """Yield lattices of at least `_MIN_CELLS` crossings, the largest first.
+
+    A smaller one is extended only when it is asked for, as one that holds the board mostly is not.
+    """
+    seeds, held = _linked(crossings), set[int]()
+    grown: list[Lattice] = []
+    for k, lattice in enumerate(seeds):
+        if len(held.intersection(lattice.values())) < 0.5 * len(lattice):
+            whole = _extended(crossings, _regular(crossings, lattice))
+            held.update(whole.values())
+            grown.append(whole)
+            grown.sort(key=len, reverse=True)
+        left = len(seeds[k + 1]) if k + 1 < len(seeds) else 0
+        while grown and len(grown[0]) >= left:
+            yield grown.pop(0)
+
+
+def _linked(crossings: Crossings) -> list[Lattice]:
+    """The largest lattices of crossings that are each other's neighbours, the largest first."""
     if len(crossings) < _MIN_CELLS:
         return []
     links = _links(crossings)
     lattices: list[Lattice] = []
     taken: set[int] = set()
-    for seed in np.argsort(-(links >= 0).sum(axis=1), kind="stable").tolist():
-        if (links[seed] >= 0).sum() < 2:
-            break
-        if seed not in taken:
+    first, way = np.nonzero(links >= 0)
+    ones, pairs = np.ones(len(way), np.int64), (first, links[first, way])
+    linked = coo_array((ones, pairs), shape=(len(links), len(links)))
+    component = connected_components(linked, directed=False)[1]
+    n_links = np.asarray((links >= 0).sum(axis=1))
+    may_seed = (n_links >= 2) & (np.bincount(component)[component] >= _MIN_CELLS)
+    for seed in np.argsort(-n_links, kind="stable").tolist():
+        if may_seed[seed] and seed not in taken:
             lattice = _connected(crossings, links, seed)
             taken.update(lattice.values())
             if len(lattice) >= _MIN_CELLS:
                 lattices.append(lattice)
-    lattices.sort(key=len, reverse=True)
-    grown: list[Lattice] = []
-    held: set[int] = set()
-    for lattice in lattices[:_MAX_LATTICES]:
-        if len(held.intersection(lattice.values())) < 0.5 * len(lattice):
-            whole = _extended(crossings, _regular(crossings, lattice))
-            held.update(whole.values())
-            grown.append(whole)
-    return sorted(grown, key=len, reverse=True)
+    return sorted(lattices, key=len, reverse=True)[:_MAX_LATTICES]
 
 
 def cell_arrays(lattice: Lattice) -> tuple[IntArray, IntArray]:
@@ -273,14 +290,11 @@ def _mapped_by_homography(
     middle = points_px.mean(axis=1, keepdims=True)
     scale = np.maximum(np.abs(points_px - middle).max(axis=(1, 2)), 1e-9)
     uv = (points_px - middle) / scale[:, None, None]
-    a, b = cells[..., 0], cells[..., 1]
-    one, zero = np.ones_like(a), np.zeros_like(a)
-    blocks = []
-    for k, (x, y, w) in enumerate(((a, b, one), (a, b, one))):
-        u = uv[..., k]
-        left = (x, y, w, zero, zero, zero) if k == 0 else (zero, zero, zero, x, y, w)
-        blocks.append(np.stack([*left, -u * a, -u * b], axis=-1))
-    design = np.concatenate(blocks, axis=1)
+    own = np.concatenate([cells, np.ones_like(cells[..., :1])], axis=-1)
+    design = np.zeros((len(cells), 2 * cells.shape[1], 8))
+    above, below = np.split(design, 2, axis=1)
+    above[..., :3], above[..., 6:] = own, -uv[..., :1] * cells
+    below[..., 3:6], below[..., 6:] = own, -uv[..., 1:] * cells
     known = np.concatenate([uv[..., 0], uv[..., 1]], axis=1)
     normal = design.transpose(0, 2, 1) @ design
     normal += 1e-7 * np.eye(8)
@@ -289,15 +303,11 @@ def _mapped_by_homography(
         np.einsum("mki,mkj->mij", cells - cells.mean(axis=1, keepdims=True), cells)
     )
     solved[spans[:, 0] < 0.5] = np.nan
-    depth = 1.0 + a * solved[:, 6:7] + b * solved[:, 7:8]
-    seen = np.stack([_affine(a, b, solved[:, :3]), _affine(a, b, solved[:, 3:6])], axis=-1)
-    missed = np.sum((seen / depth[..., None] - uv) ** 2, axis=(1, 2)) * scale**2
+    seen = own @ solved[:, :6].reshape(-1, 2, 3).transpose(0, 2, 1)
+    depth = 1.0 + cells @ solved[:, 6:, None]
+    missed = np.sum((seen / depth - uv) ** 2, axis=(1, 2)) * scale**2
     place = solved[:, [2, 5]] * scale[:, None] + middle[:, 0]
     return place, missed / max(2 * cells.shape[1] - 8, 1)
-
-
-def _affine(a: FloatArray, b: FloatArray, terms: FloatArray) -> FloatArray:
-    return a * terms[:, :1] + b * terms[:, 1:2] + terms[:, 2:]
 
 
 def _links(crossings: Crossings) -> IntArray:
@@ -413,17 +423,18 @@ def _extended(crossings: Crossings, lattice: Lattice) -> Lattice:
             return lattice
         points = crossings.points_px[index]
         wanted = _free_cells(cells)
-        places, beside, below = (
-            predict_cells(cells, points, wanted + np.array(step), may_bend=may_bend)
-            for step in ((0, 0), (1, 0), (0, 1))
-        )
-        step = np.minimum(np.hypot(*(beside - places).T), np.hypot(*(below - places).T))
-        known = np.isfinite(places).all(axis=1) & np.isfinite(step)
+        places = predict_cells(cells, points, wanted, may_bend=may_bend)
+        known = np.isfinite(places.sum(axis=1))
         nearest, beside_it = _nearest(crossings.points_px, np.where(known[:, None], places, 0.0), 1)
         distance, found = nearest[:, 0], beside_it[:, 0]
-        fits = known & (distance < _POSITION_TOLERANCE * step)
-        fits &= ~np.isin(found, index)
-        fits &= _is_alike(crossings, lattice, wanted, found)
+        fits = _is_alike(crossings, lattice, wanted, found) & known & ~np.isin(found, index)
+        near = np.flatnonzero(fits)
+        ahead, below = (
+            predict_cells(cells, points, wanted[near] + np.array(way), may_bend=may_bend)
+            for way in ((1, 0), (0, 1))
+        )
+        step = np.minimum(np.hypot(*(ahead - places[near]).T), np.hypot(*(below - places[near]).T))
+        fits[near] = distance[near] < _POSITION_TOLERANCE * step
         if not fits.any() and not may_bend:
             return lattice
         may_bend = bool(fits.any())
@@ -452,15 +463,10 @@ def _free_cells(cells: IntArray) -> IntArray:
     """Cells (M, 2) without a crossing, within a gap of one that has."""
     low = cells.min(axis=0) - _GAP
     size = np.ptp(cells, axis=0) + 1 + 2 * _GAP
-    taken = np.zeros(size, dtype=np.bool_)
-    taken[tuple((cells - low).T)] = True
-    near = np.zeros_like(taken)
-    for a in range(-_GAP, _GAP + 1):
-        for b in range(-_GAP, _GAP + 1):
-            at = cells - low + np.array([a, b])
-            inside = ((at >= 0) & (at < size)).all(axis=1)
-            near[tuple(at[inside].T)] = True
-    free: IntArray = np.argwhere(near & ~taken).astype(np.int64) + low
+    taken = np.zeros(size, np.uint8)
+    taken[tuple((cells - low).T)] = 1
+    near = np.asarray(cv2.dilate(taken, np.ones((2 * _GAP + 1, 2 * _GAP + 1), np.uint8)))
+    free: IntArray = np.argwhere(near > taken).astype(np.int64) + low
     return free
 
 
@@ -607,9 +613,11 @@ def _homography(
     if lens is None:
         homography, _ = cv2.findHomography(board[trusted], points_px[trusted], 0)
         return None if homography is None else np.asarray(homography)
-    xy, is_valid = lens.undistort(points_px)
-    if not is_valid.all():
+    xy = (points_px - [lens.cx_px, lens.cy_px]) / lens.fx_px
+    angle = np.hypot(*xy.T)
+    if not angle.max() < WIDEST_RAD:
         return None
+    xy = xy * (np.tan(angle) / np.maximum(angle, NEAR_AXIS))[:, None]
     # a pixel is worth the less of X/Z the farther from the axis
     weight = 1.0 / (1.0 + np.sum(xy[trusted] ** 2, axis=1))
     return _weighted_homography(board[trusted], xy[trusted], weight)
@@ -633,7 +641,8 @@ def _weighted_homography(board: FloatArray, xy: FloatArray, weight: FloatArray) 
             np.concatenate([none, rows, -xy[:, 1:] * rows], axis=1),
         ]
     )
-    return np.asarray(np.linalg.svd(design)[2][-1].reshape(3, 3) @ to_unit)
+    axes = np.linalg.svd(design, full_matrices=False)[2]
+    return np.asarray(axes[-1].reshape(3, 3) @ to_unit)
 
 
 def _smooth(

@@ -204,12 +204,10 @@ def _difference(
     probes: tuple[float, ...] = _PROBES,
 ) -> FloatArray:
     """Level (N,) ahead of each corner less that behind it, on one side; NaN out of view."""
-    total = np.zeros(len(corners_px))
-    for p in _ALONG:
-        for q in probes:
-            ahead = sample(grey, corners_px + p * along_px + q * across_px)
-            total += ahead - sample(grey, corners_px - p * along_px + q * across_px)
-    return total / (len(_ALONG) * len(probes))
+    p, q = np.array([(p, q) for p in _ALONG for q in probes]).T[..., None, None]
+    places = np.stack([corners_px + p * along_px, corners_px - p * along_px]) + q * across_px
+    ahead, behind = sample(grey, places.reshape(-1, 2)).reshape(2, len(p), len(corners_px))
+    return np.asarray((ahead - behind).mean(axis=0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.colors import LinearSegmentedColormap
 
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.inspection.conformity import COVERAGE
+from armscan.inspection.features import FeatureInspection
 from armscan.inspection.results import (
     Deviations,
     MeasuredLength,
@@ -25,16 +25,14 @@ from armscan.inspection.results import (
 )
 from armscan.models.calibration import Provenance
 from armscan.records.cloud import PointCloud
+from armscan.report.charts import deviation_view
 from armscan.report.drawing import (
     ACCENT,
     ALERT,
     INK,
     MUTED,
-    SceneDots,
     chart_markup,
     new_figure,
-    ramp_markup,
-    scene_markup,
     styled,
 )
 from armscan.report.page import Facts, Gallery, Page, Picture, Section, Text, page_of
@@ -45,7 +43,9 @@ from armscan.report.quantity import (
     for_people,
     only,
     sentence,
+    share_text,
     significant,
+    triple,
     with_sigma,
 )
 
@@ -76,17 +76,16 @@ STILL_SIGMA = fact(
     "not known from one exposure: its error is the calibration's, which shifts both faces nearly "
     "alike",
 )
+ROUND = ("sphere", "cylinder", "cone")
+OTHER_SHAPE, BEYOND_STATED = 8.0, 2.0
+"""Rms distance from a fitted shape beyond which it is doubted, in scatters of neighbours: bores,
+bosses and balls have 3 at most, a cylinder in a cone of 25 degrees or in two flat faces 15 and
+more. And in stated sigmas, for stripes that an arm shifts are smooth themselves."""
 NARROW_CAP_DEG = 60.0
 MANY_OUTLIERS = 0.01
 FOREIGN_FRAME = "a frame that the file does not name"
-MAX_SHOWN = 20_000
 BAND_MM = 0.05
 LEAST_HALF_WIDTH_MM = 0.01
-RAMP = LinearSegmentedColormap.from_list(
-    "deviation", colormaps["cividis"](np.linspace(0.0, 0.93, 32))
-)
-"""As of the comparison with a model: lightness alone tells the sign, also in grey print and to
-colour-blind readers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +142,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         references.insert(0, ("against the nominal plane", found.nominal))
         where = "of the fitted plane over the nominal one, at the middle of the points"
         told += [
-            length_quantity("nominal.offset", "Offset", found.offset, where),
+            *length_quantities("nominal.offset", "Offset", found.offset, where),
             Quantity(
                 "nominal.tilt_mrad",
                 "Tilt",
@@ -196,16 +195,20 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
     told = (
         Quantity("feature", "", "sphere"),
         *count_quantities(found.counts),
-        length_quantity(
+        *length_quantities(
             "fitted.diameter", "Fitted diameter", found.diameter, f"nominal {nominal_mm:g} mm"
         ),
         Quantity("nominal.diameter_mm", "", nominal_mm),
         Quantity("diameter_error_mm", "Fitted minus nominal", error, shown=f"{error:+.4f} mm"),
+        place_quantity("fitted.centre_mm", "Centre", found.sphere.centre_mm, found.centre_sigma_mm),
+        Quantity("fitted.centre_u_mm", "", COVERAGE * found.centre_sigma_mm),
         Quantity(
-            "fitted.centre_mm",
-            "Centre",
-            found.sphere.centre_mm.tolist(),
-            shown=f"{triple(found.sphere.centre_mm)} mm",
+            "other_balls",
+            "",
+            [
+                {"diameter_mm": 2.0 * one.radius_mm, "centre_mm": one.centre_mm.tolist()}
+                for one in found.others
+            ],
         ),
         Quantity(
             "fitted.seen_cap_deg",
@@ -218,18 +221,6 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
         *deviation_quantities("fitted", found.fitted),
         *deviation_quantities("nominal", found.nominal),
     )
-    warnings = list(point_warnings(found.counts, cloud))
-    if found.seen_cap_deg < NARROW_CAP_DEG:
-        warnings.append(
-            f"the points cover a cap of only {found.seen_cap_deg:.0f} degrees half opening, where "
-            "centre and diameter are poorly told apart; scan more of the ball"
-        )
-    if found.other is not None:
-        warnings.append(
-            f"another ball, of {2.0 * found.other.radius_mm:.4g} mm, is centred at "
-            f"{triple(found.other.centre_mm)} mm; measured was the one on which most points lie: "
-            "show which is meant with --region"
-        )
     return InspectionReport(
         title="Ball inspected",
         subtitle=point_subtitle(found.counts, cloud),
@@ -257,8 +248,63 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
         ),
         views=(feature_view(cloud, found.rows, found.nominal),),
         counts=found.counts,
-        warnings=tuple(warnings),
+        warnings=(
+            *point_warnings(found.counts, cloud),
+            *shape_warnings(found, cloud, "ball"),
+            *_ball_warnings(found),
+        ),
     )
+
+
+def _ball_warnings(found: SphereInspection) -> tuple[str, ...]:
+    """Warn of a small cap, and of other balls of that diameter."""
+    told = []
+    if found.seen_cap_deg < NARROW_CAP_DEG:
+        told.append(
+            f"the points cover a cap of only {found.seen_cap_deg:.0f} degrees half opening, where "
+            "centre and diameter are poorly told apart; scan more of the ball"
+        )
+    told += [
+        f"another ball, of {2.0 * one.radius_mm:.4g} mm, is centred at {triple(one.centre_mm)} mm; "
+        "measured was the one on which most points lie: show which is meant with --region"
+        for one in found.others
+    ]
+    return tuple(told)
+
+
+def shape_warnings(
+    found: SphereInspection | FeatureInspection, cloud: PointCloud, kind: str, whose: str = ""
+) -> tuple[str, ...]:
+    """Warn of points that may be of another shape than the one that was fitted to them.
+
+    They are as near to a post, or lie much farther off the shape than off their neighbours and
+    than their sigmas say. ``kind`` is what the shape is called.
+    """
+    rows = found.rows[found.is_fitted]
+    rms = _rms(found.fitted.deviations_mm[found.is_fitted])
+    if found.post is not None:
+        off = significant(_rms(found.post.distance_mm(cloud.points_mm[rows])), "mm", 2)
+        return (
+            f"{whose}the points may be of no {kind}, but of a disc or a post: they lie {off} (rms) "
+            f"off a cylinder of {2.0 * found.post.radius_mm:.4g} mm, and "
+            f"{significant(rms, 'mm', 2)} off the {kind}; scan it from more sides, or show where "
+            f"the {kind} is with --region",
+        )
+    variance = np.median(np.einsum("nii->n", cloud.covariance_mm2[rows])) / 3.0
+    stated = BEYOND_STATED * math.sqrt(max(float(variance), 0.0))
+    is_round = isinstance(found, SphereInspection) or found.shape.kind in ROUND
+    # written so that a scatter that is not known warns of nothing
+    if not is_round or not rms > max(OTHER_SHAPE * found.scatter_mm, stated):
+        return ()
+    return (
+        f"{whose}the points may be of no {kind}: they lie {significant(rms, 'mm', 2)} (rms) off "
+        f"it, {rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, "
+        "and show where it is by a region or a seed",
+    )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
@@ -271,7 +317,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
     told = (
         Quantity("feature", "", "step"),
         *count_quantities(found.counts),
-        length_quantity(
+        *length_quantities(
             "fitted.height",
             "Fitted height",
             found.height,
@@ -343,10 +389,10 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
     )
 
 
-def length_quantity(
+def length_quantities(
     key: str, label: str, length: MeasuredLength, meaning: str, shown: str = ""
-) -> Quantity:
-    """A length with its standard deviation."""
+) -> tuple[Quantity, Quantity]:
+    """A length with its standard deviation, and its expanded uncertainty."""
     data = {
         "value_mm": length.value_mm,
         "sigma_mm": length.sigma_mm,
@@ -356,7 +402,26 @@ def length_quantity(
     if not shown and math.isnan(length.sigma_mm):
         shown = f"{length.value_mm:.4f} mm"
     shown = shown or with_sigma(length.value_mm, length.sigma_mm, "mm")
-    return Quantity(key, label, data, meaning=meaning, shown=shown)
+    name = label.removeprefix("Fitted ").lower()
+    return (
+        Quantity(key, label, data, meaning=meaning, shown=shown),
+        expanded(f"{key}_u_mm", name, length.sigma_mm, "mm"),
+    )
+
+
+def expanded(key: str, name: str, sigma: float, unit: str) -> Quantity:
+    """The expanded uncertainty of what has a standard deviation; NaN where that is not known."""
+    u = COVERAGE * sigma
+    meaning = "" if math.isnan(u) else "twice what stands after ±: 95 % of normal errors are less"
+    label = f"U (k = {COVERAGE:g}) of the {name}"
+    return Quantity(key, label, u, meaning=meaning, shown=significant(u, unit, 2))
+
+
+def place_quantity(key: str, label: str, point: FloatArray, sigma_mm: float) -> Quantity:
+    """A point (3,) with its expanded uncertainty along the worst way, where that is known."""
+    u = significant(COVERAGE * sigma_mm, "mm", 2)
+    known = "" if math.isnan(sigma_mm) else f", U (k = {COVERAGE:g}) {u} along the worst way"
+    return Quantity(key, label, point.tolist(), shown=f"{triple(point)} mm{known}")
 
 
 def sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
@@ -451,11 +516,6 @@ def point_warnings(
     return tuple(found)
 
 
-def triple(values: FloatArray, digits: int = 4) -> str:
-    """Three numbers with commas between them."""
-    return ", ".join(f"{value:.{digits}f}" for value in values)
-
-
 def inspection_page(
     report: InspectionReport,
     provenance: Provenance,
@@ -521,11 +581,6 @@ def _value(deviations: Deviations, k: int) -> str:
     if item.unit == "mm" and abs(item.value) < LEAST_MM:
         return "0.0000 mm"
     return significant(item.value, item.unit)
-
-
-def share_text(percent: float) -> str:
-    """A share with two decimals that never reads 100 if something is outside."""
-    return "above 99.99 %" if 99.995 <= percent < 100.0 else f"{percent:.2f} %"
 
 
 def deviation_histogram(
@@ -606,37 +661,4 @@ def feature_view(cloud: PointCloud, rows: IntArray, deviations: Deviations) -> P
         title="The feature's points",
         frame=cloud.frame,
         reference=deviations.reference_text,
-    )
-
-
-def deviation_view(
-    points_mm: FloatArray, deviations_mm: FloatArray, *, title: str, frame: str, reference: str
-) -> Picture:
-    """Points in space, coloured by deviation: dark inside or below, light outside or above.
-
-    Parameters
-    ----------
-    points_mm, deviations_mm
-        (N, 3) and (N,).
-    title
-        Of the picture.
-    frame
-        Name of the coordinate frame.
-    reference
-        What the deviations are counted from, in words.
-    """
-    step = max(1, math.ceil(len(points_mm) / MAX_SHOWN))
-    limit = max(float(np.percentile(np.abs(deviations_mm), 98)), 1e-6)
-    share = np.clip(0.5 + 0.5 * deviations_mm[::step] / limit, 0.0, 1.0)
-    colours = np.asarray(RAMP(share, bytes=True), dtype=np.uint8)[:, :3]
-    scene = scene_markup(
-        [SceneDots(points_mm[::step], colours)], [], [], title, is_z_up=frame != "Sensor"
-    )
-    text = significant(limit, "mm", 2)
-    every = f" One point in {step} is shown." if step > 1 else ""
-    return Picture(
-        ramp_markup(f"−{text}", f"+{text}", RAMP) + scene,
-        title=f"{title} ({frame} frame)",
-        caption=f"Colour is the deviation from {reference}; points beyond the ramp have its end's "
-        f"colour.{every}",
     )

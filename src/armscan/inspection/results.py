@@ -219,6 +219,8 @@ class StepInspection(ArrayRecord):
         Heights of the upper face's points over the fitted lower plane, minus the nominal height.
     heights_mm
         (U,) the same heights themselves (figure 5.19).
+    scatter_mm
+        What neighbouring points scatter by off the faces that they make; NaN where not known.
     """
 
     lower: IntArray = ints(None)
@@ -231,6 +233,7 @@ class StepInspection(ArrayRecord):
     nominal: Deviations
     heights_mm: FloatArray = floats(None)
     normal_rule: str
+    scatter_mm: float = math.nan
 
 
 WITHIN_MM = (0.03, 0.05, 0.08)

@@ -14,7 +14,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.features import Shape, fit_shape
 from armscan.geometry.shapes import Sphere, fit_sphere
 from armscan.inspection.results import PointCounts, SphereInspection, describe_deviations
-from armscan.inspection.search import NOISE_BAND, RADIUS_SLACK, sample_of
+from armscan.inspection.search import RADIUS_SLACK, scatter_about_mm
 from armscan.inspection.selection import (
     MIN_POINTS,
     OUTLIER_RULE,
@@ -89,13 +89,11 @@ def inspect_sphere(
         ball = _settled(selection, Sphere(others[0].centre_mm, diameter_mm / 2.0), diameter_mm)
         if isinstance(ball, SphereInspection):
             found, post, others = ball, None, others[1:]
-    sample = sample_of(replace(selection, rows=found.rows))
-    scatter_mm = sample.noise_mm / NOISE_BAND
     return replace(
         found,
         others=others,
         post=post,
-        scatter_mm=scatter_mm,
+        scatter_mm=scatter_about_mm(selection, found.rows),
         centre_sigma_mm=_centre_sigma_mm(cloud, found),
     )
 

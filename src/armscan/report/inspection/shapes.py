@@ -264,11 +264,15 @@ def _ball_warnings(found: SphereInspection) -> tuple[str, ...]:
             f"the points cover a cap of only {found.seen_cap_deg:.0f} degrees half opening, where "
             "centre and diameter are poorly told apart; scan more of the ball"
         )
-    told += [
-        f"another ball, of {2.0 * one.radius_mm:.4g} mm, is centred at {triple(one.centre_mm)} mm; "
-        "measured was the one on which most points lie: show which is meant with --region"
+    others = [
+        f"another ball, of {2.0 * one.radius_mm:.4g} mm, is centred at {triple(one.centre_mm)} mm"
         for one in found.others
     ]
+    if others:
+        told.append(
+            f"{', '.join(others)}; measured was the one on which most points lie: show which is "
+            "meant with --region"
+        )
     return tuple(told)
 
 
@@ -290,16 +294,34 @@ def shape_warnings(
             f"{significant(rms, 'mm', 2)} off the {kind}; scan it from more sides, or show where "
             f"the {kind} is with --region",
         )
-    variance = np.median(np.einsum("nii->n", cloud.covariance_mm2[rows])) / 3.0
-    stated = BEYOND_STATED * math.sqrt(max(float(variance), 0.0))
     is_round = isinstance(found, SphereInspection) or found.shape.kind in ROUND
-    # written so that a scatter that is not known warns of nothing
-    if not is_round or not rms > max(OTHER_SHAPE * found.scatter_mm, stated):
+    if not is_round or not _is_far(rms, found.scatter_mm, cloud, rows):
         return ()
     return (
         f"{whose}the points may be of no {kind}: they lie {significant(rms, 'mm', 2)} (rms) off "
         f"it, {rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, "
         "and show where it is by a region or a seed",
+    )
+
+
+def _is_far(rms: float, scatter_mm: float, cloud: PointCloud, rows: IntArray) -> bool:
+    """Whether points are much farther off a shape than they scatter, and than their sigmas say."""
+    variance = np.median(np.einsum("nii->n", cloud.covariance_mm2[rows])) / 3.0
+    stated = BEYOND_STATED * math.sqrt(max(float(variance), 0.0))
+    # written so that a scatter that is not known is no doubt
+    return bool(rms > OTHER_SHAPE * scatter_mm and rms > stated)
+
+
+def _face_warnings(found: StepInspection, cloud: PointCloud) -> tuple[str, ...]:
+    """Warn of faces that are bent, as parts of a ball are."""
+    rms = found.fitted.value("rms_mm")
+    both = np.concatenate([found.lower, found.upper])
+    if not _is_far(rms, found.scatter_mm, cloud, both):
+        return ()
+    return (
+        f"the two faces are not flat: their points lie {significant(rms, 'mm', 2)} (rms) off them, "
+        f"{rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, and "
+        "show where the step is with --region",
     )
 
 
@@ -385,7 +407,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
             ),
         ),
         counts=found.counts,
-        warnings=point_warnings(found.counts, cloud),
+        warnings=(*point_warnings(found.counts, cloud), *_face_warnings(found, cloud)),
     )
 
 

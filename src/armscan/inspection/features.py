@@ -519,10 +519,10 @@ def relate(cloud: PointCloud, first: FeatureInspection, second: FeatureInspectio
     """
     shared = len(np.intersect1d(first.rows, second.rows))
     if shared > SAME_PART * min(len(first.rows), len(second.rows)):
-        x, y, z = first.shape.point_mm
+        place = ",".join(f"{round(value, 3) + 0.0:.10g}" for value in first.shape.point_mm.tolist())
         raise OptionError(
             f"both features are one: they share {shared} of {len(first.rows)} and "
-            f"{len(second.rows)} points, about {x:.4g},{y:.4g},{z:.4g}",
+            f"{len(second.rows)} points, about {place}",
             where="the second feature",
             remedy=f"give it the seed or region of another {second.shape.kind}, as "
             f"{second.shape.kind}:seed=x,y,z with a point on that",

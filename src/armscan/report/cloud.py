@@ -130,9 +130,11 @@ def passes_text(scan: ScanReconstruction) -> str:
     found = scan.doubt.agreement
     if found is None:
         return "no two of them overlap, so the scan cannot be checked against itself"
+    n = len(found.pairs)
+    most = f"at most {significant(found.worst_mm)} mm"
+    pairs = f" (median of {n} pairs; {most})" if n > 1 else " (one pair)"
     return (
-        f"{significant(found.distance_mm)} mm apart where they overlap (median of "
-        f"{len(found.pairs)} pairs; at most {significant(found.worst_mm)} mm), "
+        f"{significant(found.distance_mm)} mm apart where they overlap{pairs}, "
         f"{significant(found.ratio, '', 2)} times what is expected"
     )
 

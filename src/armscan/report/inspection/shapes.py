@@ -58,8 +58,7 @@ STATEMENT = (
     "defines them; this is not an accredited test."
 )
 NO_SIGMA = (
-    "the cloud carries no standard deviations and no exposures, so it is not known how well the "
-    "fit is determined"
+    "the cloud carries no standard deviations, so it is not known how well the fit is determined"
 )
 FUSED_SIGMA = (
     "the cloud is fused and no longer tells its exposures apart, so that no ± and no U is known; "
@@ -83,7 +82,8 @@ bosses and balls have 3 at most, a cylinder in a cone of 25 degrees or in two fl
 more. And in stated sigmas, for stripes that an arm shifts are smooth themselves."""
 NARROW_CAP_DEG = 60.0
 MANY_OUTLIERS = 0.01
-FOREIGN_FRAME = "a frame that the file does not name"
+UNNAMED = "Part"
+AS_NAMED = ", as it is called where a file names none"
 BAND_MM = 0.05
 LEAST_HALF_WIDTH_MM = 0.01
 
@@ -518,9 +518,8 @@ def form_card(fitted: Deviations) -> Quantity:
 
 def point_subtitle(counts: PointCounts, cloud: PointCloud) -> str:
     """How many points, and in which frame."""
-    has_frame = bool(cloud.sheet_names[0]) if cloud.sheet_names else False
-    frame = f"the {cloud.frame} frame" if has_frame else FOREIGN_FRAME
-    return f"{counts.n_feature:,} points in {frame}"
+    is_named = cloud.frame != UNNAMED or any(cloud.sheet_names)
+    return f"{counts.n_feature:,} points in the {cloud.frame} frame{'' if is_named else AS_NAMED}"
 
 
 def point_warnings(
@@ -631,7 +630,8 @@ def deviation_histogram(
         axes.set_xlabel(f"{axis_label}, from the {deviations.reference} reference")
         axes.set_ylabel("points")
         axes.grid(axis="y")
-        axes.set_title(f"{share:.2f} % of {len(values):,} points within {BAND_MM:g} mm", loc="left")
+        told = f"{share_text(share)} of {len(values):,} points within {BAND_MM:g} mm"
+        axes.set_title(told, loc="left")
     parts = [f"Deviations from {deviations.reference_text}; {deviations.points_text}."]
     if beyond := counted.n_below + counted.n_above:
         parts.append(

@@ -88,6 +88,20 @@ def test_a_page_of_a_foreign_cloud_does_not_contradict_itself(
     assert titles == ["above 99.99 % of 30,000 points within 0.05 mm"]
 
 
+@pytest.mark.parametrize("words", [("step", "--height", "20"), ("plane",)])
+def test_a_cloud_without_sheets_is_said_to_have_none(
+    words: tuple[str, ...], clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its points were called those of one exposure."""
+    foreign = tmp_path / "block.xyz"
+    foreign.write_bytes(xyz_bytes(read_ply(clouds / "block.ply")))
+    for path in (foreign, clouds / "block.ply"):
+        assert main(["inspect", words[0], str(path), *words[1:]]) == 0
+        out = capsys.readouterr().out
+        assert ("the cloud does not tell which points lie in one" in out) == (path == foreign)
+        assert "one exposure" not in out
+
+
 def test_a_step_and_a_plane(clouds: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = report(capsys, "step", clouds / "block.ply", "--height", 20, "--margin", 2)
     assert found["height_error_mm"] == pytest.approx(0.0, abs=1e-9)

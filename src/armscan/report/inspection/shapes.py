@@ -64,6 +64,10 @@ FUSED_SIGMA = (
     "the cloud is fused and no longer tells its exposures apart, so that no ± and no U is known; "
     "inspect the cloud from before it was fused"
 )
+NO_SHEETS = (
+    "the cloud does not tell which points lie in one (fused, XYZ, STL or foreign): one may be "
+    "taken for a face"
+)
 MUCH_BEYOND = 0.05
 """Part of the points on a fitted plane that may lie too far from the nominal one to count."""
 SCATTER_IN_PROPAGATED = (
@@ -134,6 +138,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         ),
         fact("Middle of the points", f"{triple(found.plane.point_mm)} mm"),
         fact("Positive", found.side_text),
+        *_sheet_facts(cloud),
         *deviation_quantities("fitted", found.fitted),
     ]
     if found.nominal is None or found.offset is None:
@@ -174,6 +179,13 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         counts=found.counts,
         warnings=(*point_warnings(found.counts, cloud), *_beyond_warnings(found)),
     )
+
+
+def _sheet_facts(cloud: PointCloud) -> tuple[Quantity, ...]:
+    """Of a search for faces in a cloud that does not tell its sheets."""
+    if any(cloud.sheet_names) and not cloud.is_fused:
+        return ()
+    return (fact("Light sheets", NO_SHEETS),)
 
 
 def _beyond_warnings(found: PlaneInspection) -> tuple[str, ...]:
@@ -334,7 +346,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
     nominal_mm = found.nominal_height_mm
     error = found.height.value_mm - nominal_mm
     both = np.concatenate([found.lower, found.upper])
-    is_still = len(np.unique(cloud.exposure[both])) == 1
+    is_still = not _sheet_facts(cloud) and len(np.unique(cloud.exposure[both])) == 1
     mean, std = float(found.heights_mm.mean()), float(found.heights_mm.std(ddof=1))
     told = (
         Quantity("feature", "", "step"),
@@ -366,6 +378,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
             "On each face",
             f"{len(found.lower):,} points on the lower face, {len(found.upper):,} on the upper",
         ),
+        *_sheet_facts(cloud),
         *((STILL_SIGMA,) if is_still else sigma_facts(found.height, "height")),
         *deviation_quantities("fitted", found.fitted),
         *deviation_quantities("nominal", found.nominal),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from armscan.cli import main
 from armscan.storage.clouds import ply_bytes, read_ply, xyz_bytes
@@ -64,6 +65,41 @@ def test_a_ball_of_another_program_has_no_sigma(
     assert "nominal 34.96 mm" in diameter
     assert "±" not in diameter
     assert "carries no standard deviations" in out
+
+
+def test_a_page_of_a_foreign_cloud_does_not_contradict_itself(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither of its frame, nor of its exposures, nor of shares next to all."""
+    path, page = tmp_path / "plane.csv", tmp_path / "plane.html"
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(0.0, 50.0, (30_000, 2)), rng.normal(0.0, 0.005, 30_000)])
+    points[0, 2] = 0.4
+    path.write_text("x,y,z\n" + "".join("{:.4f},{:.4f},{:.4f}\n".format(*row) for row in points))
+    titles: list[str] = []
+    monkeypatch.setattr(Axes, "set_title", lambda _, text, **__: titles.append(text))
+    report(capsys, "plane", path, "-o", page)
+    text = page.read_text(encoding="utf-8")
+    assert "in the Part frame, as it is called where a file names none" in text
+    assert "does not name" not in text
+    assert "exposures are not told apart" in text
+    assert "in 1 exposure" not in text
+    assert "above 99.99 %" in text
+    assert titles == ["above 99.99 % of 30,000 points within 0.05 mm"]
+
+
+@pytest.mark.parametrize("words", [("step", "--height", "20"), ("plane",)])
+def test_a_cloud_without_sheets_is_said_to_have_none(
+    words: tuple[str, ...], clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its points were called those of one exposure."""
+    foreign = tmp_path / "block.xyz"
+    foreign.write_bytes(xyz_bytes(read_ply(clouds / "block.ply")))
+    for path in (foreign, clouds / "block.ply"):
+        assert main(["inspect", words[0], str(path), *words[1:]]) == 0
+        out = capsys.readouterr().out
+        assert ("the cloud does not tell which points lie in one" in out) == (path == foreign)
+        assert "one exposure" not in out
 
 
 def test_a_step_and_a_plane(clouds: Path, capsys: pytest.CaptureFixture[str]) -> None:

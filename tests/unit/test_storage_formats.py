@@ -369,6 +369,42 @@ def test_a_file_cut_short_is_refused(tmp_path: Path, suffix: str, kept: float) -
     assert caught.value.remedy
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".xyz"])
+def test_a_table_of_ours_is_refused_wherever_it_is_cut(tmp_path: Path, suffix: str) -> None:
+    """At a line's end it was read as a whole one; without its count it still is."""
+    path = tmp_path / f"cloud{suffix}"
+    write_cloud(path, cloud(7))
+    whole = path.read_bytes()
+    assert len(read_cloud(path)) == 7
+    for n in range(1, len(whole)):
+        path.write_bytes(whole[:n])
+        with pytest.raises(ArmscanError) as caught:
+            read_cloud(path)
+        if whole[:n].count(b"\n") >= whole.count(b"\n") - 6:
+            assert "seems cut" in caught.value.what
+            assert "line " in caught.value.what
+    lines = whole.splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:-2]))
+    with pytest.raises(FileFormatError, match="tells of 7 points, and it holds 5") as caught:
+        read_cloud(path)
+    assert "delete the line '# points 7'" in caught.value.remedy
+    path.write_bytes(b"".join(line for line in lines[:-2] if line != b"# points 7\n"))
+    assert len(read_cloud(path)) == 5
+    path.write_bytes(b"".join([*lines, lines[-1]]))
+    with pytest.raises(FileFormatError, match="tells of 7 points, and it holds 8"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("end", ["4.5,", "4.5,x", "4.5,-", "4"])
+def test_a_foreign_table_that_ends_within_a_line_is_told(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "cloud.csv"
+    path.write_text(f"# points 9\n1.5,2.5,3.5\n1.5,2.5,4.5\n2.5,{end}")
+    with pytest.raises(FileFormatError, match=r"seems cut: it ends within line 4, '2\.5,"):
+        read_cloud(path)
+    path.write_text("# points 9\n1.5,2.5,3.5\n1.5,2.5,4.5\n2.5,4.5,6.5")
+    assert len(read_cloud(path)) == 3, "another program's count may be of anything"
+
+
 @pytest.mark.parametrize("suffix", [".e57", ".laz", ".las", ".pcd"])
 def test_damaged_bytes_never_end_in_a_traceback(tmp_path: Path, suffix: str) -> None:
     """Either they are refused in words, or the damage lies where nothing can tell."""

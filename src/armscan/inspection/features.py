@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import combinations_with_replacement
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -48,8 +47,8 @@ from armscan.inspection.selection import (
     fit_robustly,
     select,
 )
-from armscan.inspection.sphere import cap_deg
-from armscan.inspection.uncertainty import FitErrors, FitLinearised
+from armscan.inspection.sphere import cap_deg, post_of
+from armscan.inspection.uncertainty import FitErrors, FitLinearised, worst_sigma
 from armscan.records.cloud import PointCloud
 
 FORMS = {
@@ -110,6 +109,8 @@ class FeatureInspection(ArrayRecord):
         Extent of the points along the axis or line; 0 for others.
     scatter_mm
         What neighbouring points scatter by off the faces that they make; NaN where not known.
+    post
+        Of a sphere, a cylinder to which its points are as near; else None.
     """
 
     wanted: WantedFeature
@@ -126,6 +127,7 @@ class FeatureInspection(ArrayRecord):
     seen_deg: float
     length_mm: float
     scatter_mm: float = math.nan
+    post: Shape | None = None
 
     @property
     def form_mm(self) -> float:
@@ -188,7 +190,9 @@ def inspect_feature(
     told = _described(selection, wanted, shape, chosen, is_fitted)
     if isinstance(told, FitFailure):
         return told
-    return replace(told, scatter_mm=sample.noise_mm / NOISE_BAND)
+    is_ball = shape.kind == "sphere"
+    post = post_of(cloud, told.rows[is_fitted], shape) if is_ball else None
+    return replace(told, scatter_mm=sample.noise_mm / NOISE_BAND, post=post)
 
 
 def inspect_points(
@@ -415,21 +419,8 @@ class Fitted:
     def _worst_sigma(
         self, axes: FloatArray, value: Callable[[FloatArray, tuple[Shape, ...]], float]
     ) -> float:
-        """Along the worst of all ways in the span of axes (K, 3).
-
-        The variances along the axes and along their sums tell that along any way.
-        """
-        n = len(axes)
-        own = np.zeros((n, n))
-        for i, j in combinations_with_replacement(range(n), 2):
-            way = axes[i] if i == j else axes[i] + axes[j]
-            own[i, j] = own[j, i] = together((self,), partial(value, way)).sigma_mm ** 2
-        if not np.isfinite(own).all():
-            return math.nan
-        variance = np.diag(own)
-        covariance = 0.5 * (own - variance[:, None] - variance)
-        np.fill_diagonal(covariance, variance)
-        return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
+        """Along the worst of all ways in the span of axes (K, 3)."""
+        return worst_sigma(axes, lambda way: together((self,), partial(value, way)).sigma_mm)
 
 
 def _along(way: FloatArray, shapes: tuple[Shape, ...]) -> float:
@@ -528,10 +519,10 @@ def relate(cloud: PointCloud, first: FeatureInspection, second: FeatureInspectio
     """
     shared = len(np.intersect1d(first.rows, second.rows))
     if shared > SAME_PART * min(len(first.rows), len(second.rows)):
-        x, y, z = first.shape.point_mm
+        place = ",".join(f"{round(value, 3) + 0.0:.10g}" for value in first.shape.point_mm.tolist())
         raise OptionError(
             f"both features are one: they share {shared} of {len(first.rows)} and "
-            f"{len(second.rows)} points, about {x:.4g},{y:.4g},{z:.4g}",
+            f"{len(second.rows)} points, about {place}",
             where="the second feature",
             remedy=f"give it the seed or region of another {second.shape.kind}, as "
             f"{second.shape.kind}:seed=x,y,z with a point on that",

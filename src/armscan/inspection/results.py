@@ -21,6 +21,7 @@ from armscan.geometry.arrays import (
     floats,
     ints,
 )
+from armscan.geometry.features import Shape
 from armscan.geometry.shapes import Plane, Sphere
 
 ReferenceKind = Literal["nominal", "fitted"]
@@ -175,8 +176,15 @@ class SphereInspection(ArrayRecord):
     seen_cap_deg
         Half opening of the smallest cap about the mean direction that holds the points; 180 is
         the whole ball.
-    other
-        Another ball of that diameter among the points that were looked at; None if there is none.
+    centre_sigma_mm
+        Standard deviation of the centre along the worst way in space; NaN where not known.
+    others
+        Other balls of that diameter among the points that were looked at.
+    post
+        A cylinder of the ball's diameter to which its points are as near: they may be of a disc or
+        a post; None if there is none.
+    scatter_mm
+        What neighbouring points scatter by off the faces that they make; NaN where not known.
     """
 
     sphere: Sphere
@@ -188,7 +196,10 @@ class SphereInspection(ArrayRecord):
     fitted: Deviations
     nominal: Deviations
     seen_cap_deg: float
-    other: Sphere | None = None
+    centre_sigma_mm: float = math.nan
+    others: tuple[Sphere, ...] = ()
+    post: Shape | None = None
+    scatter_mm: float = math.nan
 
 
 class StepInspection(ArrayRecord):
@@ -208,6 +219,8 @@ class StepInspection(ArrayRecord):
         Heights of the upper face's points over the fitted lower plane, minus the nominal height.
     heights_mm
         (U,) the same heights themselves (figure 5.19).
+    scatter_mm
+        What neighbouring points scatter by off the faces that they make; NaN where not known.
     """
 
     lower: IntArray = ints(None)
@@ -220,6 +233,7 @@ class StepInspection(ArrayRecord):
     nominal: Deviations
     heights_mm: FloatArray = floats(None)
     normal_rule: str
+    scatter_mm: float = math.nan
 
 
 WITHIN_MM = (0.03, 0.05, 0.08)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -226,6 +226,11 @@ class Sample:
         sine = np.abs(np.einsum("ni,ni->n", outward, self.along[which]))
         is_square = (cosine >= SAME_SIDE) | ~normals.any(axis=1)
         return np.asarray(is_square & (sine <= ACROSS))
+
+
+def scatter_about_mm(selection: Selection, rows: IntArray) -> float:
+    """What points (N,) of a cloud scatter by off the faces that neighbours among them make."""
+    return sample_of(replace(selection, rows=rows)).noise_mm / NOISE_BAND
 
 
 def sample_of(selection: Selection) -> Sample:

@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, Box, FloatArray
+from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.features import Shape, fit_shape
 from armscan.geometry.shapes import Sphere, fit_sphere
 from armscan.inspection.results import PointCounts, SphereInspection, describe_deviations
+from armscan.inspection.search import RADIUS_SLACK, scatter_about_mm
 from armscan.inspection.selection import (
     MIN_POINTS,
     OUTLIER_RULE,
@@ -25,7 +27,7 @@ from armscan.inspection.selection import (
     least_concentration,
     select,
 )
-from armscan.inspection.uncertainty import FitLinearised, measured_length
+from armscan.inspection.uncertainty import FitErrors, FitLinearised, measured_length, worst_sigma
 from armscan.records.cloud import PointCloud
 
 LARGEST_MISFIT = 0.02
@@ -41,6 +43,12 @@ AS_ROUND, EXACT_MM = 3.0, 1e-6
 """Scatter of another ball's points, over that of the first's, and of points without any."""
 LEAST_OTHER = 0.1
 """Points of another ball, over those of the one that is measured."""
+OTHER_PLACES = 12
+"""Where other balls are looked for."""
+AS_NEAR, N_COMPARED = 1.5, 2000
+"""Rms distance of points from a cylinder, over that from a ball, up to which they may be of a disc
+or a post: rims of discs have 1.3 at most, caps of balls of 10 degrees and more 2.5 at least. And of
+how many of the points it is taken."""
 
 
 def inspect_sphere(
@@ -74,30 +82,82 @@ def inspect_sphere(
     found = _found(selection, diameter_mm)
     if isinstance(found, FitFailure):
         return found
-    apart = found.sphere.distance_mm(selection.points_mm)
-    rest = replace(selection, rows=selection.rows[apart > selection.feature_mm])
-    if len(rest.rows) < MIN_POINTS:
-        return found
-    other = _found(rest, diameter_mm)
-    if isinstance(other, FitFailure) or not _is_another(other, found):
-        return found
-    return replace(found, other=other.sphere)
+    post = post_of(selection.cloud, found.rows[found.is_fitted], found.sphere)
+    others = _others(selection, found)
+    if post is not None and others:
+        # a disc with more points than the ball
+        ball = _settled(selection, Sphere(others[0].centre_mm, diameter_mm / 2.0), diameter_mm)
+        if isinstance(ball, SphereInspection):
+            found, post, others = ball, None, others[1:]
+    return replace(
+        found,
+        others=others,
+        post=post,
+        scatter_mm=scatter_about_mm(selection, found.rows),
+        centre_sigma_mm=_centre_sigma_mm(cloud, found),
+    )
+
+
+def _centre_sigma_mm(cloud: PointCloud, found: SphereInspection) -> float:
+    used = found.rows[found.is_fitted]
+    errors = FitErrors.of(linearised_sphere(found.sphere, cloud.points_mm[used]), cloud, used)
+    return worst_sigma(np.eye(3), lambda way: errors.measured(0.0, np.append(way, 0.0)).sigma_mm)
+
+
+def post_of(cloud: PointCloud, rows: IntArray, ball: Sphere | Shape) -> Shape | None:
+    """A cylinder of the ball's diameter to which points are as near; None if there is none.
+
+    A ball is round in two ways, the rim of a disc and a short post in one.
+
+    ``rows`` are those (N,) of the points in the cloud that the ball was fitted to.
+    """
+    points = cloud.points_mm[np.random.default_rng(0).permutation(rows)[:N_COMPARED]]
+    fit = fit_shape("cylinder", points)
+    if isinstance(fit, FitFailure):
+        return None
+    post = fit.value
+    off_mm, usual_mm = (
+        float(np.sqrt(np.mean(one.distance_mm(points) ** 2))) for one in (post, ball)
+    )
+    is_as_wide = abs(post.radius_mm - ball.radius_mm) < RADIUS_SLACK * ball.radius_mm
+    return post if is_as_wide and off_mm < AS_NEAR * usual_mm else None
+
+
+def _others(selection: Selection, found: SphereInspection) -> tuple[Sphere, ...]:
+    """Other balls of that diameter, in the order in which they are found; no discs and posts."""
+    rest, place, balls = selection, found, [found]
+    for _ in range(OTHER_PLACES):
+        is_away = place.sphere.distance_mm(rest.points_mm) > rest.feature_mm
+        rest = replace(rest, rows=rest.rows[is_away])
+        if len(rest.rows) < MIN_POINTS:
+            break
+        at = _found(rest, found.nominal_diameter_mm)
+        if isinstance(at, FitFailure):
+            break
+        place = at
+        is_another = _is_another(at, found) and all(_are_apart(at, ball) for ball in balls)
+        if is_another and post_of(rest.cloud, at.rows[at.is_fitted], at.sphere) is None:
+            balls.append(at)
+    return tuple(ball.sphere for ball in balls[1:])
+
+
+def _are_apart(one: SphereInspection, other: SphereInspection) -> bool:
+    """Whether two balls have room beside each other."""
+    apart_mm = float(np.linalg.norm(one.sphere.centre_mm - other.sphere.centre_mm))
+    return apart_mm > BESIDE * one.nominal_diameter_mm
 
 
 def _is_another(other: SphereInspection, found: SphereInspection) -> bool:
-    """True of a ball that is as well seen and as round as the first, and not in its place.
+    """True of a ball that is as well seen and as round as the first.
 
-    Strays lie about the first; a post of that diameter is round one way only.
+    A post of that diameter is round one way only.
     """
-    apart_mm = float(np.linalg.norm(other.sphere.centre_mm - found.sphere.centre_mm))
     off_mm, usual_mm = (
         float(np.sqrt(np.mean(one.fitted.deviations_mm[one.is_fitted] ** 2)))
         for one in (other, found)
     )
     return (
-        apart_mm > BESIDE * found.nominal_diameter_mm
-        and len(other.rows) > LEAST_OTHER * len(found.rows)
-        and off_mm < AS_ROUND * usual_mm + EXACT_MM
+        len(other.rows) > LEAST_OTHER * len(found.rows) and off_mm < AS_ROUND * usual_mm + EXACT_MM
     )
 
 

@@ -19,6 +19,7 @@ from armscan.inspection.results import (
     StepInspection,
     describe_deviations,
 )
+from armscan.inspection.search import scatter_about_mm
 from armscan.inspection.selection import (
     MIN_POINTS,
     OUTLIER_RULE,
@@ -38,6 +39,9 @@ MAX_PEAKS = 60
 MAX_EXTENT_MM = 1e5
 """Heights about their median among which faces are looked for."""
 LEAST_INSIDE = 0.5
+LEAST_GATHERED, MOST_GATHERED = 0.3, 0.9
+"""What a face's points near to it are more than of points that fill its thickness evenly, as those
+of a ball do at any level; and the part of them that is always enough."""
 HEIGHT_TOLERANCE = 0.05
 """Faces are searched up to this part of the nominal height from it."""
 
@@ -380,6 +384,9 @@ def _fitted(search: _Search, faces: ParallelFaces) -> _Chosen | FitFailure:
             is_face = np.abs(distance) <= search.thickness_mm
             mask = away_from_ends(flat, faces.normal, is_face, stripe, margin)
             if int(mask.sum()) < MIN_POINTS:
+                failure = _no_face(search, distance, is_face)
+                if failure is not None:
+                    return failure
                 return FitFailure(
                     f"a face of the step keeps {int(mask.sum())} of {int(is_face.sum())} points "
                     f"after {margin:g} mm at its ends are left out; {MIN_POINTS} are "
@@ -394,7 +401,27 @@ def _fitted(search: _Search, faces: ParallelFaces) -> _Chosen | FitFailure:
         if np.array_equal(used, kept[0] | kept[1]):
             break
         used = kept[0] | kept[1]
+    for level, mask in zip((faces.lower_mm, faces.upper_mm), masks, strict=True):
+        failure = _no_face(search, flat @ faces.normal - level, mask)
+        if failure is not None:
+            return failure
     return _Chosen(faces, masks[0], masks[1], used)
+
+
+def _no_face(search: _Search, distance: FloatArray, is_face: BoolArray) -> FitFailure | None:
+    """Why points (N,) that lie about a level are of no face there; None if they are of one."""
+    thickness_mm = search.thickness_mm
+    bands_mm = np.minimum(search.selection.search_band_mm[is_face], thickness_mm / 2.0)
+    band_mm = float(np.median(bands_mm))
+    n_near, n = int((np.abs(distance[is_face]) <= bands_mm).sum()), int(is_face.sum())
+    if n_near >= min(band_mm / thickness_mm + LEAST_GATHERED, MOST_GATHERED) * n:
+        return None
+    return FitFailure(
+        f"there are no two parallel faces {search.height_mm:g} mm apart: at the best place for "
+        f"one, only {n_near} of {n} points within {thickness_mm:.3g} mm lie within {band_mm:.2g} "
+        "mm of it",
+        "check the height, or show where the step is with --region",
+    )
 
 
 def _lean(section: _Section, upwards: FloatArray, normal: FloatArray | None) -> tuple[float, str]:
@@ -431,9 +458,14 @@ def _measured(search: _Search, chosen: _Chosen, lean: float, rule: str) -> StepI
     own = np.concatenate([along[chosen.is_lower] - low, heights - height])
     flats = "planes" if section.sheet_normal is None else "lines"
     n_low, n_up = int(chosen.is_lower.sum()), int(chosen.is_upper.sum())
+    lower, upper = (search.selection.rows[face] for face in (chosen.is_lower, chosen.is_upper))
+    # one light sheet holds no neighbourhoods that are faces
+    scatter_mm = math.nan
+    if section.sheet_normal is None:
+        scatter_mm = scatter_about_mm(search.selection, np.concatenate([lower, upper]))
     return StepInspection(
-        lower=search.selection.rows[chosen.is_lower],
-        upper=search.selection.rows[chosen.is_upper],
+        lower=lower,
+        upper=upper,
         normal=full,
         nominal_height_mm=nominal,
         height=_height(search, chosen, height, full, math.cos(lean)),
@@ -453,6 +485,7 @@ def _measured(search: _Search, chosen: _Chosen, lean: float, rule: str) -> StepI
         ),
         heights_mm=heights,
         normal_rule=rule,
+        scatter_mm=scatter_mm,
     )
 
 

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -71,6 +73,23 @@ def measured_length(
     the points of the fit.
     """
     return FitErrors.of(fit, cloud, rows).measured(value_mm, slope)
+
+
+def worst_sigma(axes: FloatArray, sigma_along: Callable[[FloatArray], float]) -> float:
+    """Standard deviation along the worst of all ways in the span of axes (K, 3); NaN if unknown.
+
+    The variances along the axes and along their sums tell that along any way.
+    """
+    n = len(axes)
+    own = np.zeros((n, n))
+    for i, j in combinations_with_replacement(range(n), 2):
+        own[i, j] = own[j, i] = sigma_along(axes[i] if i == j else axes[i] + axes[j]) ** 2
+    if not np.isfinite(own).all():
+        return math.nan
+    variance = np.diag(own)
+    covariance = 0.5 * (own - variance[:, None] - variance)
+    np.fill_diagonal(covariance, variance)
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
 
 
 def exposure_blocks(exposure: IntArray, most: int) -> tuple[IntArray, int]:

@@ -25,6 +25,7 @@ from armscan.pipeline.measure import (
     labeller_for,
     measure_instants,
     summarised,
+    unknown_lasers,
 )
 from armscan.pipeline.progress import Progress, silent
 from armscan.reconstruction.labels import LabelledProfile, PointStatus
@@ -169,6 +170,7 @@ def observe_stripes(
     not_used = tuple((source.rows[row].source, reason) for row, reason in reasons.items())
     warnings = (
         *poses.warnings,
+        *unknown_lasers(source.rows, sensor, options),
         *_left_out(len(chosen), int(has_pose.sum()), not_used),
         *merged,
         *summarised(weak),

@@ -145,7 +145,8 @@ def pair_by_view(exposures: Sequence[Exposure]) -> list[ExposurePair]:
 
 WINDOW_REMEDY = (
     "use images of the camera's full size; if the sensor read a window, say where it begins by "
-    "window_x_px and window_y_px under [[camera]] in session.toml"
+    "window_x_px and window_y_px under [[camera]] in session.toml; if they are whole, the "
+    "calibration is of another head: give that of the head that took them"
 )
 
 
@@ -168,7 +169,8 @@ def check_sizes(exposures: Iterable[Exposure], camera: CameraModel) -> None:
                 where=exposure.source,
                 remedy=WINDOW_REMEDY
                 if is_window
-                else "use images of the camera that was calibrated",
+                else "the calibration is of another camera or head, or the images were resized: "
+                "give the calibration of the camera that took them",
             )
 
 
@@ -423,7 +425,7 @@ class ScanInstants:
                 f"the scan holds exposures of camera{'s' if len(cameras) > 1 else ''} "
                 f"{', '.join(map(str, cameras))}, the scanner has {n_cameras}",
                 where=source.name,
-                remedy="give the scanner's calibration that belongs to this scan",
+                remedy="the scanner's document is of another head: give the one of this scan",
             )
         lit = [bool(row.lasers) for row in source.rows]
         self.is_lit: BoolArray = np.array(lit if any(lit) else [True] * len(lit), dtype=np.bool_)

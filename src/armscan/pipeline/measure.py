@@ -50,6 +50,7 @@ from armscan.reconstruction.triangulate import (
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
+from armscan.records.recording import ExposureRow
 from armscan.storage.detection_cache import DetectionCache, detection_key
 from armscan.thesis.row_rule import RowLabeller
 from armscan.vision.stripe.extract import extract_stripes
@@ -658,3 +659,20 @@ def measurement_warnings(
                 "stripes checks it"
             )
     return tuple(warnings)
+
+
+def unknown_lasers(
+    rows: Sequence[ExposureRow], sensor: SensorCalibration, options: MeasureOptions
+) -> tuple[str, ...]:
+    """Warn of lasers that exposures name but the calibration has no sheet of."""
+    sheets = [sheet.name for sheet in sensor.sheets]
+    known = {*sheets, *(name.partition(".")[0] for name in sheets)}
+    named = {laser for row in rows for laser in row.lasers}
+    if options.sheet or not named - known:
+        return ()
+    lasers, names = ", ".join(sorted(named - known)), ", ".join(sheets)
+    return (
+        f"exposures name the laser {lasers}, of which the calibration has no sheet: their stripes "
+        f"were measured as if they were of {names}. If one of these is it under another name, "
+        "`armscan reconstruct` takes that by --sheet; else the calibration is of another head",
+    )

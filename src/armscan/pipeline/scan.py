@@ -19,7 +19,7 @@ from armscan.fusion.point_spool import PointSpool
 from armscan.fusion.scan_normals import ScanNormals, choose_scan_radius_mm
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
-from armscan.models.calibration import ScannerCalibration, SensorCalibration
+from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.instants import (
     PARTNER_MISSING,
     Instant,
@@ -39,6 +39,7 @@ from armscan.pipeline.measure import (
     nothing_measured,
     scan_as_seen,
     summarised,
+    unknown_lasers,
 )
 from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan, doubt_times
@@ -393,7 +394,7 @@ def measure_long_scan(
             *measurement_warnings(counts, found.depths, sensor),
             *extra,
             *doubt.warnings,
-            *_unknown_lasers(source, sensor, options.measure),
+            *unknown_lasers(source.rows, sensor, options.measure),
             *summarised(found.weak),
         ),
         doubt=doubt,
@@ -473,22 +474,6 @@ def _hung(
     members = {first: [number[row] for row in group] for first, group in measured.items()}
     apart = stripes_at_equal_poses(_InstantClouds(points, members), poses)
     return {row: apart[first] for first in apart for row in measured[first]}
-
-
-def _unknown_lasers(
-    source: ScanSource, sensor: SensorCalibration, options: MeasureOptions
-) -> tuple[str, ...]:
-    """Lasers that exposures name but the calibration has no sheet of."""
-    sheets = [sheet.name for sheet in sensor.sheets]
-    known = {*sheets, *(name.partition(".")[0] for name in sheets)}
-    named = {laser for row in source.rows for laser in row.lasers}
-    if options.sheet or not named - known:
-        return ()
-    lasers, names = ", ".join(sorted(named - known)), ", ".join(sheets)
-    return (
-        f"exposures name the laser {lasers}, of which the calibration has no sheet: their stripes "
-        f"were measured as if they were of {names}; name the sheet with --sheet if that is so",
-    )
 
 
 def _exposures(

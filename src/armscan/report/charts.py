@@ -3,18 +3,39 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.camera import CameraModel
-from armscan.report.drawing import ACCENT, INK, chart_markup, new_figure, round_below, styled
+from armscan.report.drawing import (
+    ACCENT,
+    INK,
+    SceneDots,
+    chart_markup,
+    new_figure,
+    ramp_markup,
+    round_below,
+    scene_markup,
+    styled,
+)
 from armscan.report.page import Picture
+from armscan.report.quantity import significant
+
+MAX_SHOWN = 20_000
+RAMP = LinearSegmentedColormap.from_list(
+    "deviation", colormaps["cividis"](np.linspace(0.0, 0.93, 32))
+)
+"""As of the comparison with a model: lightness alone tells the sign, also in grey print and to
+colour-blind readers."""
 
 DIVERGING = "RdBu_r"
 PAGE_WIDTH = 10.4
@@ -156,3 +177,36 @@ def symmetric_edges(values: FloatArray, least: float = 0.0) -> FloatArray:
 def short(name: str, most: int = 28) -> str:
     """The end of a long name."""
     return name if len(name) <= most else f"…{name[1 - most :]}"
+
+
+def deviation_view(
+    points_mm: FloatArray, deviations_mm: FloatArray, *, title: str, frame: str, reference: str
+) -> Picture:
+    """Points in space, coloured by deviation: dark inside or below, light outside or above.
+
+    Parameters
+    ----------
+    points_mm, deviations_mm
+        (N, 3) and (N,).
+    title
+        Of the picture.
+    frame
+        Name of the coordinate frame.
+    reference
+        What the deviations are counted from, in words.
+    """
+    step = max(1, math.ceil(len(points_mm) / MAX_SHOWN))
+    limit = max(float(np.percentile(np.abs(deviations_mm), 98)), 1e-6)
+    share = np.clip(0.5 + 0.5 * deviations_mm[::step] / limit, 0.0, 1.0)
+    colours = np.asarray(RAMP(share, bytes=True), dtype=np.uint8)[:, :3]
+    scene = scene_markup(
+        [SceneDots(points_mm[::step], colours)], [], [], title, is_z_up=frame != "Sensor"
+    )
+    text = significant(limit, "mm", 2)
+    every = f" One point in {step} is shown." if step > 1 else ""
+    return Picture(
+        ramp_markup(f"−{text}", f"+{text}", RAMP) + scene,
+        title=f"{title} ({frame} frame)",
+        caption=f"Colour is the deviation from {reference}; points beyond the ramp have its end's "
+        f"colour.{every}",
+    )

@@ -17,6 +17,7 @@ from armscan.pipeline.measure import Reconstruction
 from armscan.pipeline.progress import ChainProfile
 from armscan.pipeline.scan import ExposureStatus, ScanReconstruction
 from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeCounts
+from armscan.reconstruction.pass_agreement import PassAgreement
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.report.charts import Bars, histogram_chart
@@ -115,7 +116,7 @@ def scan_quantities(scan: ScanReconstruction, digest: CloudDigest) -> tuple[Quan
         ),
         Quantity("poses_by", "Poses", scan.poses.source, shown=scan.poses.how),
         Quantity("max_gap_ns", "", scan.poses.max_gap_ns),
-        Quantity("passes", "Passes", passes, shown=passes_text(scan)),
+        Quantity("passes", "Passes", passes, shown=passes_text(scan.doubt.agreement)),
         Quantity("contradictions", "", list(scan.contradictions)),
         Quantity(
             "without_pose",
@@ -125,14 +126,15 @@ def scan_quantities(scan: ScanReconstruction, digest: CloudDigest) -> tuple[Quan
     )
 
 
-def passes_text(scan: ScanReconstruction) -> str:
+def passes_text(found: PassAgreement | None) -> str:
     """How far the passes of a scan agree, in words."""
-    found = scan.doubt.agreement
     if found is None:
         return "no two of them overlap, so the scan cannot be checked against itself"
+    n = len(found.pairs)
+    most = f"at most {significant(found.worst_mm)} mm"
+    pairs = f" (median of {n} pairs; {most})" if n > 1 else " (one pair)"
     return (
-        f"{significant(found.distance_mm)} mm apart where they overlap (median of "
-        f"{len(found.pairs)} pairs; at most {significant(found.worst_mm)} mm), "
+        f"{significant(found.distance_mm)} mm apart where they overlap{pairs}, "
         f"{significant(found.ratio, '', 2)} times what is expected"
     )
 

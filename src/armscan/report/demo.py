@@ -16,18 +16,17 @@ from armscan.pipeline.truth import HeadDemo, NamingErrors
 from armscan.reconstruction.labels import PointStatus
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
+from armscan.report.charts import deviation_view
 from armscan.report.cloud import cloud_view
 from armscan.report.drawing import Marks, photo_markup, scene_markup, uniform_dots
 from armscan.report.hand_eye import hand_eye_quantities, total_covariance
 from armscan.report.inspection.shapes import (
     deviation_histogram,
-    deviation_view,
     height_histogram,
-    share_text,
 )
 from armscan.report.page import Facts, Gallery, Page, Picture, Section, Text
 from armscan.report.photographs import sheet_colour
-from armscan.report.quantity import Quantity, Table, fact, for_people, significant
+from armscan.report.quantity import Quantity, Table, fact, for_people, share_text, significant
 
 Figures = Mapping[str, Any]
 """What `head_data` gives of one head."""

@@ -258,7 +258,9 @@ def stripe_quantities(profiles: Sequence[Profile]) -> tuple[Quantity, ...]:
         Quantity("n_images", "Images with a line", n_shown, meaning=f"of {len(profiles)}"),
         Quantity("n_points", "Points accepted", n_points, meaning=flagged),
         Quantity("sigma_px", "Sigma of a centre", sigma_px, unit="px", meaning=told),
-        Quantity("width_px", "Sigma of the line", width_px, unit="px", meaning="median"),
+        Quantity(
+            "width_px", "Sigma of the stripe", width_px, unit="px", meaning="across it, median"
+        ),
     )
 
 

@@ -217,6 +217,16 @@ def significant(value: float, unit: str = "", digits: int = 3) -> str:
     return f"{value:.{max(0, digits - 1 - magnitude)}f}{tail}"
 
 
+def share_text(percent: float) -> str:
+    """A share with two decimals that never reads 100 if something is outside."""
+    return "above 99.99 %" if 99.995 <= percent < 100.0 else f"{percent:.2f} %"
+
+
+def triple(values: Iterable[float], digits: int = 4) -> str:
+    """Three numbers with commas between them."""
+    return ", ".join(f"{value:.{digits}f}" for value in values)
+
+
 def sentence(text: str) -> str:
     """Text with a capital at its start and a full stop, or its question mark, at its end.
 

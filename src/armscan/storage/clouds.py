@@ -192,7 +192,7 @@ def cloud_parts(
     if suffix == ".ply":
         yield from ply_parts(marks, n_points, pieces, is_fused=is_fused)
     elif suffix in (".xyz", ".asc", ".txt"):
-        yield from text.xyz_parts(marks, pieces)
+        yield from text.xyz_parts(marks, n_points, pieces)
     else:
         whole = CloudPiece.joined(list(pieces))
         marked = replace(

@@ -41,7 +41,7 @@ def test_every_value_comes_back_to_the_last_bit(
         pixels = np.concatenate([piece.pixel_px for piece in pieces])
     assert ply_bytes(found) == ply_bytes(whole)
     assert b"".join(ply_parts(marks, len(whole), parts)) == ply_bytes(whole)
-    assert b"".join(xyz_parts(marks, parts)) == xyz_bytes(whole)
+    assert b"".join(xyz_parts(marks, len(whole), parts)) == xyz_bytes(whole)
     np.testing.assert_array_equal(pixels, np.concatenate([pixels_of(clouds[k], k) for k in KEPT]))
     assert starts == np.cumsum([0, *(len(part.cloud) for part in parts[:-1])]).tolist()
     assert len(pieces) > 1 or piece_points == 10**6

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -79,8 +81,10 @@ def test_a_bore_is_found_by_lone_stripes_down_its_wall(
 def test_one_feature_is_not_measured_against_itself(block: PointCloud) -> None:
     face = found(block, WantedFeature("plane"))
     again = found(block, WantedFeature("plane", axis=(0.0, 0.0, 1.0)))
-    with pytest.raises(OptionError, match="both features are one"):
+    with pytest.raises(OptionError, match="both features are one") as caught:
         relate(block, face, again)
+    place = caught.value.what.rpartition("about ")[2]
+    assert re.fullmatch(r"(-?\d+(\.\d{1,3})?,?){3}", place), "as --seed takes it"
     bore = found(block, WantedFeature("cylinder", diameter_mm=BORE_MM))
     angle = relate(block, face, bore).angle
     assert angle is not None

@@ -10,11 +10,15 @@ from scipy.optimize import least_squares
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.inspection.features import inspect_feature
 from armscan.inspection.results import SphereInspection
+from armscan.inspection.search import WantedFeature
 from armscan.inspection.selection import InspectionOptions
 from armscan.inspection.sphere import inspect_sphere
 from armscan.records.cloud import PointCloud
+from armscan.report.inspection.features import feature_report
 from armscan.report.inspection.shapes import sphere_report
+from armscan.report.quantity import Summary, summary_text, values
 from rigs.inspection_clouds import RADIUS_MM, ball_stripes, cloud_of, random_motion
 
 DIAMETER_MM = 2.0 * RADIUS_MM
@@ -73,7 +77,7 @@ def test_a_small_ball_is_found_above_a_large_table_on_a_post() -> None:
     found = inspected(inspect_sphere(cloud, DIAMETER_MM))
     assert found.counts.n_feature == 1200
     assert found.rows.min() == 9300
-    assert found.other is None
+    assert found.others == ()
     assert found.diameter.value_mm == pytest.approx(DIAMETER_MM, abs=0.003)
 
 
@@ -89,12 +93,119 @@ def test_another_ball_of_the_same_size_is_told(
     cloud = cloud_of(np.concatenate([beside, ball(DIAMETER_MM, 0.01)]))
     found = inspected(inspect_sphere(cloud, DIAMETER_MM))
     assert found.rows.min() == len(beside)
-    assert (found.other is not None) == is_told
-    if found.other is not None:
-        off = found.other.centre_mm - CENTRE - [apart_mm, 20.0, 0.0]
+    assert len(found.others) == is_told
+    for other in found.others:
+        off = other.centre_mm - CENTRE - [apart_mm, 20.0, 0.0]
         assert np.abs(off).max() < 0.02
     shown = sphere_report(found, cloud).warnings
     assert any("another ball, of 34.9" in text for text in shown) == is_told
+
+
+def test_every_other_ball_is_told_to_people_and_programs() -> None:
+    """Four balls in a row, and a disc of their diameter, which is none of them."""
+    rng = np.random.default_rng(4)
+    places = [np.array([60.0 * k, 10.0 * k * k, 0.0]) for k in range(4)]
+    balls = [(ball(DIAMETER_MM, 0.01, k) + at)[k * 100 :] for k, at in enumerate(places)]
+    disc = rim_of_a_disc(4.0, 0.01, rng) + CENTRE - [80.0, 0.0, 0.0]
+    cloud = cloud_of(np.concatenate([*balls, disc]))
+    found = inspected(inspect_sphere(cloud, DIAMETER_MM))
+    assert np.abs(found.sphere.centre_mm - CENTRE).max() < 0.02
+    told = {round(float(one.centre_mm[0] - CENTRE[0])): one for one in found.others}
+    assert sorted(told) == [60, 120, 180]
+    report = sphere_report(found, cloud)
+    shown = [text for text in report.warnings if text.startswith("another ball, of 34.9")]
+    assert [text.count("another ball, of 34.9") for text in shown] == [3]
+    listed = values(report.quantities)["other_balls"]
+    assert [item["centre_mm"] for item in listed] == [
+        one.centre_mm.tolist() for one in found.others
+    ]
+    assert all(abs(item["diameter_mm"] - DIAMETER_MM) < 0.01 for item in listed)
+
+
+def rim_of_a_disc(thick_mm: float, noise_mm: float, rng: np.random.Generator) -> FloatArray:
+    """3,000 points (3000, 3) of a disc's rim about the origin, its axis z."""
+    turn, height = rng.uniform(0.0, 2.0 * np.pi, 3000), rng.uniform(-0.5, 0.5, 3000) * thick_mm
+    radius = RADIUS_MM + rng.normal(0.0, noise_mm, 3000)
+    return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
+
+
+def drawn_shape(kind: str, seed: int) -> PointCloud:
+    """A ball's cap of 20 to 90 degrees, or a disc's rim, 1 to 10 mm, with its face or without.
+
+    Noise of 5 um to 0.1 mm, stated as sigma or not.
+    """
+    rng = np.random.default_rng(seed)
+    noise_mm = 10.0 ** rng.uniform(np.log10(0.005), -1.0)
+    if kind == "ball":
+        n, least = int(10.0 ** rng.uniform(2.0, 3.7)), np.cos(np.deg2rad(rng.uniform(20.0, 90.0)))
+        height, turn = rng.uniform(least, 1.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
+        wide = np.sqrt(1.0 - height**2)
+        outward = np.column_stack([wide * np.cos(turn), wide * np.sin(turn), height])
+        points = outward * (RADIUS_MM + rng.normal(0.0, noise_mm, (n, 1)))
+    else:
+        thick_mm = rng.uniform(1.0, 10.0)
+        points = rim_of_a_disc(thick_mm, noise_mm, rng)
+        if seed % 2:
+            turn = rng.uniform(0.0, 2.0 * np.pi, 6000)
+            wide = RADIUS_MM * np.sqrt(rng.uniform(0.0, 1.0, 6000))
+            height = thick_mm / 2.0 + rng.normal(0.0, noise_mm, 6000)
+            face = np.column_stack([wide * np.cos(turn), wide * np.sin(turn), height])
+            points = np.concatenate([points, face])
+    rotation, shift = random_motion(seed)
+    return cloud_of(points @ rotation.T + shift, sigma_mm=noise_mm * (seed % 3 > 0))
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("kind", ["ball", "disc"])
+def test_a_disc_is_not_measured_as_a_ball_without_a_word(kind: str, seed: int) -> None:
+    cloud = drawn_shape(kind, seed)
+    found = inspect_sphere(cloud, DIAMETER_MM)
+    if isinstance(found, FitFailure):
+        assert kind == "disc"
+        return
+    doubts = [text for text in sphere_report(found, cloud).warnings if "may be of no" in text]
+    assert len(doubts) == (kind == "disc")
+    assert all("of a disc or a post" in text for text in doubts)
+    one = inspect_feature(cloud, WantedFeature("sphere", diameter_mm=DIAMETER_MM))
+    if not isinstance(one, FitFailure):
+        shown = feature_report(one, cloud).warnings
+        assert any("may be of no sphere" in text for text in shown) == (kind == "disc")
+
+
+def test_a_disc_with_more_points_hides_no_ball() -> None:
+    rng = np.random.default_rng(6)
+    disc = rim_of_a_disc(5.0, 0.01, rng) + CENTRE + [80.0, 0.0, 0.0]
+    cloud = cloud_of(np.concatenate([disc, ball(DIAMETER_MM, 0.01)]))
+    found = inspected(inspect_sphere(cloud, DIAMETER_MM))
+    assert np.abs(found.sphere.centre_mm - CENTRE).max() < 0.02
+    assert (found.others, found.post, found.counts.n_region) == ((), None, 4200)
+
+
+def test_a_dented_ball_is_doubted_and_a_smeared_one_is_not() -> None:
+    """Three lobes of 0.15 mm; the same by an arm that says that it errs so much."""
+    outward = ball_stripes(80, 80)
+    lobes = np.sin(3.0 * np.arctan2(outward[:, :1], outward[:, 1:2]))
+    points = CENTRE + outward * (RADIUS_MM + 0.15 * lobes)
+    for sigma_mm in (0.005, 0.15):
+        cloud = cloud_of(points, sigma_mm=sigma_mm)
+        found = inspected(inspect_sphere(cloud, DIAMETER_MM))
+        doubts = [text for text in sphere_report(found, cloud).warnings if "no ball:" in text]
+        assert len(doubts) == (sigma_mm < 0.1)
+
+
+def test_u_is_told_of_diameter_and_centre() -> None:
+    cloud = smeared(0.02, 1)
+    found = inspected(inspect_sphere(cloud, DIAMETER_MM))
+    report = sphere_report(found, cloud)
+    told = values(report.quantities)["fitted"]
+    assert told["diameter_u_mm"] == 2.0 * found.diameter.sigma_mm
+    assert told["centre_u_mm"] == 2.0 * found.centre_sigma_mm > 0.0
+    one = inspect_feature(cloud, WantedFeature("sphere", diameter_mm=DIAMETER_MM))
+    assert not isinstance(one, FitFailure)
+    assert found.centre_sigma_mm == pytest.approx(one.centre_sigma_mm, rel=1e-3)
+    shown = summary_text(Summary(title="", quantities=report.quantities))
+    assert "U (k = 2) of the diameter" in shown
+    assert "twice what stands after ±: 95 % of normal errors are less" in shown
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -105,7 +216,7 @@ def test_strays_about_a_ball_are_no_other_one(seed: int) -> None:
     halo = CENTRE + outward[::2] * (RADIUS_MM + rng.uniform(-6.0, 6.0, (600, 1)))
     floor = CENTRE + np.column_stack([rng.uniform(-60.0, 60.0, (3000, 2)), np.full(3000, -20.0)])
     cloud = cloud_of(np.concatenate([ball(DIAMETER_MM, 0.01, seed), halo, floor]))
-    assert inspected(inspect_sphere(cloud, DIAMETER_MM)).other is None
+    assert inspected(inspect_sphere(cloud, DIAMETER_MM)).others == ()
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -122,7 +233,7 @@ def test_a_dense_post_hides_no_ball_and_is_none(seed: int) -> None:
     both = cloud_of(np.concatenate([*posts, ball(DIAMETER_MM, 0.01, seed)]))
     found = inspected(inspect_sphere(both, DIAMETER_MM))
     assert np.abs(found.sphere.centre_mm - CENTRE).max() < 0.02
-    assert found.other is None
+    assert found.others == ()
 
 
 def test_outliers_leave_the_fit_but_not_the_histogram() -> None:

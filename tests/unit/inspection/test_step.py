@@ -15,7 +15,15 @@ from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import StepInspection
 from armscan.inspection.selection import StepOptions
 from armscan.inspection.step import inspect_step
-from rigs.inspection_clouds import block_stripes, cloud_of, random_motion, seen_from
+from armscan.report.inspection.shapes import step_report
+from rigs.inspection_clouds import (
+    RADIUS_MM,
+    ball_stripes,
+    block_stripes,
+    cloud_of,
+    random_motion,
+    seen_from,
+)
 
 HEIGHT_MM = 20.0
 
@@ -205,6 +213,40 @@ def test_a_stray_far_away_hides_no_face() -> None:
     points[0, 2] = 1e6
     found = inspected(inspect_step(cloud_of(points, exposure), HEIGHT_MM))
     assert found.height.value_mm == pytest.approx(HEIGHT_MM, abs=1e-9)
+
+
+@pytest.mark.parametrize("height_mm", [1.0, 2.0, 3.0, 5.0, 10.0])
+def test_a_ball_has_no_faces_whatever_the_margin(height_mm: float) -> None:
+    """It was measured as a step, or a smaller margin was asked for. Low ones are caps, bent."""
+    for seed in range(5):
+        rotation, shift = random_motion(seed)
+        rng = np.random.default_rng(seed)
+        outward = ball_stripes(120, 120)
+        points = outward * (RADIUS_MM + rng.normal(0.0, 0.01, (len(outward), 1)))
+        for exposure in (None, np.arange(len(points)) // 120):
+            ball = cloud_of(points @ rotation.T + shift, exposure)
+            nothing = inspect_step(ball, height_mm)
+            if not isinstance(nothing, FitFailure):
+                assert height_mm in (2.0, 3.0)
+                shown = step_report(nothing, ball).warnings
+                assert any("two faces are not flat" in text for text in shown)
+                continue
+            assert "no two parallel faces" in nothing.reason
+            assert "--margin" not in nothing.remedy
+
+
+@pytest.mark.parametrize("height_mm", [1.0, 2.0, 20.0])
+@pytest.mark.parametrize("noise_mm", [0.005, 0.03, 0.1])
+def test_faces_that_scatter_are_faces(height_mm: float, noise_mm: float) -> None:
+    """A step of 1 mm cannot be told in noise of 0.1 mm that nobody states."""
+    points, exposure = block_stripes(height_mm)
+    noise = np.random.default_rng(3).normal(0.0, noise_mm, points.shape)
+    cloud = cloud_of(points + noise, exposure)
+    found = inspect_step(cloud, height_mm)
+    if height_mm > 10.0 * noise_mm:
+        assert inspected(found).height.value_mm == pytest.approx(height_mm, abs=noise_mm)
+        shown = step_report(inspected(found), cloud).warnings
+        assert not any("not flat" in text for text in shown)
 
 
 def test_input_without_the_step_is_refused_in_words() -> None:

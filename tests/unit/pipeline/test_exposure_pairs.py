@@ -59,6 +59,7 @@ def test_images_must_be_of_the_cameras_size_or_lie_on_its_sensor() -> None:
         with pytest.raises(InputError, match="camera was calibrated with 40 x 30") as caught:
             check_sizes([wrong], CAMERA)
         assert ("window_x_px and window_y_px" in str(caught.value)) == (wrong.source == "small.png")
+        assert "is of another" in caught.value.remedy
 
 
 def scene(seed: int, has_line: bool) -> np.ndarray:

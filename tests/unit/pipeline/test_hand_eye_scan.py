@@ -215,6 +215,14 @@ def test_a_moving_scan_has_a_posture_an_exposure() -> None:
     assert run.fit.calibration.n_postures == run.fit.calibration.n_exposures == 8
 
 
+def test_a_laser_that_the_calibration_has_no_sheet_of_is_told() -> None:
+    """The sensor's calibration is of another head: nothing told of it."""
+    sensor = _sensor()
+    other = replace(sensor, sheets=(replace(sensor.sheets[0], name="R"),))
+    seen = observe_stripes(DrawnScan(), other, max_exposures=8)
+    assert [text for text in seen.warnings if "no sheet" in text and "of another head" in text]
+
+
 def test_an_exposure_without_pose_is_named_and_left_out() -> None:
     run = _run(DrawnScan(is_first_known=False))
     assert run.seen.not_used == (("image0", "the arm gave no pose for it"),)

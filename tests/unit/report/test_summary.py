@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from armscan.reconstruction.pass_agreement import PassAgreement, PassPair
+from armscan.report.cloud import passes_text
 from armscan.report.quantity import (
     Quantity,
     Summary,
@@ -143,3 +145,19 @@ def test_one_quantity_feeds_people_and_programs() -> None:
     done = Summary(title="Done.", quantities=told)
     assert "± is one standard deviation" in summary_text(done)
     assert done.data["fitted"] == {"length_mm": 1.5}
+
+
+@pytest.mark.parametrize(("n", "told"), [(1, "(one pair)"), (3, "(median of 3 pairs; at most")])
+def test_one_pair_of_passes_has_no_median(n: int, told: str) -> None:
+    pairs = tuple(PassPair(0, k + 1, 0.02, 1.0) for k in range(n))
+    found = PassAgreement(
+        pairs=pairs,
+        n_points=900,
+        agreeing=0.99,
+        distance_mm=0.02,
+        worst_mm=0.02,
+        claimed_mm=0.02,
+        ratio=1.0,
+        worst_ratio=1.0,
+    )
+    assert told in passes_text(found)

@@ -42,9 +42,8 @@ from armscan.report.drawing import (
     scene_markup,
     styled,
 )
-from armscan.report.inspection.shapes import share_text
 from armscan.report.page import Facts, Gallery, Legend, Page, Picture, Section, Text, page_of
-from armscan.report.quantity import Quantity, Table, fact, only, significant
+from armscan.report.quantity import Quantity, Table, fact, only, share_text, significant
 
 MAX_SHOWN = 30_000
 MAX_EDGES = 6_000

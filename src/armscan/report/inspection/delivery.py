@@ -64,10 +64,12 @@ def delivery_of(
     calibration = calibration_quantities(block, state)
     names = [name for name in cloud.sheet_names if name]
     sheets = ", ".join(names[:MOST_NAMED]) + (" and others" if len(names) > MOST_NAMED else "")
-    n_exposures = len(np.unique(cloud.exposure))
+    exposures = f"in {plural(len(np.unique(cloud.exposure)), 'exposure')}"
+    if cloud.is_fused or not names:
+        exposures = "exposures are not told apart"
     setup = (
         fact("Cloud", f"{source}, {plural(len(cloud), 'point')} in the {cloud.frame} frame"),
-        fact("Light sheets", sheets or NOT_TOLD, f"in {plural(n_exposures, 'exposure')}"),
+        fact("Light sheets", sheets or NOT_TOLD, exposures),
         *(fact(item.label, item.text, item.meaning) for item in calibration if item.label),
     )
     is_asked = bool(state.marks) or math.isfinite(state.valid_days)

@@ -8,35 +8,31 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray
+from armscan.inspection.conformity import COVERAGE
 from armscan.inspection.features import FeatureInspection, MeasuredAngle, Relation
 from armscan.inspection.results import MeasuredLength, PointCounts
 from armscan.records.cloud import PointCloud
+from armscan.report.charts import deviation_view
 from armscan.report.inspection.shapes import (
     InspectionReport,
     count_quantities,
     deviation_histogram,
     deviation_quantities,
-    deviation_view,
+    expanded,
     feature_view,
     form_card,
-    length_quantity,
+    length_quantities,
+    place_quantity,
     point_subtitle,
     point_warnings,
+    shape_warnings,
     share_card,
     sigma_facts,
-    triple,
 )
-from armscan.report.quantity import Quantity, fact, only, significant, with_sigma
+from armscan.report.quantity import Quantity, fact, only, significant, triple, with_sigma
 
-COVERAGE = 2.0
-"""Coverage factor k of U: 95 % of normal errors (GUM 6.3.3)."""
 NARROW_ARC_DEG = 90.0
 """Less of a turn tells radius and place poorly apart: their errors grow as 1 / arc^2."""
-ROUND = ("sphere", "cylinder", "cone")
-OTHER_SHAPE = 8.0
-"""Rms distance from a fitted shape, in scatters of neighbours, beyond which it is doubted: bores
-and bosses have 1, a cylinder in a cone of 25 degrees or in two flat faces 15 and more."""
 SEED_OFF_MM = 1.0
 """Distance from a feature within which its seed is on it."""
 ANGLE_NOTE = "near 0 and 90 degrees it is the size of a tilt, which noise never makes negative"
@@ -47,7 +43,7 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
     kind = found.shape.kind
     main = found.nominal or found.fitted
     told = feature_quantities(found)
-    warnings = [*point_warnings(found.counts, cloud), *_shape_warnings(found, cloud)]
+    warnings = [*point_warnings(found.counts, cloud), *_doubts(found, cloud)]
     if kind in ("circle", "cylinder", "cone") and found.seen_deg < NARROW_ARC_DEG:
         warnings.append(
             f"the points cover only {found.seen_deg:.0f} degrees of the turn, where radius and "
@@ -78,25 +74,10 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
     )
 
 
-def _shape_warnings(
-    found: FeatureInspection, cloud: PointCloud, whose: str = ""
-) -> tuple[str, ...]:
-    """Warn of points that lie much farther off the shape than they lie off their neighbours, and of
-    a seed that is on no feature.
-    """
-    seed = _seed_warnings(found, cloud, whose)
-    deviations = found.fitted.deviations_mm[found.is_fitted]
-    rms = math.sqrt(float(np.mean(deviations**2)))
+def _doubts(found: FeatureInspection, cloud: PointCloud, whose: str = "") -> tuple[str, ...]:
+    """Warn of a seed that is on no feature, and of points that may be of another shape."""
     kind = found.shape.kind
-    # written so that a scatter that is not known warns of nothing
-    if kind not in ROUND or not rms > OTHER_SHAPE * found.scatter_mm:
-        return seed
-    return (
-        *seed,
-        f"{whose}the points may be of no {kind}: they lie {significant(rms, 'mm', 2)} (rms) off "
-        f"it, {rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, "
-        "and show where it is by a region or a seed",
-    )
+    return (*_seed_warnings(found, cloud, whose), *shape_warnings(found, cloud, kind, whose))
 
 
 def _seed_warnings(found: FeatureInspection, cloud: PointCloud, whose: str) -> tuple[str, ...]:
@@ -123,9 +104,9 @@ def feature_quantities(found: FeatureInspection) -> tuple[Quantity, ...]:
     if found.half_angle is not None:
         told += _half_angle(found, found.half_angle)
     where = {"circle": "Centre", "sphere": "Centre"}.get(kind, "Middle of the points on it")
-    told.append(_place("fitted.point_mm", where, shape.point_mm, found.centre_sigma_mm))
+    told.append(place_quantity("fitted.point_mm", where, shape.point_mm, found.centre_sigma_mm))
     if kind == "cone":
-        told.append(_place("fitted.apex_mm", "Tip", shape.apex_mm, math.nan))
+        told.append(place_quantity("fitted.apex_mm", "Tip", shape.apex_mm, math.nan))
     if kind != "sphere":
         told.append(_direction(found))
     if not math.isnan(found.seen_deg):
@@ -163,8 +144,7 @@ def _diameter(found: FeatureInspection, diameter: MeasuredLength) -> list[Quanti
     nominal = found.wanted.diameter_mm
     meaning = "" if nominal is None else f"nominal {nominal:g} mm"
     told = [
-        length_quantity("fitted.diameter", "Fitted diameter", diameter, meaning),
-        _expanded("fitted.diameter_u_mm", "diameter", COVERAGE * diameter.sigma_mm, "mm"),
+        *length_quantities("fitted.diameter", "Fitted diameter", diameter, meaning),
     ]
     if nominal is not None:
         error = diameter.value_mm - nominal
@@ -181,7 +161,7 @@ def _half_angle(found: FeatureInspection, angle: MeasuredAngle) -> list[Quantity
     sigma = math.degrees(angle.sigma_rad)
     told = [
         angle_quantity("fitted.half_angle", "Fitted half angle", angle, meaning),
-        _expanded("fitted.half_angle_u_deg", "half angle", COVERAGE * sigma, "degrees"),
+        expanded("fitted.half_angle_u_deg", "half angle", sigma, "degrees"),
     ]
     if nominal is not None:
         told.append(Quantity("nominal.half_angle_deg", "", nominal))
@@ -195,17 +175,6 @@ def angle_quantity(key: str, label: str, angle: MeasuredAngle, meaning: str) -> 
     return Quantity(
         key, label, {"value_deg": value, "sigma_deg": sigma}, meaning=meaning, shown=shown
     )
-
-
-def _expanded(key: str, name: str, value: float, unit: str) -> Quantity:
-    return Quantity(key, f"U (k = 2) of the {name}", value, shown=significant(value, unit, 2))
-
-
-def _place(key: str, label: str, point: FloatArray, sigma_mm: float) -> Quantity:
-    known = (
-        "" if math.isnan(sigma_mm) else f", U (k = 2) {significant(COVERAGE * sigma_mm, 'mm', 2)}"
-    )
-    return Quantity(key, label, point.tolist(), shown=f"{triple(point)} mm{known}")
 
 
 def _direction(found: FeatureInspection) -> Quantity:
@@ -231,7 +200,9 @@ POSITIVE = {
 SHOWN = (
     "points.n_feature",
     "fitted.diameter",
+    "fitted.diameter_u_mm",
     "fitted.half_angle",
+    "fitted.half_angle_u_deg",
     "fitted.point_mm",
     "fitted.direction",
     "fitted.form_mm",
@@ -259,22 +230,19 @@ def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
     names = f"{found.first.wanted} and {found.second.wanted}"
     told = [Quantity("feature", "", "relation")]
     if found.distance is not None:
-        told += [
-            length_quantity("distance", "Distance", found.distance, found.distance_text),
-            _expanded("distance_u_mm", "distance", COVERAGE * found.distance.sigma_mm, "mm"),
-        ]
+        told += length_quantities("distance", "Distance", found.distance, found.distance_text)
     else:
         told.append(fact("Distance", f"none: {found.distance_text}"))
     if found.angle is not None:
         sigma = math.degrees(found.angle.sigma_rad)
         told += [
             angle_quantity("angle", "Angle", found.angle, f"{found.angle_text}; {ANGLE_NOTE}"),
-            _expanded("angle_u_deg", "angle", COVERAGE * sigma, "degrees"),
+            expanded("angle_u_deg", "angle", sigma, "degrees"),
         ]
     for key in ("parallelism", "perpendicularity"):
         zone = getattr(found, key)
         if zone is not None:
-            told.append(length_quantity(key, key.capitalize(), zone, ZONE))
+            told += length_quantities(key, key.capitalize(), zone, ZONE)
     for place, one in (("first", found.first), ("second", found.second)):
         for item in feature_quantities(one):
             key = f"{place}.{item.key}" if item.key else ""
@@ -284,8 +252,8 @@ def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
     warnings = (
         *point_warnings(found.first.counts, cloud, "first feature"),
         *point_warnings(found.second.counts, cloud, "second feature"),
-        *_shape_warnings(found.first, cloud, "first feature: "),
-        *_shape_warnings(found.second, cloud, "second feature: "),
+        *_doubts(found.first, cloud, "first feature: "),
+        *_doubts(found.second, cloud, "second feature: "),
     )
     deviations = np.concatenate([one.fitted.deviations_mm for one in both])
     return InspectionReport(

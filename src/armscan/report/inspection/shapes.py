@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.colors import LinearSegmentedColormap
 
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.inspection.conformity import COVERAGE
+from armscan.inspection.features import FeatureInspection
 from armscan.inspection.results import (
     Deviations,
     MeasuredLength,
@@ -25,16 +25,14 @@ from armscan.inspection.results import (
 )
 from armscan.models.calibration import Provenance
 from armscan.records.cloud import PointCloud
+from armscan.report.charts import deviation_view
 from armscan.report.drawing import (
     ACCENT,
     ALERT,
     INK,
     MUTED,
-    SceneDots,
     chart_markup,
     new_figure,
-    ramp_markup,
-    scene_markup,
     styled,
 )
 from armscan.report.page import Facts, Gallery, Page, Picture, Section, Text, page_of
@@ -45,7 +43,9 @@ from armscan.report.quantity import (
     for_people,
     only,
     sentence,
+    share_text,
     significant,
+    triple,
     with_sigma,
 )
 
@@ -58,12 +58,15 @@ STATEMENT = (
     "defines them; this is not an accredited test."
 )
 NO_SIGMA = (
-    "the cloud carries no standard deviations and no exposures, so it is not known how well the "
-    "fit is determined"
+    "the cloud carries no standard deviations, so it is not known how well the fit is determined"
 )
 FUSED_SIGMA = (
     "the cloud is fused and no longer tells its exposures apart, so that no ± and no U is known; "
     "inspect the cloud from before it was fused"
+)
+NO_SHEETS = (
+    "the cloud does not tell which points lie in one (fused, XYZ, STL or foreign): one may be "
+    "taken for a face"
 )
 MUCH_BEYOND = 0.05
 """Part of the points on a fitted plane that may lie too far from the nominal one to count."""
@@ -76,17 +79,17 @@ STILL_SIGMA = fact(
     "not known from one exposure: its error is the calibration's, which shifts both faces nearly "
     "alike",
 )
+ROUND = ("sphere", "cylinder", "cone")
+OTHER_SHAPE, BEYOND_STATED = 8.0, 2.0
+"""Rms distance from a fitted shape beyond which it is doubted, in scatters of neighbours: bores,
+bosses and balls have 3 at most, a cylinder in a cone of 25 degrees or in two flat faces 15 and
+more. And in stated sigmas, for stripes that an arm shifts are smooth themselves."""
 NARROW_CAP_DEG = 60.0
 MANY_OUTLIERS = 0.01
-FOREIGN_FRAME = "a frame that the file does not name"
-MAX_SHOWN = 20_000
+UNNAMED = "Part"
+AS_NAMED = ", as it is called where a file names none"
 BAND_MM = 0.05
 LEAST_HALF_WIDTH_MM = 0.01
-RAMP = LinearSegmentedColormap.from_list(
-    "deviation", colormaps["cividis"](np.linspace(0.0, 0.93, 32))
-)
-"""As of the comparison with a model: lightness alone tells the sign, also in grey print and to
-colour-blind readers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,6 +138,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         ),
         fact("Middle of the points", f"{triple(found.plane.point_mm)} mm"),
         fact("Positive", found.side_text),
+        *_sheet_facts(cloud),
         *deviation_quantities("fitted", found.fitted),
     ]
     if found.nominal is None or found.offset is None:
@@ -143,7 +147,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         references.insert(0, ("against the nominal plane", found.nominal))
         where = "of the fitted plane over the nominal one, at the middle of the points"
         told += [
-            length_quantity("nominal.offset", "Offset", found.offset, where),
+            *length_quantities("nominal.offset", "Offset", found.offset, where),
             Quantity(
                 "nominal.tilt_mrad",
                 "Tilt",
@@ -177,6 +181,13 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
     )
 
 
+def _sheet_facts(cloud: PointCloud) -> tuple[Quantity, ...]:
+    """Of a search for faces in a cloud that does not tell its sheets."""
+    if any(cloud.sheet_names) and not cloud.is_fused:
+        return ()
+    return (fact("Light sheets", NO_SHEETS),)
+
+
 def _beyond_warnings(found: PlaneInspection) -> tuple[str, ...]:
     """Warn of a face that goes on where it is too far from the nominal plane to count."""
     share = found.n_beyond / max(found.counts.n_feature + found.n_beyond, 1)
@@ -196,16 +207,20 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
     told = (
         Quantity("feature", "", "sphere"),
         *count_quantities(found.counts),
-        length_quantity(
+        *length_quantities(
             "fitted.diameter", "Fitted diameter", found.diameter, f"nominal {nominal_mm:g} mm"
         ),
         Quantity("nominal.diameter_mm", "", nominal_mm),
         Quantity("diameter_error_mm", "Fitted minus nominal", error, shown=f"{error:+.4f} mm"),
+        place_quantity("fitted.centre_mm", "Centre", found.sphere.centre_mm, found.centre_sigma_mm),
+        Quantity("fitted.centre_u_mm", "", COVERAGE * found.centre_sigma_mm),
         Quantity(
-            "fitted.centre_mm",
-            "Centre",
-            found.sphere.centre_mm.tolist(),
-            shown=f"{triple(found.sphere.centre_mm)} mm",
+            "other_balls",
+            "",
+            [
+                {"diameter_mm": 2.0 * one.radius_mm, "centre_mm": one.centre_mm.tolist()}
+                for one in found.others
+            ],
         ),
         Quantity(
             "fitted.seen_cap_deg",
@@ -218,18 +233,6 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
         *deviation_quantities("fitted", found.fitted),
         *deviation_quantities("nominal", found.nominal),
     )
-    warnings = list(point_warnings(found.counts, cloud))
-    if found.seen_cap_deg < NARROW_CAP_DEG:
-        warnings.append(
-            f"the points cover a cap of only {found.seen_cap_deg:.0f} degrees half opening, where "
-            "centre and diameter are poorly told apart; scan more of the ball"
-        )
-    if found.other is not None:
-        warnings.append(
-            f"another ball, of {2.0 * found.other.radius_mm:.4g} mm, is centred at "
-            f"{triple(found.other.centre_mm)} mm; measured was the one on which most points lie: "
-            "show which is meant with --region"
-        )
     return InspectionReport(
         title="Ball inspected",
         subtitle=point_subtitle(found.counts, cloud),
@@ -257,8 +260,85 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
         ),
         views=(feature_view(cloud, found.rows, found.nominal),),
         counts=found.counts,
-        warnings=tuple(warnings),
+        warnings=(
+            *point_warnings(found.counts, cloud),
+            *shape_warnings(found, cloud, "ball"),
+            *_ball_warnings(found),
+        ),
     )
+
+
+def _ball_warnings(found: SphereInspection) -> tuple[str, ...]:
+    """Warn of a small cap, and of other balls of that diameter."""
+    told = []
+    if found.seen_cap_deg < NARROW_CAP_DEG:
+        told.append(
+            f"the points cover a cap of only {found.seen_cap_deg:.0f} degrees half opening, where "
+            "centre and diameter are poorly told apart; scan more of the ball"
+        )
+    others = [
+        f"another ball, of {2.0 * one.radius_mm:.4g} mm, is centred at {triple(one.centre_mm)} mm"
+        for one in found.others
+    ]
+    if others:
+        told.append(
+            f"{', '.join(others)}; measured was the one on which most points lie: show which is "
+            "meant with --region"
+        )
+    return tuple(told)
+
+
+def shape_warnings(
+    found: SphereInspection | FeatureInspection, cloud: PointCloud, kind: str, whose: str = ""
+) -> tuple[str, ...]:
+    """Warn of points that may be of another shape than the one that was fitted to them.
+
+    They are as near to a post, or lie much farther off the shape than off their neighbours and
+    than their sigmas say. ``kind`` is what the shape is called.
+    """
+    rows = found.rows[found.is_fitted]
+    rms = _rms(found.fitted.deviations_mm[found.is_fitted])
+    if found.post is not None:
+        off = significant(_rms(found.post.distance_mm(cloud.points_mm[rows])), "mm", 2)
+        return (
+            f"{whose}the points may be of no {kind}, but of a disc or a post: they lie {off} (rms) "
+            f"off a cylinder of {2.0 * found.post.radius_mm:.4g} mm, and "
+            f"{significant(rms, 'mm', 2)} off the {kind}; scan it from more sides, or show where "
+            f"the {kind} is with --region",
+        )
+    is_round = isinstance(found, SphereInspection) or found.shape.kind in ROUND
+    if not is_round or not _is_far(rms, found.scatter_mm, cloud, rows):
+        return ()
+    return (
+        f"{whose}the points may be of no {kind}: they lie {significant(rms, 'mm', 2)} (rms) off "
+        f"it, {rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, "
+        "and show where it is by a region or a seed",
+    )
+
+
+def _is_far(rms: float, scatter_mm: float, cloud: PointCloud, rows: IntArray) -> bool:
+    """Whether points are much farther off a shape than they scatter, and than their sigmas say."""
+    variance = np.median(np.einsum("nii->n", cloud.covariance_mm2[rows])) / 3.0
+    stated = BEYOND_STATED * math.sqrt(max(float(variance), 0.0))
+    # written so that a scatter that is not known is no doubt
+    return bool(rms > OTHER_SHAPE * scatter_mm and rms > stated)
+
+
+def _face_warnings(found: StepInspection, cloud: PointCloud) -> tuple[str, ...]:
+    """Warn of faces that are bent, as parts of a ball are."""
+    rms = found.fitted.value("rms_mm")
+    both = np.concatenate([found.lower, found.upper])
+    if not _is_far(rms, found.scatter_mm, cloud, both):
+        return ()
+    return (
+        f"the two faces are not flat: their points lie {significant(rms, 'mm', 2)} (rms) off them, "
+        f"{rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, and "
+        "show where the step is with --region",
+    )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
@@ -266,12 +346,12 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
     nominal_mm = found.nominal_height_mm
     error = found.height.value_mm - nominal_mm
     both = np.concatenate([found.lower, found.upper])
-    is_still = len(np.unique(cloud.exposure[both])) == 1
+    is_still = not _sheet_facts(cloud) and len(np.unique(cloud.exposure[both])) == 1
     mean, std = float(found.heights_mm.mean()), float(found.heights_mm.std(ddof=1))
     told = (
         Quantity("feature", "", "step"),
         *count_quantities(found.counts),
-        length_quantity(
+        *length_quantities(
             "fitted.height",
             "Fitted height",
             found.height,
@@ -298,6 +378,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
             "On each face",
             f"{len(found.lower):,} points on the lower face, {len(found.upper):,} on the upper",
         ),
+        *_sheet_facts(cloud),
         *((STILL_SIGMA,) if is_still else sigma_facts(found.height, "height")),
         *deviation_quantities("fitted", found.fitted),
         *deviation_quantities("nominal", found.nominal),
@@ -339,14 +420,14 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
             ),
         ),
         counts=found.counts,
-        warnings=point_warnings(found.counts, cloud),
+        warnings=(*point_warnings(found.counts, cloud), *_face_warnings(found, cloud)),
     )
 
 
-def length_quantity(
+def length_quantities(
     key: str, label: str, length: MeasuredLength, meaning: str, shown: str = ""
-) -> Quantity:
-    """A length with its standard deviation."""
+) -> tuple[Quantity, Quantity]:
+    """A length with its standard deviation, and its expanded uncertainty."""
     data = {
         "value_mm": length.value_mm,
         "sigma_mm": length.sigma_mm,
@@ -356,7 +437,26 @@ def length_quantity(
     if not shown and math.isnan(length.sigma_mm):
         shown = f"{length.value_mm:.4f} mm"
     shown = shown or with_sigma(length.value_mm, length.sigma_mm, "mm")
-    return Quantity(key, label, data, meaning=meaning, shown=shown)
+    name = label.removeprefix("Fitted ").lower()
+    return (
+        Quantity(key, label, data, meaning=meaning, shown=shown),
+        expanded(f"{key}_u_mm", name, length.sigma_mm, "mm"),
+    )
+
+
+def expanded(key: str, name: str, sigma: float, unit: str) -> Quantity:
+    """The expanded uncertainty of what has a standard deviation; NaN where that is not known."""
+    u = COVERAGE * sigma
+    meaning = "" if math.isnan(u) else "twice what stands after ±: 95 % of normal errors are less"
+    label = f"U (k = {COVERAGE:g}) of the {name}"
+    return Quantity(key, label, u, meaning=meaning, shown=significant(u, unit, 2))
+
+
+def place_quantity(key: str, label: str, point: FloatArray, sigma_mm: float) -> Quantity:
+    """A point (3,) with its expanded uncertainty along the worst way, where that is known."""
+    u = significant(COVERAGE * sigma_mm, "mm", 2)
+    known = "" if math.isnan(sigma_mm) else f", U (k = {COVERAGE:g}) {u} along the worst way"
+    return Quantity(key, label, point.tolist(), shown=f"{triple(point)} mm{known}")
 
 
 def sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
@@ -431,9 +531,8 @@ def form_card(fitted: Deviations) -> Quantity:
 
 def point_subtitle(counts: PointCounts, cloud: PointCloud) -> str:
     """How many points, and in which frame."""
-    has_frame = bool(cloud.sheet_names[0]) if cloud.sheet_names else False
-    frame = f"the {cloud.frame} frame" if has_frame else FOREIGN_FRAME
-    return f"{counts.n_feature:,} points in {frame}"
+    is_named = cloud.frame != UNNAMED or any(cloud.sheet_names)
+    return f"{counts.n_feature:,} points in the {cloud.frame} frame{'' if is_named else AS_NAMED}"
 
 
 def point_warnings(
@@ -449,11 +548,6 @@ def point_warnings(
         share = 100.0 * counts.n_outliers / counts.n_feature
         found.append(f"{share:.1f} % of the {whose}'s points are outliers: see the pictures")
     return tuple(found)
-
-
-def triple(values: FloatArray, digits: int = 4) -> str:
-    """Three numbers with commas between them."""
-    return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
 def inspection_page(
@@ -523,11 +617,6 @@ def _value(deviations: Deviations, k: int) -> str:
     return significant(item.value, item.unit)
 
 
-def share_text(percent: float) -> str:
-    """A share with two decimals that never reads 100 if something is outside."""
-    return "above 99.99 %" if 99.995 <= percent < 100.0 else f"{percent:.2f} %"
-
-
 def deviation_histogram(
     deviations: Deviations,
     *,
@@ -554,7 +643,8 @@ def deviation_histogram(
         axes.set_xlabel(f"{axis_label}, from the {deviations.reference} reference")
         axes.set_ylabel("points")
         axes.grid(axis="y")
-        axes.set_title(f"{share:.2f} % of {len(values):,} points within {BAND_MM:g} mm", loc="left")
+        told = f"{share_text(share)} of {len(values):,} points within {BAND_MM:g} mm"
+        axes.set_title(told, loc="left")
     parts = [f"Deviations from {deviations.reference_text}; {deviations.points_text}."]
     if beyond := counted.n_below + counted.n_above:
         parts.append(
@@ -606,37 +696,4 @@ def feature_view(cloud: PointCloud, rows: IntArray, deviations: Deviations) -> P
         title="The feature's points",
         frame=cloud.frame,
         reference=deviations.reference_text,
-    )
-
-
-def deviation_view(
-    points_mm: FloatArray, deviations_mm: FloatArray, *, title: str, frame: str, reference: str
-) -> Picture:
-    """Points in space, coloured by deviation: dark inside or below, light outside or above.
-
-    Parameters
-    ----------
-    points_mm, deviations_mm
-        (N, 3) and (N,).
-    title
-        Of the picture.
-    frame
-        Name of the coordinate frame.
-    reference
-        What the deviations are counted from, in words.
-    """
-    step = max(1, math.ceil(len(points_mm) / MAX_SHOWN))
-    limit = max(float(np.percentile(np.abs(deviations_mm), 98)), 1e-6)
-    share = np.clip(0.5 + 0.5 * deviations_mm[::step] / limit, 0.0, 1.0)
-    colours = np.asarray(RAMP(share, bytes=True), dtype=np.uint8)[:, :3]
-    scene = scene_markup(
-        [SceneDots(points_mm[::step], colours)], [], [], title, is_z_up=frame != "Sensor"
-    )
-    text = significant(limit, "mm", 2)
-    every = f" One point in {step} is shown." if step > 1 else ""
-    return Picture(
-        ramp_markup(f"−{text}", f"+{text}", RAMP) + scene,
-        title=f"{title} ({frame} frame)",
-        caption=f"Colour is the deviation from {reference}; points beyond the ramp have its end's "
-        f"colour.{every}",
     )

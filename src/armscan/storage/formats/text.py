@@ -57,20 +57,24 @@ LOOKED_AT = 1000
 """Lines in which decimal commas are sought: a table that has them has them everywhere."""
 EMPTY_FIELD = re.compile(r"(^|[,;])[ \t]*(?=[,;])", re.MULTILINE)
 """Nothing between two separators: a value that is missing, which must not move the next ones."""
-OWN_HEADER = "x_mm y_mm z_mm in frame "
+OWN_HEADER, OWN_NOTE = "x_mm y_mm z_mm in frame ", "written by armscan"
+COUNT = re.compile(r"points (\d+)")
+"""Note of a file that armscan wrote: of how many points, so that one that was cut is told."""
 
 
 def xyz_bytes(points: PointCloud | CloudPiece) -> bytes:
     """Content of an XYZ text file; it lacks `XYZ_LOSES`."""
     piece = points if isinstance(points, CloudPiece) else CloudPiece(points)
-    return b"".join(xyz_parts(piece.cloud, [piece]))
+    return b"".join(xyz_parts(piece.cloud, len(piece.cloud), [piece]))
 
 
-def xyz_parts(marks: PointCloud, pieces: Iterable[CloudPiece]) -> Iterator[bytes]:
+def xyz_parts(marks: PointCloud, n_points: int, pieces: Iterable[CloudPiece]) -> Iterator[bytes]:
     """As `xyz_bytes`, of a cloud that comes in pieces; ``marks`` are its names and marks."""
     frame = f"{marks.frame}; {SIMULATED}" if marks.is_simulated else marks.frame
     header = f"{OWN_HEADER}{frame}; not in this file: {'; '.join(XYZ_LOSES)}"
-    header = "\n".join((header, *(f"{FORCED}: {reason}" for reason in marks.forced)))
+    header = "\n".join(
+        (header, f"points {n_points}", *(f"{FORCED}: {reason}" for reason in marks.forced))
+    )
     for k, piece in enumerate(pieces):
         buffer = io.StringIO()
         np.savetxt(buffer, piece.cloud.points_mm, fmt="%.7f", header=header if k == 0 else "")
@@ -82,7 +86,7 @@ def csv_bytes(piece: CloudPiece) -> bytes:
     found = cloud_columns(piece)
     heading = ",".join(f"{name}_mm" if name in POINT else name for name in found.columns)
     formats = {**dict.fromkeys(POINT, "%.7f"), **dict.fromkeys(WHOLE, "%d")}
-    notes = "".join(f"# {note}\n" for note in found.notes)
+    notes = "".join(f"# {note}\n" for note in (*found.notes, f"points {len(piece.cloud)}"))
     buffer = io.StringIO()
     row = ",".join(formats.get(name, "%.9g") for name in found.columns)
     np.savetxt(buffer, structured(found.columns), fmt=row)
@@ -91,7 +95,8 @@ def csv_bytes(piece: CloudPiece) -> bytes:
 
 def text_columns(data: bytes, path: Path) -> CloudColumns:
     """Columns of a table of numbers: those that its heading names, else the first three as xyz."""
-    lines = data.decode("utf-8-sig", errors="replace").splitlines()
+    text = data.decode("utf-8-sig", errors="replace")
+    lines, is_ended = text.splitlines(), text.endswith(("\n", "\r"))
     start = 1 if _is_heading(lines, path) else 0
     body = [line.partition("#")[0] for line in lines[start:]]
     filled = list(islice((line for line in body if line.strip()), LOOKED_AT))
@@ -108,13 +113,17 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
             where=path_text(path),
             remedy="write numbers with points: 1.5,2.5,3.5",
         )
+    if not is_ended:
+        _refuse_cut_line(body[-1], filled[0], len(lines), path)
     named = _named(heading, path)
     values = _values("\n".join(body), tuple(named.values()), path, start + 1)
     columns = {name: values[:, k] for k, name in enumerate(named)}
+    notes = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
+    _refuse_cut(notes, len(values), len(lines), path, is_ended=is_ended)
     read = set(named.values())
     passed_over = tuple(word for k, word in enumerate(heading) if k not in read)
     is_table = len(_words(filled[0])) == len(heading)
-    return CloudColumns(columns, _notes(lines), passed_over=passed_over if is_table else ())
+    return CloudColumns(columns, _notes(notes), passed_over=passed_over if is_table else ())
 
 
 def _named(heading: list[str], path: Path) -> dict[str, int]:
@@ -158,9 +167,46 @@ def _first_wrong(body: str, columns: tuple[int, ...], first: int) -> str:
     return ""
 
 
-def _notes(lines: list[str]) -> tuple[str, ...]:
+def _refuse_cut_line(last: str, first: str, number: int, path: Path) -> None:
+    """Raise for a last line without an end that holds less than the first one, or half a number."""
+    words, wanted = _words(last), _words(first)
+    pairs = zip(words, wanted, strict=False)
+    is_half = any(_is_number(other) and not _is_number(word) for word, other in pairs)
+    if words and (len(words) < len(wanted) or is_half):
+        raise FileFormatError(
+            f"the file seems cut: it ends within line {number}, '{last.strip()[:60]}'",
+            where=path_text(path),
+            remedy="copy or export it again; without that line the points before it can be read",
+        )
+
+
+def _refuse_cut(
+    notes: list[str], n_points: int, n_lines: int, path: Path, *, is_ended: bool
+) -> None:
+    """Raise for a table of armscan's that says in its notes that it held other points."""
+    stated = [found[1] for note in notes if (found := COUNT.fullmatch(note))]
+    is_own = bool(notes) and (notes[0].startswith(OWN_HEADER) or OWN_NOTE in notes)
+    if not (is_own and stated):
+        return
+    wanted = int(stated[0])
+    if n_points == wanted and is_ended:
+        return
+    on_purpose = "if points were left out or added on purpose"
+    fact = f"its header tells of {wanted:,} points, and it holds {n_points:,}"
+    if n_points < wanted:
+        fact = f"the file seems cut: {fact}, the last in line {n_lines}"
+    elif n_points == wanted:
+        fact = f"the file seems cut within its last point: line {n_lines} has no end"
+        on_purpose = "if that line is whole"
+    raise FileFormatError(
+        fact,
+        where=path_text(path),
+        remedy=f"copy it again, or delete the line '# points {wanted}' {on_purpose}",
+    )
+
+
+def _notes(notes: list[str]) -> tuple[str, ...]:
     """Notes of a table that armscan wrote; of an XYZ file its first line says them all."""
-    notes = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
     if not notes or not notes[0].startswith(OWN_HEADER):
         return tuple(notes)
     words = notes[0].removeprefix(OWN_HEADER).split("; ")

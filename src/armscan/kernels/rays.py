@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From pixels to points: rays on light sheets, with their derivatives."""
+"""From pixels to points: rays on light sheets; from boards to the equations of a camera."""
 
 from __future__ import annotations
 

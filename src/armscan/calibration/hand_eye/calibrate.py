@@ -93,6 +93,8 @@ LEAST_RESIDUAL_MM = 1e-4
 LIKELY_DIAMETER = 0.2
 """Part of the diameter by which it may have been mistaken."""
 NAMED_STRIPES = 3
+MOST_READ = 24
+"""Stripes on a sphere, evenly spread, that other readings of the poses are tried on."""
 UNDERDETERMINED_PART, UNDERDETERMINED_MM = 0.2, 2.0
 """A combination known less well than this part of the diameter and than this is not determined."""
 TURN_THE_TOOL = (
@@ -410,10 +412,11 @@ def _misread(
     rotations = np.array([pose.rotation for pose in given])
     translations = np.array([pose.translation_mm for pose in given])
     radius_mm = float(few.surface.start[3])
+    some = np.unique(np.linspace(0, len(sections) - 1, MOST_READ).round().astype(int))
     for words, remedy, turns, shifts in other_readings(rotations, translations):
         read = [
-            replace(one, stripe=replace(one.stripe, base_from_tool=Pose(turn, shift)))
-            for one, turn, shift in zip(sections, turns, shifts, strict=True)
+            replace(one, stripe=replace(one.stripe, base_from_tool=Pose(turns[k], shifts[k])))
+            for k, one in ((k, sections[k]) for k in some.tolist())
         ]
         problem = replace(few, observations=condense_sphere(read, START_PIECES))
         found = [(_typical_mm(problem, each), each) for each in minima_on_sphere(read, radius_mm)]

@@ -177,7 +177,8 @@ def test_the_wrong_convention_of_angles_is_noticed(euler: EulerConvention) -> No
     failure = solve(euler)
     assert isinstance(failure, FitFailure)
     assert "no hand-eye puts the points on one sphere" in failure.reason
-    assert "convention of the arm's angles" in failure.remedy
+    assert f"read as {euler}, reading them as extrinsic-xyz would leave 0.07" in failure.reason
+    assert "give the rotation convention extrinsic-xyz" in failure.remedy
 
 
 def test_a_wrong_diameter_is_noticed() -> None:

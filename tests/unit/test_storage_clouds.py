@@ -123,7 +123,8 @@ def test_xyz_says_what_it_loses() -> None:
     text = xyz_bytes(before).decode()
     assert text.startswith("# x_mm y_mm z_mm in frame Sensor")
     assert all(loss in text.splitlines()[0] for loss in XYZ_LOSES)
-    found = np.array([line.split() for line in text.splitlines()[1:]], dtype=float)
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    found = np.array([line.split() for line in lines], dtype=float)
     np.testing.assert_allclose(found, before.points_mm, atol=0.51e-7, rtol=0)
 
 

@@ -29,7 +29,6 @@ from armscan.inspection.results import (
     describe_deviations,
 )
 from armscan.inspection.search import (
-    NOISE_BAND,
     Sample,
     WantedFeature,
     connected,
@@ -192,7 +191,7 @@ def inspect_feature(
         return told
     is_ball = shape.kind == "sphere"
     post = post_of(cloud, told.rows[is_fitted], shape) if is_ball else None
-    return replace(told, scatter_mm=sample.noise_mm / NOISE_BAND, post=post)
+    return replace(told, scatter_mm=sample.scatter_mm, post=post)
 
 
 def inspect_points(

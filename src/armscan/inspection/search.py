@@ -195,8 +195,8 @@ class Sample:
         (M, 3) unit directions of the stripes, of any sign; 0 where points lie in no line.
     band_mm
         (M,) how far off the shape each may lie by its own sigma.
-    noise_mm
-        How far off a candidate of a surface they may lie: what neighbourhoods are thick.
+    scatter_mm
+        What neighbourhoods are thick; NaN where none is flat.
     spacing_mm
         Typical distance of neighbours.
     """
@@ -205,8 +205,13 @@ class Sample:
     normals: FloatArray
     along: FloatArray
     band_mm: FloatArray
-    noise_mm: float
+    scatter_mm: float
     spacing_mm: float
+
+    @property
+    def noise_mm(self) -> float:
+        """How far off a candidate of a surface they may lie."""
+        return min(float(np.fmax(NOISE_BAND * self.scatter_mm, LEAST_BAND_MM)), SEARCH_BAND_MM)
 
     def nearest(self, points_mm: FloatArray) -> IntArray:
         """(N,) rows of the sample points nearest to points (N, 3)."""
@@ -229,8 +234,11 @@ class Sample:
 
 
 def scatter_about_mm(selection: Selection, rows: IntArray) -> float:
-    """What points (N,) of a cloud scatter by off the faces that neighbours among them make."""
-    return sample_of(replace(selection, rows=rows)).noise_mm / NOISE_BAND
+    """What points (N,) of a cloud scatter by off the faces that neighbours among them make.
+
+    NaN where no neighbours make one.
+    """
+    return sample_of(replace(selection, rows=rows)).scatter_mm
 
 
 def sample_of(selection: Selection) -> Sample:
@@ -243,12 +251,14 @@ def sample_of(selection: Selection) -> Sample:
         given = own[selection.rows[chosen]]
         is_given = np.isfinite(given).all(axis=1) & given.any(axis=1)
         normals[is_given] = given[is_given]
-    band = min(max(NOISE_BAND * thickness, LEAST_BAND_MM), SEARCH_BAND_MM)
-    return Sample(drawn, normals, along, selection.search_band_mm[chosen], band, spacing)
+    scatter = float(np.maximum(thickness, LEAST_BAND_MM / NOISE_BAND))
+    return Sample(drawn, normals, along, selection.search_band_mm[chosen], scatter, spacing)
 
 
 def _normals(points: FloatArray, along: FloatArray) -> tuple[FloatArray, float, float]:
     """Normals (M, 3) of neighbourhoods, 0 where there is none, their thickness, and how wide.
+
+    The thickness is NaN if none is flat.
 
     Where the nearest points lie along one stripe they are taken of ever fewer, until they span
     several stripes.
@@ -273,7 +283,7 @@ def _normals(points: FloatArray, along: FloatArray) -> tuple[FloatArray, float, 
         is_line[rows] = breadth < THINNEST_LINE * length
         most //= SPARSER
     if not normals.any():
-        return normals, 0.0, float(np.ptp(points, axis=0).max()) / math.sqrt(len(points))
+        return normals, math.nan, float(np.ptp(points, axis=0).max()) / math.sqrt(len(points))
     return normals, float(np.median(np.concatenate(thick))), float(np.median(np.concatenate(wide)))
 
 

@@ -44,6 +44,8 @@ LEAST_GATHERED, MOST_GATHERED = 0.3, 0.9
 of a ball do at any level; and the part of them that is always enough."""
 HEIGHT_TOLERANCE = 0.05
 """Faces are searched up to this part of the nominal height from it."""
+MOST_OFF = 2.0 * HEIGHT_TOLERANCE
+"""What faces once fitted may be off: more was no step, but a ball or a ramp."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -323,6 +325,13 @@ def inspect_step(
     chosen = _fitted(search, faces)
     if isinstance(chosen, FitFailure):
         return chosen
+    apart = chosen.faces.upper_mm - chosen.faces.lower_mm
+    if abs(apart - within) > MOST_OFF * within:
+        return FitFailure(
+            f"there are no two parallel faces {height_mm:g} mm apart: fitted to what lies about "
+            f"the best place for them, they stand {apart:.4g} mm apart",
+            "check the height, or show where the step is with --region",
+        )
     return _measured(search, chosen, *_lean(section, chosen.faces.normal @ section.axes, normal))
 
 

@@ -336,3 +336,18 @@ def test_input_without_the_ball_is_refused_in_words() -> None:
             inspect_sphere(cloud_of(points[:few]), DIAMETER_MM)
     with pytest.raises(InputError, match="-1 mm diameter"):
         inspect_sphere(cloud_of(points), -1.0)
+
+
+@pytest.mark.parametrize("diameter_mm", [2.0, 10.0])
+def test_a_small_noisy_ball_is_not_doubted(diameter_mm: float) -> None:
+    """No neighbourhood of it is flat: what its neighbours scatter by is not known."""
+    rng = np.random.default_rng(4)
+    height = rng.uniform(0.0, 1.0, 20_000)
+    turn, across = rng.uniform(0.0, 2.0 * np.pi, 20_000), np.sqrt(1.0 - height**2)
+    outward = np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
+    noise_mm = 0.01 * diameter_mm
+    points = outward * (0.5 * diameter_mm + rng.normal(0.0, noise_mm, 20_000))[:, None]
+    cloud = cloud_of(points, sigma_mm=0.0)
+    found = inspect_sphere(cloud, diameter_mm)
+    assert not isinstance(found, FitFailure), found
+    assert not any("no ball" in text for text in sphere_report(found, cloud).warnings)

@@ -271,3 +271,24 @@ def test_input_without_the_step_is_refused_in_words() -> None:
         inspect_step(cloud_of(profile(0.0)), HEIGHT_MM, normal=np.zeros(3))
     with pytest.raises(OptionError, match="margin_mm is -1"):
         StepOptions(margin_mm=-1.0)
+
+
+@pytest.mark.parametrize("height_mm", [4.0, 5.0, 8.0])
+def test_a_ramp_beside_a_floor_is_no_step(height_mm: float) -> None:
+    """Both levels settled on the floor: a height of 0.0000 mm was told."""
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(-20.0, 20.0, (2, 8000))
+    z = np.where(x > 0.0, 0.6 * x, 0.0) + rng.normal(0.0, 0.02, 8000)
+    failure = inspect_step(cloud_of(np.column_stack([x, y, z])), height_mm)
+    assert isinstance(failure, FitFailure)
+    assert "no two parallel faces" in failure.reason
+
+
+def test_faces_of_a_noisy_step_are_not_doubted() -> None:
+    """Where no neighbourhood is flat for noise, what neighbours scatter by is not known."""
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(-5.0, 5.0, (2, 20_000))
+    z = np.where(x > 0.0, HEIGHT_MM, 0.0) + rng.normal(0.0, 0.1, 20_000)
+    cloud = cloud_of(np.column_stack([x, y, z]), sigma_mm=0.0)
+    found = inspected(inspect_step(cloud, HEIGHT_MM))
+    assert not any("not flat" in text for text in step_report(found, cloud).warnings)

@@ -194,8 +194,8 @@ FILES = [Path("scans/1.png"), Path("scans/2.png"), Path("scans/10.png")]
     [
         "10.png 10 2 3 0 0 0|1.png 1 2 3 0 0 0|extra.png 7 7 7 0 0 0|2.png 2 2 3 0 0 0",
         "image,x,y,z,qx,qy,qz,qw|1.png,1,2,3,0,0,0,1|10.png,10,2,3,0,0,0,1|2.png,2,2,3,0,0,0,1",
-        'filename; x; y; z; a; b; c|"a b\\1.png"; 1; 2; 3; 0; 0; 0|'
-        "q/10.png; 10; 2; 3; 0; 0; 0|2.png; 2; 2; 3; 0; 0; 0",
+        'filename; x; y; z; a; b; c|"scans\\1.png"; 1; 2; 3; 0; 0; 0|'
+        "x/scans/10.png; 10; 2; 3; 0; 0; 0|2.png; 2; 2; 3; 0; 0; 0",
         "name,x_m,y_m,z_m,a,b,c|2,.002,.002,.003,0,0,0|10,.01,.002,.003,0,0,0|1,.001,.002,.003,0,0,0",
         "2.png 1 0 0 2 0 1 0 2 0 0 1 3|1.png 1 0 0 1 0 1 0 2 0 0 1 3|"
         "10.png 1 0 0 10 0 1 0 2 0 0 1 3",
@@ -217,8 +217,8 @@ def test_poses_that_name_their_files_go_to_these_whatever_the_order(
     ("text", "said"),
     [
         ("1.png 1 2 3 0 0 0\n2.png 1 2 3 0 0 0\n", "there is no pose of 10.png"),
-        ("pose1 1 2 3 0 0 0\npose2 1 2 3 0 0 0\n", "no pose of 1.png and 2 more files"),
-        ("1.png 1 2 3 0 0 0\na/1.png 1 2 3 0 0 0\n", "two poses of 1.png"),
+        ("pose1 1 2 3 0 0 0\npose2 1 2 3 0 0 0\n", "there is no pose of 1.png"),
+        ("1.png 1 2 3 0 0 0\n1 1 2 3 0 0 0\n", "two poses of 1.png"),
         ("1.png 1 2 3 0 0 0\n2.png\n", "p.txt, line 2"),
         ("image,foo,bar\n1.png,1,2\n", "the header foo,bar is not understood"),
     ],
@@ -256,3 +256,15 @@ def test_rotations_that_are_written_with_few_decimals_are_read(
     if 6.0 * 10.0**-decimals > 5e-5:
         with pytest.raises(FileFormatError):
             rotations_of_form(changed, form, "extrinsic-xyz", places)
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    files = [Path("left/1.png"), Path("right/1.png")]
+    text = "right/1.png 2 0 900 0 0 0\nleft/1.png 1 0 900 0 0 0\n"
+    poses = read_robot_poses(written(tmp_path, "p.txt", text), "extrinsic-xyz", files)
+    assert [pose.translation_mm[0] for pose in poses] == [1.0, 2.0]
+    with pytest.raises(FileFormatError, match=r"1\.png may be left/1\.png or right/1\.png"):
+        read_robot_poses(written(tmp_path, "q.txt", "1.png 2 0 9 0 0 0\n"), "extrinsic-xyz", files)
+    with pytest.raises(FileFormatError, match=r"left/1\.png may be left/1\.png or right/1\.png"):
+        left_only = written(tmp_path, "r.txt", "left/1.png 1 0 9 0 0 0\n")
+        read_robot_poses(left_only, "extrinsic-xyz", files)

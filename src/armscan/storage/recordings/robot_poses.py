@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import product, takewhile
 from pathlib import Path, PureWindowsPath
 from typing import Any, Final, get_args
 
@@ -301,26 +301,49 @@ class _PoseTable:
         """The lines that name these files, in their order; all of them where none is named."""
         if not self.names or not files:
             return self
-        lines = {name: k for k, name in enumerate(self.names)}
-        for k, name in enumerate(self.names):
-            if lines[name] != k:
-                raise FileFormatError(
-                    f"there are two poses of {name}", where=where, remedy="name each file once"
-                )
-        found = [
-            next((lines[n] for n in (file.name, file.stem) if n in lines), -1) for file in files
-        ]
-        missing = [file.name for file, line in zip(files, found, strict=True) if line < 0]
-        if missing:
+        parts = [PureWindowsPath(name).parts for name in self.names]
+        lines = [_line_of(file, parts, where) for file in files]
+        if len(set(lines)) < len(lines):
+            twice = next(line for line in lines if lines.count(line) > 1)
+            both = [str(file) for file, line in zip(files, lines, strict=True) if line == twice]
             raise FileFormatError(
-                f"there is no pose of {missing[0]}"
-                + (f" and {len(missing) - 1} more files" if len(missing) > 1 else ""),
-                where=where,
-                remedy="name each file in the table as it is called, or leave the names out and "
-                "give one pose a file, in the files' order",
+                f"{self.names[twice]} may be {' or '.join(both[:2])}",
+                where=self.places[twice],
+                remedy="name each file with the folder that it is in",
             )
-        rows, places = [self.rows[k] for k in found], [self.places[k] for k in found]
+        rows, places = [self.rows[k] for k in lines], [self.places[k] for k in lines]
         return _PoseTable(self.header, rows, places, self.is_metres, self.names)
+
+
+def _line_of(file: Path, names: Sequence[tuple[str, ...]], where: str) -> int:
+    """The one line whose name is that of a file, with most folders alike."""
+    alike = [_n_alike(file, name) for name in names]
+    most = max(alike)
+    if most > 0 and alike.count(most) == 1:
+        return alike.index(most)
+    if most > 0:
+        raise FileFormatError(
+            f"there are two poses of {'/'.join(names[alike.index(most)])}",
+            where=where,
+            remedy="name each file once, with its folder where two are called alike",
+        )
+    raise FileFormatError(
+        f"there is no pose of {file.name}",
+        where=where,
+        remedy="name each file in the table as it is called, or leave the names out and give one "
+        "pose a file, in the files' order",
+    )
+
+
+def _n_alike(file: Path, name: tuple[str, ...]) -> int:
+    """Last parts of a path that a name has, too; its ending may be left out.
+
+    Folders before may differ: they are called otherwise on another machine.
+    """
+    if not name or name[-1] not in (file.name, file.stem):
+        return 0
+    pairs = zip(reversed(name[:-1]), reversed(file.absolute().parent.parts), strict=False)
+    return 1 + sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def _read_table(path: Path, files: Sequence[Path]) -> _PoseTable:
@@ -448,10 +471,9 @@ _FIRST = re.compile(r"([^,;]*[^,;\s])\s*[,;]\s*|(\S+)\s+")
 
 
 def _file_of(line: str) -> str:
-    """Last part of the file's name with which a line begins."""
+    """The file's name with which a line begins."""
     first = _FIRST.match(line)
-    name = (first[1] or first[2]) if first else line
-    return PureWindowsPath(name.strip()).name
+    return ((first[1] or first[2]) if first else line).strip()
 
 
 def _after_first(line: str) -> str:

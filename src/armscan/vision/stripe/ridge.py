@@ -329,7 +329,9 @@ CLIPPED = 250.0
 """Of 255, `NORMAL_SCALE`: a little less where a view without laser was taken off."""
 MEASURED = 300
 MOST = 0.5
-APART = 1.5
+WIDER = 1.5
+"""Lines without the laser's colour are wider than those that have it by this factor at least where
+the latter tell the width: they are fewer, and a little less certain."""
 STRONG_SHARE = 0.4
 REACH_PX = 30.0
 STEP_PX = 0.5
@@ -349,8 +351,8 @@ def find_line_sigma(
 ) -> float:
     """Median sigma of the brighter lines from their full width at half height, in px.
 
-    Where most of the brighter lines have not the laser's colour, as sheets of paper and folds of
-    cloth in the room, and are of another width, those that have it tell.
+    Where most of the brighter lines have not the laser's colour and are wider than those that have
+    it, as sheets of paper and folds of cloth in the room, the latter tell.
 
     ``image``: (H, W) float32. ``runs``: (N, 3) candidates; a sample of them is measured across the
     local ridge direction. ``level``: Background and threshold. ``blur_px``: Sigma by which the
@@ -370,8 +372,7 @@ def find_line_sigma(
     if near is None or _at(near, points[bright]).mean() > MOST:
         return sigma
     own = find_line_sigma(image, runs[_at(near, runs) > 0], level, blur_px)
-    # of fewer points and less certain; a fit in the line's own width mends less
-    return own if max(own, sigma) > APART * min(own, sigma) else sigma
+    return own if sigma > WIDER * own else sigma
 
 
 def _at(image: NDArray[Any], points: FloatArray) -> NDArray[Any]:

@@ -137,8 +137,10 @@ def test_images_of_another_size_may_be_left_out(
     assert "view3.png" in said
     assert "view1.png" not in fails(*words, "--leave-out", "view1.png", writes=tmp_path)
     assert main([*words, "--leave-out", "view[13].png"]) == 0
-    views = json.loads(capsys.readouterr().out)["views"]
+    told = json.loads(capsys.readouterr().out)
+    views = told["views"]
     assert not {"view1.png", "view3.png"} & {view["source"] for view in views}
+    assert [one["source"] for one in told["not_found"]] == ["view1.png", "view3.png"]
     assert len(views) > 3
 
 

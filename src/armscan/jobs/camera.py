@@ -51,6 +51,9 @@ from armscan.vision.targets.target import (
 )
 
 
+ODD_SIZE = "left out by request: it has another size"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Images:
     """Images of one camera with their files, other files that went in, and what is odd."""
@@ -93,6 +96,8 @@ def calibrate_camera(
     options = replace(options, leave_out=tuple(one for one in options.leave_out if one in seen))
     plate = settle_target(exposures, plate)
     found = find_targets(exposures, plate, cache=job.cache, progress=job.progress)
+    gone = tuple((source, ODD_SIZE) for source in sources if source not in seen)
+    found = replace(found, not_found=(*found.not_found, *gone))
     run = calibrate_camera_from_found(found, plate, options, progress=job.progress)
     inputs = (*read.paths, *read.tables)
     by_source = dict(zip(sources, read.exposures, strict=True))

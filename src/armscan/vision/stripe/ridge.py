@@ -328,9 +328,8 @@ SPOTS = 4.0
 CLIPPED = 250.0
 """Of 255, `NORMAL_SCALE`: a little less where a view without laser was taken off."""
 MEASURED = 300
-MOST = 0.5
-WIDER = 1.5
-"""Lines without the laser's colour are wider than those that have it by this factor at least where
+MOST, WIDER = 0.5, 1.5
+"""More than this part of them are most. Lines without the laser's colour are wider than those that have it by this factor at least where
 the latter tell the width: they are fewer, and a little less certain."""
 STRONG_SHARE = 0.4
 REACH_PX = 30.0

@@ -50,7 +50,6 @@ from armscan.vision.targets.target import (
     parse_target,
 )
 
-
 ODD_SIZE = "left out by request: it has another size"
 
 

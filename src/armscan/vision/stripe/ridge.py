@@ -329,8 +329,8 @@ CLIPPED = 250.0
 """Of 255, `NORMAL_SCALE`: a little less where a view without laser was taken off."""
 MEASURED = 300
 MOST, WIDER = 0.5, 1.5
-"""More than this part of them are most. Lines without the laser's colour are wider than those that have it by this factor at least where
-the latter tell the width: they are fewer, and a little less certain."""
+"""More than this part of lines are most of them. Lines without the laser's colour are wider by this
+factor at least where those that have it tell the width: they are fewer and less certain."""
 STRONG_SHARE = 0.4
 REACH_PX = 30.0
 STEP_PX = 0.5

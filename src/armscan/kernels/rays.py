@@ -204,16 +204,24 @@ def lens_slopes(x: float, y: float, camera: Floats, is_fisheye: bool) -> Four:
 
 
 @compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
+def distorted_at(x: float, y: float, camera: Floats, radial: float) -> Two:
+    """Distorted x and y, of the radial factor from `lens_slopes`."""
+    p1, p2, r2 = camera[6], camera[7], x * x + y * y
+    return (
+        x * radial + p1 * 2.0 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + p2 * 2.0 * x * y,
+    )
+
+
+@compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
 def _lens_step(x: float, y: float, u: float, v: float, camera: Floats, safe: float) -> Four:
     """One of Newton's steps to the inverse of `distort` for a pinhole.
 
     The new place, the step's size, and the least of ``safe`` and what it divides by.
     """
-    p1, p2 = camera[6], camera[7]
     xx, xy, yy, radial = lens_slopes(x, y, camera, False)
-    r2 = x * x + y * y
-    ex = x * radial + p1 * 2.0 * x * y + p2 * (r2 + 2.0 * x * x) - u
-    ey = y * radial + p1 * (r2 + 2.0 * y * y) + p2 * 2.0 * x * y - v
+    ex, ey = distorted_at(x, y, camera, radial)
+    ex, ey = ex - u, ey - v
     det = xx * yy - xy * xy
     safe = det if det < safe else safe
     safe = xx if xx < safe else safe
@@ -423,10 +431,8 @@ def board_rows(
     x, y = (tx + pose[9]) / z, (ty + pose[10]) / z
     xx, xy, yy, radial = lens_slopes(x, y, shared, is_fisheye)
     scale, q = radial_base(x * x + y * y, is_fisheye)
-    u, v, r2 = scale * x, scale * y, x * x + y * y
-    p1, p2 = shared[6], shared[7]
-    distorted_x = x * radial + p1 * 2.0 * x * y + p2 * (r2 + 2.0 * x * x)
-    distorted_y = y * radial + p1 * (r2 + 2.0 * y * y) + p2 * 2.0 * x * y
+    u, v = scale * x, scale * y
+    distorted_x, distorted_y = distorted_at(x, y, shared, radial)
     for i in range(2):
         focal = shared[i]
         along, across = (u, v) if i == 0 else (v, u)

@@ -336,6 +336,15 @@ def _number(cell: str) -> float:
     return float(cell) if DECIMAL.fullmatch(cell) else math.inf
 
 
+def reads_as_float(word: str) -> bool:
+    """Whether Python reads a word as a number; NaN and infinity are such."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def _is_number(cell: str) -> bool:
     return bool(cell) and math.isfinite(_number(cell))
 

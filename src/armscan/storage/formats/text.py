@@ -31,7 +31,7 @@ from armscan.storage.formats.columns import (
     cloud_columns,
     structured,
 )
-from armscan.storage.tables import refuse_other_units
+from armscan.storage.tables import reads_as_float, refuse_other_units
 
 SIGMA_LOSS = "sigma_mm and covariance"
 XYZ_LOSES = (
@@ -171,7 +171,7 @@ def _refuse_cut_line(last: str, first: str, number: int, path: Path) -> None:
     """Raise for a last line without an end that holds less than the first one, or half a number."""
     words, wanted = _words(last), _words(first)
     pairs = zip(words, wanted, strict=False)
-    is_half = any(_is_number(other) and not _is_number(word) for word, other in pairs)
+    is_half = any(reads_as_float(other) and not reads_as_float(word) for word, other in pairs)
     if words and (len(words) < len(wanted) or is_half):
         raise FileFormatError(
             f"the file seems cut: it ends within line {number}, '{last.strip()[:60]}'",
@@ -222,7 +222,7 @@ def _is_heading(lines: list[str], path: Path) -> bool:
         return False
     if len(words) == 1 and words[0].isdecimal():
         return True
-    if all(_is_number(word) for word in words):
+    if all(reads_as_float(word) for word in words):
         return False
     if not all(re.match(r"[\W_]*[A-Za-z]", word) for word in words):
         raise FileFormatError(
@@ -252,11 +252,3 @@ def _refuse_decimal_commas(line: str, path: Path) -> None:
 
 def _words(line: str) -> list[str]:
     return [word for word in re.split(r"[,;\s]+", line.strip()) if word]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

@@ -26,7 +26,7 @@ from armscan.geometry.rotations import (
 from armscan.records.recording import PoseForm
 from armscan.storage.codec import parse_json
 from armscan.storage.files import read_bytes
-from armscan.storage.tables import refuse_beyond_reach
+from armscan.storage.tables import reads_as_float, refuse_beyond_reach
 
 POSITION: Final = ("x_mm", "y_mm", "z_mm")
 FORM_COLUMNS: Final[dict[PoseForm, tuple[str, ...]]] = {
@@ -436,7 +436,7 @@ def _from_text(data: bytes, where: str) -> _PoseTable:
             line = _after_first(line) if is_named else line
             header = _header(line.rstrip(",;"), _words(line), place)
             continue
-        if is_named or not (rows or _is_number(words[0])):
+        if is_named or not (rows or reads_as_float(words[0])):
             is_named = True
             names.append(_file_of(line))
             line = _after_first(line)
@@ -456,14 +456,6 @@ def _from_text(data: bytes, where: str) -> _PoseTable:
 
 def _words(line: str) -> list[str]:
     return [word for word in re.split(r"[\s,;\[\]]+", line) if word]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 _FIRST = re.compile(r"([^,;]*[^,;\s])\s*[,;]\s*|(\S+)\s+")

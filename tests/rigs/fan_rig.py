@@ -6,7 +6,7 @@ The light is the simulator's (`armscan.simulation.optics.lasers`), the projectio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -138,7 +138,7 @@ class FanRig:
             for c, rig in enumerate(rigs):
                 if not _is_seen(rig):
                     continue
-                view = rig.view(0, rng)
+                view = replace(rig.view(0, rng), source=f"{c}-{i}.png")
                 own = estimate_board_pose(view, cameras.model(c))
                 assert own, own
                 seen.append((c, view, own))

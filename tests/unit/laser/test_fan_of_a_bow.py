@@ -23,7 +23,7 @@ class _Stated(_OneSheet):
 
     def __init__(self, bow_mm: float, sigma_mm: float, chi2_of_fan) -> None:
         errors = SimpleNamespace(n_camera=N_CAMERA)
-        super().__init__(None, errors)
+        super().__init__(None, errors, is_bow_allowed=True)
         object.__setattr__(self, "told", (bow_mm, sigma_mm, chi2_of_fan))
 
     def solve(self, start, sigma_factor, *, is_bowed=False):

@@ -37,9 +37,9 @@ GRAZING = 1e-6
 
 LEAST_BOW_VIEWS = 3
 """Of fewer views, the poses take up a bow."""
-LIKELY_BOARD_BOW = 3e-4
-"""Bow of a board that is called flat, in parts of half its size: of a print on a plate of 300 mm,
-0.05 mm. It only limits what views that hardly show a bow leave open."""
+LIKELY_BOARD_BOWS = np.geomspace(1e-5, 8e-4, 21)
+"""Bows of boards that are called flat, in parts of half their size, each as likely as any other: of
+300 mm from glass, 1.5 um, to a print on a plate, 0.12 mm. Their rms is 3e-4."""
 BOW_STEPS = 3
 
 SeenBoard = tuple[int, TargetView, Estimate[Pose[Sensor, Board]]]
@@ -364,6 +364,27 @@ class BoardBow:
         board[:, 2] = self.shape(board) @ self.bow_mm
         return replace(view, points_board_mm=board)
 
+    def held_at_zero(self, sizes_mm: FloatArray) -> BoardBow:
+        """No bow, and the mean square of what it may be where this one was found.
+
+        Means over ``sizes_mm`` (S,) that boards may bow by, each as likely beforehand, weighed by
+        how probable they make the bow that was found (MacKay 1992).
+        """
+        found_mm, covariance = self.bow_mm, self.covariance_mm2
+        whole = covariance + sizes_mm[:, None, None] ** 2 * np.eye(2)
+        inverse = np.linalg.inv(whole)
+        evidence = -0.5 * (np.linalg.slogdet(whole)[1] + found_mm @ (inverse @ found_mm).T)
+        weight = np.exp(evidence - evidence.max())
+        gain = np.eye(2) - covariance @ inverse
+        mean_mm = gain @ found_mm
+        square = gain @ covariance + np.einsum("si,sj->sij", mean_mm, mean_mm)
+        return replace(
+            self,
+            bow_mm=np.zeros(2),
+            covariance_mm2=np.average(square, axis=0, weights=weight),
+            by_cameras=np.average(gain, axis=0, weights=weight) @ self.by_cameras,
+        )
+
     def height_mm(self, points_mm: FloatArray, pose: Pose[Sensor, Board]) -> FloatArray:
         """(N,) height of the bowed board over its plane below points (N, 3) in Sensor."""
         local = (points_mm - pose.translation_mm) @ pose.rotation
@@ -430,14 +451,35 @@ def find_board_bow(
     """Bow of the target that camera 0 saw in several views, the camera being held.
 
     One that is not significant is held at zero, with the mean square of what the views leave likely
-    of it where ``likely_mm`` is known beforehand (None: `LIKELY_BOARD_BOW`). None where fewer than
-    `LEAST_BOW_VIEWS` views show it, and where it is known to be zero and they do not contradict.
+    of it where ``likely_mm`` is known beforehand (None: `LIKELY_BOARD_BOWS`); of fewer than
+    `LEAST_BOW_VIEWS` views that is all that is likely. None where a view's pose has no solution,
+    and where the bow is known to be zero and the views do not contradict.
     """
-    flat = _held_camera(views, cameras.model(0)) if len(views) >= LEAST_BOW_VIEWS else None
-    if flat is None:
+    if not views:
         return None
-    bowed = with_board_warp(flat, MAX_STEPS)
-    if isinstance(bowed, FitFailure):
+    board = np.concatenate([view.points_board_mm[:, :2] for view in views])
+    half_mm = 0.5 * float(np.ptp(board, axis=0).max())
+    sizes_mm = LIKELY_BOARD_BOWS * half_mm if likely_mm is None else np.array([likely_mm])
+    if len(views) >= LEAST_BOW_VIEWS:
+        solved = _solved_bow(views, cameras)
+        if solved is None:
+            return None
+        bow, is_significant = solved
+        if is_significant:
+            return bow
+        bow = bow.held_at_zero(sizes_mm)
+    else:
+        likely = np.mean(sizes_mm**2) * np.eye(2)
+        of_cameras = np.zeros((2, cameras.n_parameters))
+        bow = BoardBow(np.zeros(2), likely, of_cameras, board.min(axis=0), board.max(axis=0))
+    return None if likely_mm == 0.0 else bow
+
+
+def _solved_bow(views: Sequence[TargetView], cameras: HeadCameras) -> tuple[BoardBow, bool] | None:
+    """The bow as the views show it, and whether it is significant."""
+    flat = _held_camera(views, cameras.model(0))
+    bowed = None if flat is None else with_board_warp(flat, MAX_STEPS)
+    if flat is None or bowed is None or isinstance(bowed, FitFailure):
         return None
     equations = linearise(bowed.observations, bowed.state, np.eye(N_CAMERA + 2), bowed.weights)
     if equations is None:
@@ -448,18 +490,11 @@ def find_board_bow(
     of_bow = np.linalg.inv(reduced[N_CAMERA:, N_CAMERA:])
     by_cameras = np.zeros((2, cameras.n_parameters))
     by_cameras[:, :N_CAMERA] = -of_bow @ reduced[N_CAMERA:, :N_CAMERA]
+    covariance = bowed.variance_factor * of_bow
     board = np.concatenate([view.points_board_mm[:, :2] for view in views])
-    bow_mm, covariance = bowed.state.shared[N_CAMERA:], bowed.variance_factor * of_bow
-    if not BowTest.of(flat, bowed).is_significant:
-        if likely_mm is None:
-            likely_mm = LIKELY_BOARD_BOW * 0.5 * float(np.ptp(board, axis=0).max())
-        if likely_mm == 0.0:
-            return None
-        left = np.linalg.inv(np.linalg.inv(covariance) + np.eye(2) / likely_mm**2)
-        mean_mm = left @ np.linalg.solve(covariance, bow_mm)
-        by_cameras = left @ np.linalg.solve(covariance, by_cameras)
-        bow_mm, covariance = np.zeros(2), left + np.outer(mean_mm, mean_mm)
-    return BoardBow(bow_mm, covariance, by_cameras, board.min(axis=0), board.max(axis=0))
+    ends = board.min(axis=0), board.max(axis=0)
+    bow = BoardBow(bowed.state.shared[N_CAMERA:], covariance, by_cameras, *ends)
+    return bow, BowTest.of(flat, bowed).is_significant
 
 
 def _held_camera(views: Sequence[TargetView], model: CameraModel) -> Solution | None:

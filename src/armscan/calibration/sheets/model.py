@@ -409,7 +409,7 @@ def choose_model(
     is_bow_allowed: bool,
 ) -> SheetModel | FitFailure:
     """Fit the plane, test its fit, and let the sheet bow if the test asks for it."""
-    data = _OneSheet(observations.as_one_sheet(), errors)
+    data = _OneSheet(observations.as_one_sheet(), errors, is_bow_allowed)
     noise = stripe_noise(data.points, data.points.residuals_px([start])[1])
     flat = data.solve(start, noise.sigma_factor)
     if not isinstance(flat, FitFailure):
@@ -432,10 +432,11 @@ def choose_model(
             f"bow from their own errors: {MIN_BOARDS_FOR_BOW} are needed"
         )
     else:
-        return _bow_or_boards(model, flat, data, is_bow_allowed=is_bow_allowed)
+        return _bow_or_boards(model, flat, data)
     model = replace(model, decision=decision)
     if n_boards != NO_SPARE:
-        return data.charged_to_stripes(model)
+        is_enough = plane_test.p_value >= LACK_OF_FIT_P
+        return model if is_enough else data.charged_to_stripes(model)
     # One height is left over, and no test of it has power: its likeliest cause is taken.
     scatter = data.board_scatter(flat, noise)
     factor = min(scatter.factor, MOST_OF_TWO)
@@ -443,7 +444,7 @@ def choose_model(
 
 
 def _bow_or_boards(
-    plane_model: SheetModel, flat: SheetSolution, data: _OneSheet, *, is_bow_allowed: bool
+    plane_model: SheetModel, flat: SheetSolution, data: _OneSheet
 ) -> SheetModel | FitFailure:
     """What a plane leaves unexplained: is the sheet bowed, or do its boards scatter?"""
     noise, plane_test = plane_model.noise, plane_model.plane_test
@@ -453,7 +454,7 @@ def _bow_or_boards(
     def plane(decision: str) -> SheetModel | FitFailure:
         return data.charged_to_boards(replace(plane_model, decision=decision), boards.of_boards)
 
-    if not is_bow_allowed:
+    if not data.is_bow_allowed:
         return plane(f"a plane was asked for, and does not explain the stripes ({test})")
     condition = _bow_condition(data.points, flat)
     bowed = data.solve_bowed(flat.sheets[0], noise.sigma_factor)
@@ -494,12 +495,24 @@ class _OneSheet:
 
     points: SheetObservations
     errors: CommonErrors
+    is_bow_allowed: bool
 
     def solve(
         self, start: LightSheet, sigma_factor: float, *, is_bowed: bool = False
     ) -> SheetSolution | FitFailure:
         return solve_sheets(
             self.points, [start], self.errors, [is_bowed], sigma_factor=sigma_factor
+        )
+
+    def solve_again(self, model: SheetModel, sigma_factor: float) -> SheetSolution | FitFailure:
+        """The model as it is stored: with the likeliest of small bows where none is free."""
+        return solve_sheets(
+            self.points,
+            [model.sheet],
+            self.errors,
+            [model.is_bowed],
+            sigma_factor=sigma_factor,
+            may_bow=self.is_bow_allowed,
         )
 
     def lack_of_fit(
@@ -603,8 +616,8 @@ class _OneSheet:
         form would show as scatter, and that is charged to the stripes.
         """
         for _ in range(SCATTER_ROUNDS):
-            wider = _OneSheet(self.points, self.errors.with_boards(factors))
-            solution = wider.solve(model.sheet, model.noise.sigma_factor, is_bowed=model.is_bowed)
+            wider = replace(self, errors=self.errors.with_boards(factors))
+            solution = wider.solve_again(model, model.noise.sigma_factor)
             if isinstance(solution, FitFailure):
                 return solution
             if not solution.has_converged:
@@ -613,15 +626,11 @@ class _OneSheet:
                     "the sheet's shape did not settle",
                     "take more boards, farther apart, and check their poses",
                 )
-            final = wider.lack_of_fit(solution, model.noise)
-            model = replace(model, final_test=final, sigma_factor=model.noise.sigma_factor)
-            charged = wider.charged_to_stripes(
-                replace(model, sheet=solution.sheets[0], board_factors=factors)
-            )
+            charged = wider.charged_to_stripes(replace(model, board_factors=factors))
             if isinstance(charged, FitFailure) or len(np.unique(self.points.board)) <= NO_SPARE:
                 return charged
             model = charged
-            solution = wider.solve(model.sheet, model.sigma_factor, is_bowed=model.is_bowed)
+            solution = wider.solve_again(model, model.sigma_factor)
             if isinstance(solution, FitFailure):
                 return solution
             found = np.array(self.likeliest_scatter(solution, model.noise).of_boards)
@@ -637,17 +646,17 @@ class _OneSheet:
         What neither the model nor the boards' scatter explains is charged to the stripes. The
         covariance of the sheet grows with it.
         """
-        factor, test, sheet = model.sigma_factor, model.final_test, model.sheet
+        factor, tests = model.noise.sigma_factor, list[FTest]()
         for _ in range(MAX_RAISES):
-            if test.p_value >= LACK_OF_FIT_P or test.f_ratio <= 1.0:
-                break
-            factor *= float(np.sqrt(test.f_ratio))
-            solution = self.solve(sheet, factor, is_bowed=model.is_bowed)
+            solution = self.solve_again(model, factor)
             if isinstance(solution, FitFailure):
                 return solution
-            sheet = solution.sheets[0]
-            test = self.lack_of_fit(solution, model.noise, factor)
-        return replace(model, sheet=sheet, sigma_factor=factor)
+            model = replace(model, sheet=solution.sheets[0], sigma_factor=factor)
+            tests.append(self.lack_of_fit(solution, model.noise, factor))
+            if tests[-1].p_value >= LACK_OF_FIT_P or tests[-1].f_ratio <= 1.0:
+                break
+            factor *= float(np.sqrt(tests[-1].f_ratio))
+        return replace(model, final_test=tests[0])
 
 
 def _bow_condition(observations: SheetObservations, flat: SheetSolution) -> float:

@@ -219,7 +219,8 @@ class SheetSolution:
         (6 M + P,) estimated common errors of boards and cameras, in their own sigmas; zero for
         cameras that are held.
     chi2
-        Weighted squares of ``remaining_px`` plus squares of ``common``.
+        Weighted squares of ``remaining_px`` plus squares of ``common``, and of the bows that are
+        known beforehand to be small, over what is likely of them.
     last_step_sigma
         Largest last step of a parameter, in its own sigma.
     active
@@ -243,8 +244,8 @@ class SheetSolution:
 
     @property
     def n_parameters(self) -> int:
-        """Free parameters of all sheets."""
-        return int(self.active.sum())
+        """Parameters of all sheets of which nothing is known beforehand."""
+        return int(np.count_nonzero(self.system.precision == 0.0))
 
     @property
     def has_converged(self) -> bool:
@@ -315,7 +316,11 @@ def solve_sheets(
         covariance=_joint_covariance(normal, active, errors),
         remaining_px=remaining,
         common=common,
-        chi2=float((robust * (remaining / sigma) ** 2).sum() + common @ common),
+        chi2=float(
+            (robust * (remaining / sigma) ** 2).sum()
+            + common @ common
+            + system.precision @ system.bow_mm**2
+        ),
         last_step_sigma=float((np.abs(normal.step[:n_active]) / sigmas).max()),
         active=active,
         weight=robust / sigma**2,

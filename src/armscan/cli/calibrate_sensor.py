@@ -97,7 +97,7 @@ TargetBow = Annotated[
     float | None,
     typer.Option(
         help="What the target may be bowed by where its views show none (mm); 0 if known flat.",
-        show_default="3e-4 of half its size",
+        show_default="1e-5 to 8e-4 of half its size",
     ),
 ]
 TargetMargin = Annotated[

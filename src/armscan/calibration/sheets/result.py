@@ -62,8 +62,8 @@ class SheetOptions:
         False holds every sheet to a plane.
     target_bow_mm
         What the target may be bowed by (one standard deviation of the height of its middle over its
-        edges) where its views show no bow; 0 for one that is known to be flat. None takes 3e-4 of
-        half its size.
+        edges) where its views show no bow; 0 for one that is known to be flat. None takes any
+        size from 1e-5 to 8e-4 of half the target.
     """
 
     margin_mm: float | None = None

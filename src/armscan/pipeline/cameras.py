@@ -324,9 +324,12 @@ def pair_lists(left: Sequence[Exposure], right: Sequence[Exposure]) -> list[Expo
         If the lists differ in length, or an exposure is in both.
     """
     if len(left) != len(right):
+        alone = without_partner(left, right)
+        has = "has" if len(alone) == 1 else "have"
+        named = f"; by the numbers in their names {_listed(alone)} {has} no partner"
         raise InputError(
             f"{len(left)} left images ({_listed(left)}) but {len(right)} right ones "
-            f"({_listed(right)}){_without_partner(left, right)}",
+            f"({_listed(right)}){named if 0 < len(alone) <= LISTED else ''}",
             remedy="give one right image for each left image, in the same order",
         )
     on_the_right = {exposure.source for exposure in right}
@@ -598,25 +601,22 @@ def _listed(exposures: Sequence[Exposure]) -> str:
     return begun([exposure.source for exposure in exposures], LISTED)
 
 
-def _without_partner(left: Sequence[Exposure], right: Sequence[Exposure]) -> str:
-    """The few images that have no partner by the last number in their names; "" if that is open."""
+def without_partner(left: Sequence[Exposure], right: Sequence[Exposure]) -> list[Exposure]:
+    """Images without a partner by the last number in their names; none where these do not tell."""
     numbers = [
         [re.findall(r"\d+", PurePath(exposure.source).stem)[-1:] for exposure in side]
         for side in (left, right)
     ]
     counted = [{int(found[0]) for found in side if found} for side in numbers]
-    if any(len(seen) < len(side) for seen, side in zip(counted, numbers, strict=True)):
-        return ""
-    alone = [
+    is_told = all(len(seen) == len(side) for seen, side in zip(counted, numbers, strict=True))
+    if not is_told or not counted[0] & counted[1]:
+        return []
+    return [
         exposure
         for side, found, other in zip((left, right), numbers, counted[::-1], strict=True)
         for exposure, number in zip(side, found, strict=True)
         if int(number[0]) not in other
     ]
-    if not counted[0] & counted[1] or not 0 < len(alone) <= LISTED:
-        return ""
-    has = "has" if len(alone) == 1 else "have"
-    return f"; by the numbers in their names {_listed(alone)} {has} no partner"
 
 
 def camera_calibration(fit: CameraFit, provenance: Provenance) -> CameraCalibration:

@@ -32,6 +32,33 @@ def test_an_image_in_both_lists_is_refused_wherever_it_stands() -> None:
     assert len(pair_lists(left, [named("c.png"), named("d.png")])) == 2
 
 
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        ("left1 left2 left10", "right1 right2 right10 right11", "right11.png has no partner"),
+        ("l1 l2 l3", "r2 r3", "in their names l1.png has no partner"),
+        ("l1 l2 l3 l5", "r1 r3 r4", "l2.png, l5.png, r4.png have no partner"),
+    ],
+)
+def test_of_lists_of_unlike_length_the_images_without_partner_are_named(
+    left: str, right: str, said: str
+) -> None:
+    lists = [[named(f"{name}.png") for name in side.split()] for side in (left, right)]
+    with pytest.raises(InputError, match=said.replace(".", r"\.")):
+        pair_lists(*lists)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [("a b", "c"), ("l1 l2", "r7"), ("cam1 cam1x1", "r1"), ("l1 l2 l3 l4 l5 l6", "r1")],
+)
+def test_names_that_do_not_tell_the_partner_name_none(left: str, right: str) -> None:
+    lists = [[named(f"{name}.png") for name in side.split()] for side in (left, right)]
+    with pytest.raises(InputError, match="left images") as refused:
+        pair_lists(*lists)
+    assert "no partner" not in str(refused.value)
+
+
 def test_images_beside_a_recording_are_refused(tmp_path: Path, fails: Fails) -> None:
     scan, output = lab_folder(tmp_path), tmp_path / "stereo.json"
     words = ("calibrate", "stereo", *TARGET, "--scan", scan, "-o", output)

@@ -24,8 +24,10 @@ from armscan.pipeline.cameras import (
     pair_lists,
     stereo_calibration,
     stereo_rows,
+    without_partner,
 )
 from armscan.pipeline.targets import find_targets
+from armscan.records.exposure import Exposure
 from armscan.report.photographs import refused_page, tried_targets
 from armscan.report.quantity import (
     Summary,
@@ -77,12 +79,11 @@ def calibrate_stereo(
     plate = parse_target(target)
     places = job.places(".json", beside=(".npz", ".html"))
     given = _given(*cameras)
-    read = _stereo_images(left, right, scan, image_options)
+    read = _stereo_images(left, right, scan, image_options, options.leave_out)
     hashes = {source: fingerprint(path).sha256 for source, path in read.paths.items()}
     if given is not None and options.intrinsics == "prior":
         _check_not_the_same(given, hashes)
-    every = [one.source for pair in read.pairs for one in pair if one is not None]
-    options = replace(options, leave_out=named_by(options.leave_out, every))
+    options = replace(options, leave_out=named_by(options.leave_out, list(read.paths)))
     pairs = _of_one_size(read.pairs, options.leave_out)
     by_source = {one.source: one for pair in pairs for one in pair if one is not None}
     left_out = tuple(one for one in options.leave_out if one in by_source)
@@ -140,7 +141,13 @@ def _given(left: Path | None, right: Path | None) -> Given | None:
     return read_camera_calibration(left), read_camera_calibration(right)
 
 
-def _stereo_images(left: str, right: str, scan: Path | None, image_options: ImageOptions) -> _Pairs:
+def _stereo_images(
+    left: str,
+    right: str,
+    scan: Path | None,
+    image_options: ImageOptions,
+    leave_out: Sequence[str],
+) -> _Pairs:
     if scan is not None:
         if left or right:
             raise OptionError(
@@ -156,9 +163,22 @@ def _stereo_images(left: str, right: str, scan: Path | None, image_options: Imag
     lefts, rights = expand_paths([left]), expand_paths([right])
     files = (*lefts, *rights)
     exposures = read_exposures(files, image_options)
-    pairs = pair_lists(exposures[: len(lefts)], exposures[len(lefts) :])
+    pairs = pair_lists(*_with_partners(exposures, len(lefts), leave_out))
     paths = {exposure.source: path for exposure, path in zip(exposures, files, strict=True)}
     return _Pairs(pairs, paths, are_simulated(files))
+
+
+def _with_partners(
+    exposures: Sequence[Exposure], n_left: int, leave_out: Sequence[str]
+) -> tuple[list[Exposure], list[Exposure]]:
+    """Images left and right; of unlike counts without those left out that have no partner."""
+    left, right = list(exposures[:n_left]), list(exposures[n_left:])
+    if len(left) == len(right):
+        return left, right
+    named = set(named_by(leave_out, [exposure.source for exposure in exposures]))
+    out = named & {exposure.source for exposure in without_partner(left, right)}
+    left, right = ([one for one in side if one.source not in out] for side in (left, right))
+    return left, right
 
 
 def _stereo_scan(folder: Path) -> _Pairs:

@@ -5,8 +5,10 @@ the document's content of what was found; one camera or two.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -322,9 +324,12 @@ def pair_lists(left: Sequence[Exposure], right: Sequence[Exposure]) -> list[Expo
         If the lists differ in length, or an exposure is in both.
     """
     if len(left) != len(right):
+        alone = without_partner(left, right)
+        has = "has" if len(alone) == 1 else "have"
+        named = f"; by the numbers in their names {_listed(alone)} {has} no partner"
         raise InputError(
             f"{len(left)} left images ({_listed(left)}) but {len(right)} right ones "
-            f"({_listed(right)})",
+            f"({_listed(right)}){named if 0 < len(alone) <= LISTED else ''}",
             remedy="give one right image for each left image, in the same order",
         )
     on_the_right = {exposure.source for exposure in right}
@@ -594,6 +599,24 @@ def _stereo_moved_sigmas(before: StereoFit, after: StereoFit) -> float:
 
 def _listed(exposures: Sequence[Exposure]) -> str:
     return begun([exposure.source for exposure in exposures], LISTED)
+
+
+def without_partner(left: Sequence[Exposure], right: Sequence[Exposure]) -> list[Exposure]:
+    """Images without a partner by the last number in their names; none where these do not tell."""
+    numbers = [
+        [re.findall(r"\d+", PurePath(exposure.source).stem)[-1:] for exposure in side]
+        for side in (left, right)
+    ]
+    counted = [{int(found[0]) for found in side if found} for side in numbers]
+    is_told = all(len(seen) == len(side) for seen, side in zip(counted, numbers, strict=True))
+    if not is_told or not counted[0] & counted[1]:
+        return []
+    return [
+        exposure
+        for side, found, other in zip((left, right), numbers, counted[::-1], strict=True)
+        for exposure, number in zip(side, found, strict=True)
+        if int(number[0]) not in other
+    ]
 
 
 def camera_calibration(fit: CameraFit, provenance: Provenance) -> CameraCalibration:

@@ -41,10 +41,12 @@ def chosen(
     chances: Mapping[DistortionModel, float] | None = None,
     folding: tuple[DistortionModel, ...] = (),
     unsettled: tuple[DistortionModel, ...] = (),
+    alike: tuple[DistortionModel, ...] = (),
 ) -> ChosenModel | FitFailure:
     """The choice when models have these hold-out errors; those not named have no solution.
 
-    ``chances`` of a larger model's further coefficients; significant where not named.
+    ``chances`` of a larger model's further coefficients; significant where not named. ``alike``:
+    models that leave residuals which are alike within a view.
     """
 
     def solve(model: DistortionModel) -> Solution | FitFailure:
@@ -62,6 +64,7 @@ def chosen(
         validate,
         lambda solution: name_of(solution) in folding,
         lambda solution, _names: (chances or {}).get(name_of(solution), 0.0),
+        lambda solution: name_of(solution) in alike,
     )
 
 
@@ -83,6 +86,9 @@ ALIKE: dict[DistortionModel, float] = dict.fromkeys(MODELS, 0.2)
         (chosen({**ALIKE, "k1": 0.3}, folding=("k1k2",)), "k1k2p1p2", "k1k2 folds over"),
         (chosen({**BETTER}, folding=("k1k2p1p2k3",)), "k1k2p1p2k3", "all five"),
         (chosen(ALIKE, folding=MODELS), "k1", "predicted no better"),
+        (chosen(BETTER, {"k1k2p1p2k3": 0.5}, alike=MODELS), "k1k2p1p2k3", "all five"),
+        (chosen(ALIKE, dict.fromkeys(MODELS, 0.5), alike=MODELS), "k1", "not told"),
+        (chosen(BETTER, {"k1k2p1p2k3": 0.5}, (), ("k1k2p1p2k3",), MODELS), "k1k2p1p2", "k3 not"),
         (chosen(dict.fromkeys(MODELS, 0.0)), "k1k2p1p2k3", "all five"),
         (chosen(dict.fromkeys(MODELS, 0.0), dict.fromkeys(MODELS, 0.3)), "k1", "not told"),
     ],
@@ -144,6 +150,7 @@ def test_a_gain_that_scatters_more_than_it_is_does_not_count() -> None:
         validate,
         lambda _solution: False,
         lambda _solution, _names: 0.0,
+        lambda _solution: False,
     )
     assert isinstance(found, ChosenModel)
     assert found.model == "k1"

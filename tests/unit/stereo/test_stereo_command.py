@@ -58,6 +58,20 @@ def test_lists_of_different_length(capsys: pytest.CaptureFixture[str], tmp_path:
     assert "5 right ones" in said
 
 
+def test_an_image_without_partner_can_be_left_out(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """But not one that has a partner: all others would be paired one off."""
+    left, right = sides("0[1-4]")[0], sides("0[1-5]")[1]
+    words = [*TARGET, *SMALL, "-o", str(tmp_path / "s.json"), "--json"]
+    assert calibrate(left, right, *words) == 2
+    assert "right05.jpg has no partner" in capsys.readouterr().err
+    assert calibrate(left, right, *words, "--leave-out", "right05.jpg") == 0
+    assert json.loads(capsys.readouterr().out)["n_pairs"] == 4
+    assert calibrate(left, right, *words, "--leave-out", "right04.jpg", "--force") == 2
+    assert "right05.jpg has no partner" in capsys.readouterr().err
+
+
 def test_the_same_images_twice(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     left, _ = sides()
     assert calibrate(left, left, *TARGET, "-o", str(tmp_path / "s.json")) == 2

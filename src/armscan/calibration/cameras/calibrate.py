@@ -31,6 +31,7 @@ from armscan.calibration.cameras.distortion import (
     sigma_of_axis,
 )
 from armscan.calibration.cameras.result import (
+    ALIKE,
     MIN_VIEWS,
     CameraFit,
     CameraOptions,
@@ -531,10 +532,13 @@ def _solve_model(
         camera = solution.observations.camera(solution.state.shared[:N_CAMERA])
         return len(camera.folded_border()) > 0
 
+    def alike(solution: Solution) -> bool:
+        return design_effect(solution).widening >= ALIKE
+
     def choose(
         solving: Callable[[DistortionModel], Solution | FitFailure],
     ) -> ChosenModel | FitFailure:
-        return choose_model(solving, validate, folds, chance_of_coefficients)
+        return choose_model(solving, validate, folds, chance_of_coefficients, alike)
 
     def choose_pinhole() -> ChosenModel | FitFailure:
         chosen = choose(solve)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, stdtr
 
 from armscan.calibration.cameras.adjustment import (
     SHARED_NAMES,
@@ -136,6 +136,11 @@ GAIN_SIGMAS = 1.0
 """...and if views that took no part are predicted better, by this many standard errors of the mean
 over the views. The test above has no mercy with noise; this one notices what is not noise."""
 
+GAIN_SIGNIFICANCE = 0.001
+"""Where the residuals of one view are alike, the first test is widened for that and has little
+power. Coefficients that fail it are kept if unseen views would be predicted so much better by
+chance less often than this: less than above, for views held out together share a camera."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChosenModel:
@@ -171,15 +176,18 @@ def choose_model(
     validate: Callable[[Solution, Solution], CrossValidation | None],
     folds: Callable[[Solution], bool],
     chance: Callable[[Solution, tuple[str, ...]], float],
+    alike: Callable[[Solution], bool],
 ) -> ChosenModel | FitFailure:
     """Choose the smallest model beyond which the views show nothing.
 
     A larger model takes the place of a smaller one if its further coefficients are significant and
-    if it predicts unseen views better by more than that gain's own scatter over the views.
+    if it predicts unseen views better by more than that gain's own scatter over the views; or if
+    residuals of one view are alike and the gain by itself is significant.
 
     ``validate`` tests a solution on held-out views, on the points that the second solution kept;
     ``folds`` says whether a solution's distortion folds over inside the image; ``chance`` is the
-    probability that coefficients of a solution, which in truth are zero, look as they do.
+    probability that coefficients of a solution, which in truth are zero, look as they do;
+    ``alike`` says whether the residuals of one view are alike, so that ``chance`` has little power.
     """
     solved = [(model, solve(model)) for model in MODELS]
     tried = [(model, each) for model, each in solved if not isinstance(each, FitFailure)]
@@ -195,7 +203,10 @@ def choose_model(
         probability = chance(larger.solution, further) if is_settled else 1.0
         gain = _gain_sigmas(chosen.cross_validation, larger.cross_validation)
         names = " ".join(further)
-        if probability >= SIGNIFICANCE:
+        is_told = probability < SIGNIFICANCE
+        if not is_told and is_settled and alike(larger.solution):
+            is_told = _chance_of_gain(gain, larger.cross_validation) < GAIN_SIGNIFICANCE
+        if not is_told:
             said = said or f"{names} not told from zero by these views"
         elif gain is not None and gain < GAIN_SIGMAS:
             said = said or f"unseen views are predicted no better with {names}"
@@ -266,6 +277,15 @@ def _gain_sigmas(smaller: CrossValidation | None, larger: CrossValidation | None
     gain = np.square(smaller.view_rms_px) - np.square(larger.view_rms_px)
     error = float(np.std(gain, ddof=1)) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
     return float(np.mean(gain)) / max(error, 1e-300)
+
+
+def _chance_of_gain(gain: float | None, validation: CrossValidation | None) -> float:
+    """Probability that unseen views seem to be predicted better by so many standard errors.
+
+    Student's t, one-sided: each view that took no part is one draw, however many points it has.
+    """
+    n_views = 0 if validation is None else len(validation.view_rms_px)
+    return 1.0 if gain is None or n_views < MIN_VIEWS else float(stdtr(n_views - 1, -gain))
 
 
 def predicts_better(

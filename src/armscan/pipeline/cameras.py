@@ -330,7 +330,8 @@ def pair_lists(left: Sequence[Exposure], right: Sequence[Exposure]) -> list[Expo
         raise InputError(
             f"{len(left)} left images ({_listed(left)}) but {len(right)} right ones "
             f"({_listed(right)}){named if 0 < len(alone) <= LISTED else ''}",
-            remedy="give one right image for each left image, in the same order",
+            remedy="give one right image for each left image, in the same order, or name those "
+            "without a partner by --leave-out",
         )
     on_the_right = {exposure.source for exposure in right}
     for exposure in left:

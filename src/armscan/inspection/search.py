@@ -296,17 +296,26 @@ def _thinned(points: FloatArray, most: int) -> IntArray:
     if len(points) <= most:
         return order
     low, high = 0.0, float(np.ptp(points, axis=0).max())
-    kept = order[:most]
+    placed = np.ascontiguousarray((points[order] - points.min(axis=0)).T)
+    widest = None
     for _ in range(BISECTIONS):
         side = 0.5 * (low + high)
-        cells = np.floor((points[order] - points.min(axis=0)) / side).astype(np.int64)
-        numbers = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
-        first = np.unique(numbers, return_index=True)[1]
-        if len(first) > most:
+        numbers = _cells(placed, side)
+        # counted without their places, which costs a third of the time
+        if np.count_nonzero(np.diff(np.sort(numbers))) + 1 > most:
             low = side
         else:
-            high, kept = side, order[np.sort(first)]
-    return np.asarray(kept)
+            high, widest = side, numbers
+    if widest is None:
+        return np.asarray(order[:most])
+    return np.asarray(order[np.sort(np.unique(widest, return_index=True)[1])])
+
+
+def _cells(placed: FloatArray, side: float) -> IntArray:
+    """(N,) number of the cube in which each of points (3, N), none below 0, lies."""
+    cells = (placed / side).astype(np.int64)
+    n_y, n_z = (int(one) + 1 for one in cells[1:].max(axis=1))
+    return np.asarray((cells[0] * n_y + cells[1]) * n_z + cells[2])
 
 
 def _along_stripes(selection: Selection, chosen: IntArray) -> FloatArray:

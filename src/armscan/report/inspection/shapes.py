@@ -135,7 +135,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
             "fitted.plane",
             "Plane A, B, C, D",
             [a, b, c, d],
-            shown=f"{a:.7f}, {b:.7f}, {c:.7f}, {d:.4f} mm",
+            shown=f"{triple((a, b, c), 7)}, {d:.4f} mm",
         ),
         fact("Middle of the points", f"{triple(found.plane.point_mm)} mm"),
         fact("Positive", found.side_text),

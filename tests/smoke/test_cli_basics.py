@@ -188,6 +188,29 @@ def test_info_of_images_and_folders(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "image, 6 x 4 px, grey, 8 bits" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("heading", "what"),
+    [
+        ("x,y,z", "point cloud, 2 points"),
+        ("nx,ny,nz,Z [mm],Y [mm],X [mm]", "point cloud, 2 points"),
+        ("x;y;z;r;g;b", "point cloud, 2 points"),
+        ("x_mm,y_mm,z_mm", "probed points"),
+        ("image,x,y,z,a,b,c", ""),
+    ],
+)
+def test_info_of_tables(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], heading: str, what: str
+) -> None:
+    """A cloud of another program, which every other command reads, was no file of ours."""
+    sep, names = (";" if ";" in heading else ","), heading.replace(";", ",").split(",")
+    rows = [sep.join(str(float(k + n)) for n in range(len(names))) for k in range(2)]
+    path = tmp_path / "c.csv"
+    path.write_text("\n".join([heading, *rows, ""]))
+    assert main(["info", str(path)]) == (0 if what else 2)
+    said = capsys.readouterr()
+    assert what in said.out if what else "no column is called x_mm" in said.err
+
+
 def test_info_of_documents(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     golden = Path(__file__).parents[1] / "golden"
     assert main(["info", str(golden / "camera_v1.json"), str(golden / "sensor_v1.json")]) == 0

@@ -178,3 +178,26 @@ def test_metres_are_noticed_and_cured(files: Path, capsys: pytest.CaptureFixture
     assert inspect(files, "--align", "none", part="metres.stl") == 2
     assert "--unit m" in capsys.readouterr().err
     assert inspect(files, "--align", "none", "--unit", "m", part="metres.stl") == 0
+
+
+@pytest.mark.parametrize("kind", ["own", "constant", "random", "zero"])
+def test_normals_that_are_not_of_the_points_are_told_and_not_used(
+    files: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """The same one at every point, as some programs write, made the part its mirror image."""
+    points, triangle = PART.surface_points(30_000)
+    random = np.random.default_rng(0).normal(size=points.shape)
+    normals = {
+        "own": PART.normals[triangle],
+        "constant": np.tile([0.0, 0.0, 1.0], (len(points), 1)),
+        "random": random / np.linalg.norm(random, axis=1)[:, None],
+        "zero": np.zeros_like(points),
+    }[kind]
+    turned = points[:, [1, 2, 0]] + [100.0, 50.0, 20.0]
+    cloud = cloud_of(turned, normals=normals[:, [1, 2, 0]] if kind == "own" else normals)
+    (files / f"{kind}.ply").write_bytes(ply_bytes(cloud))
+    assert inspect(files, cloud=f"{kind}.ply") == 0
+    said = capsys.readouterr()
+    assert ("normals do not stand on the faces" in said.out + said.err) == (
+        kind in ("constant", "random")
+    )

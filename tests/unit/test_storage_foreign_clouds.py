@@ -132,3 +132,18 @@ def test_what_is_no_cloud_is_refused(tmp_path: Path, name: str, text: str, messa
     path.write_text(text)
     with pytest.raises(FileFormatError, match=message):
         read_cloud(path)
+
+
+@pytest.mark.parametrize(
+    "heading", ["X [mm],Y [mm],Z [mm]", "x(mm);y(mm);z(mm)", "i,x [mm],y[mm],z"]
+)
+def test_units_in_brackets_are_part_of_a_columns_name(tmp_path: Path, heading: str) -> None:
+    """They counted as columns, and the points of three were not understood."""
+    path, sep = tmp_path / "c.csv", ";" if ";" in heading else ","
+    row = (["7"] if heading.startswith("i") else []) + ["1.5", "2.5", "3.5"]
+    path.write_text(f"{heading}\n{sep.join(row)}\n")
+    assert read_cloud(path).points_mm.tolist() == [[1.5, 2.5, 3.5]]
+    path.write_text(f"{heading.replace('mm', 'm')}\n{sep.join(row)}\n")
+    if heading.count("mm") == 3:
+        with pytest.raises(FileFormatError, match="are in metres"):
+            read_cloud(path)

@@ -87,6 +87,11 @@ FULLY_BENT = 0.05
 SHELL_BANDS = 5.0
 """Half width, in bands, of the shell in which points beside a shape count against it."""
 ROUNDS = 3
+N_ASKED, BROAD_FACE = 2000, 0.3
+"""Points whose normals are held against their neighbours' faces; and breadth of those over their
+length, for a few stripes side by side tell a normal poorly."""
+LEAST_UPRIGHT, MOST_OFF = math.cos(math.radians(45.0)), 0.2
+"""Normals more than 45 degrees off their face are not of it; part of them that edges explain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,6 +238,28 @@ class Sample:
         return np.asarray(is_square & (sine <= ACROSS))
 
 
+def normals_are_of_points(points_mm: FloatArray, normals: FloatArray) -> bool:
+    """Whether normals (N, 3) stand on the faces that neighbours among points (N, 3) make.
+
+    Other programs write the same one at every point, or leave those of another cloud. True where
+    too few neighbourhoods are flat to tell; zeros are no normals and do not count.
+    """
+    given = np.flatnonzero(np.isfinite(normals).all(axis=1) & normals.any(axis=1))
+    if len(given) < MIN_POINTS:
+        return True
+    points = points_mm[given]
+    asked = np.random.default_rng(0).permutation(len(given))[:N_ASKED]
+    near = cKDTree(points).query(points[asked], min(N_NEIGHBOURS, len(points)))[1]
+    about = points[near] - points[near].mean(axis=1, keepdims=True)
+    values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", about, about))
+    thickness, breadth, length = np.sqrt(np.maximum(values, 0.0)).T
+    is_flat = (breadth >= BROAD_FACE * length) & (thickness <= THICKEST_FACE * breadth)
+    told = normals[given[asked[is_flat]]]
+    cosine = np.abs(np.einsum("ni,ni->n", told, axes[is_flat, :, 0]))
+    is_off = cosine < LEAST_UPRIGHT * np.linalg.norm(told, axis=1)
+    return len(told) < MIN_POINTS or float(is_off.mean()) <= MOST_OFF
+
+
 def scatter_about_mm(selection: Selection, rows: IntArray) -> float:
     """What points (N,) of a cloud scatter by off the faces that neighbours among them make.
 
@@ -296,17 +323,26 @@ def _thinned(points: FloatArray, most: int) -> IntArray:
     if len(points) <= most:
         return order
     low, high = 0.0, float(np.ptp(points, axis=0).max())
-    kept = order[:most]
+    placed = np.ascontiguousarray((points[order] - points.min(axis=0)).T)
+    widest = None
     for _ in range(BISECTIONS):
         side = 0.5 * (low + high)
-        cells = np.floor((points[order] - points.min(axis=0)) / side).astype(np.int64)
-        numbers = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
-        first = np.unique(numbers, return_index=True)[1]
-        if len(first) > most:
+        numbers = _cells(placed, side)
+        # counted without their places, which costs a third of the time
+        if np.count_nonzero(np.diff(np.sort(numbers))) + 1 > most:
             low = side
         else:
-            high, kept = side, order[np.sort(first)]
-    return np.asarray(kept)
+            high, widest = side, numbers
+    if widest is None:
+        return np.asarray(order[:most])
+    return np.asarray(order[np.sort(np.unique(widest, return_index=True)[1])])
+
+
+def _cells(placed: FloatArray, side: float) -> IntArray:
+    """(N,) number of the cube in which each of points (3, N), none below 0, lies."""
+    cells = (placed / side).astype(np.int64)
+    n_y, n_z = (int(one) + 1 for one in cells[1:].max(axis=1))
+    return np.asarray((cells[0] * n_y + cells[1]) * n_z + cells[2])
 
 
 def _along_stripes(selection: Selection, chosen: IntArray) -> FloatArray:

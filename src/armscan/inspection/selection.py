@@ -273,12 +273,15 @@ MIN_SINE = 0.02
 """Flattest triangle, as height over length, that may carry a candidate."""
 
 
-def dominant_flat(points: FloatArray, stripe: IntArray | None = None) -> FloatArray | FitFailure:
+def dominant_flat(
+    points: FloatArray, stripe: IntArray | None = None, band_mm: float = SEARCH_BAND_MM
+) -> FloatArray | FitFailure:
     """Unit normal (D,) of the plane (D = 3) or line (D = 2) that most points (N, D) lie near.
 
     ``stripe``: (N,) number of each point's stripe. All points of one lie in its light sheet, which
     is no face: of several stripes the one that has most points on a plane does not count there, and
     `MIN_POINTS` of others are asked for. None, and a single stripe: all points count.
+    ``band_mm``: how near they lie.
     """
     if stripe is not None and int(np.ptp(stripe)) == 0:
         stripe = None
@@ -298,13 +301,13 @@ def dominant_flat(points: FloatArray, stripe: IntArray | None = None) -> FloatAr
     votes = []
     for k in range(0, len(normals), BATCH):
         away = np.abs(scored @ normals[k : k + BATCH].T - offsets[k : k + BATCH])
-        is_near = (away <= SEARCH_BAND_MM).astype(np.int64)
+        is_near = (away <= band_mm).astype(np.int64)
         votes.append(is_near.sum(axis=0))
         if stripe is not None:
             votes[-1] -= np.add.reduceat(is_near, first, axis=0).max(axis=0)
     best = int(np.concatenate(votes).argmax())
     if stripe is not None:
-        on_it = np.abs(points @ normals[best] - offsets[best]) <= SEARCH_BAND_MM
+        on_it = np.abs(points @ normals[best] - offsets[best]) <= band_mm
         counts = np.bincount(stripe[on_it])
         if int(counts.sum() - counts.max(initial=0)) < MIN_POINTS:
             return FitFailure(
@@ -312,7 +315,7 @@ def dominant_flat(points: FloatArray, stripe: IntArray | None = None) -> FloatAr
                 "whatever it crosses",
                 "measure the face from more places: exposures at rest show it in one line",
             )
-    return _polished(points, normals[best], float(offsets[best]))
+    return _polished(points, normals[best], float(offsets[best]), band_mm)
 
 
 def _normals(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -332,9 +335,9 @@ def _normals(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
     return normal / np.where(size > 0.0, size, 1.0), is_valid
 
 
-def _polished(points: FloatArray, normal: FloatArray, offset: float) -> FloatArray:
+def _polished(points: FloatArray, normal: FloatArray, offset: float, band_mm: float) -> FloatArray:
     for _ in range(POLISHING_ROUNDS):
-        near = points[np.abs(points @ normal - offset) <= SEARCH_BAND_MM]
+        near = points[np.abs(points @ normal - offset) <= band_mm]
         if len(near) < points.shape[1]:
             break
         centre = near.mean(axis=0)

@@ -27,7 +27,7 @@ from armscan.inspection.selection import (
     least_concentration,
     select,
 )
-from armscan.inspection.uncertainty import FitErrors, FitLinearised, measured_length, worst_sigma
+from armscan.inspection.uncertainty import FitErrors, FitLinearised, worst_sigma
 from armscan.records.cloud import PointCloud
 
 LARGEST_MISFIT = 0.02
@@ -94,14 +94,7 @@ def inspect_sphere(
         others=others,
         post=post,
         scatter_mm=scatter_about_mm(selection, found.rows),
-        centre_sigma_mm=_centre_sigma_mm(cloud, found),
     )
-
-
-def _centre_sigma_mm(cloud: PointCloud, found: SphereInspection) -> float:
-    used = found.rows[found.is_fitted]
-    errors = FitErrors.of(linearised_sphere(found.sphere, cloud.points_mm[used]), cloud, used)
-    return worst_sigma(np.eye(3), lambda way: errors.measured(0.0, np.append(way, 0.0)).sigma_mm)
 
 
 def post_of(cloud: PointCloud, rows: IntArray, ball: Sphere | Shape) -> Shape | None:
@@ -273,12 +266,14 @@ def _described(
     )
     text = f"all {len(feature)} points {near}"
     linear = linearised_sphere(sphere, points[is_fitted])
+    errors = FitErrors.of(linear, cloud, feature[is_fitted])
     from_centre = sphere.distance_mm(points) + sphere.radius_mm
     return SphereInspection(
         sphere=sphere,
         nominal_diameter_mm=diameter_mm,
-        diameter=measured_length(
-            2.0 * sphere.radius_mm, DIAMETER_OF_SPHERE, linear, cloud, feature[is_fitted]
+        diameter=errors.measured(2.0 * sphere.radius_mm, DIAMETER_OF_SPHERE),
+        centre_sigma_mm=worst_sigma(
+            np.eye(3), lambda way: errors.measured(0.0, np.append(way, 0.0)).sigma_mm
         ),
         rows=feature,
         is_fitted=is_fitted,

@@ -34,14 +34,21 @@ from armscan.inspection.selection import (
 from armscan.inspection.uncertainty import FitLinearised, measured_length
 from armscan.records.cloud import PointCloud
 
-BIN_MM = 0.1
+LEVEL_BANDS = 8.0
+"""Heights over the band in which points support a level or a face: at a quarter of the height, a
+plane that crosses both faces would hold as many points as either."""
+BINS, MAX_BINS = 2.0, 1e6
+"""Bins in a band; and in all, however far strays lie."""
 MAX_PEAKS = 60
 MAX_EXTENT_MM = 1e5
 """Heights about their median among which faces are looked for."""
 LEAST_INSIDE = 0.5
-LEAST_GATHERED, MOST_GATHERED = 0.3, 0.9
+LEAST_GATHERED, FEW_GATHERED, MOST_GATHERED = 0.15, 0.3, 0.9
 """What a face's points near to it are more than of points that fill its thickness evenly, as those
-of a ball do at any level; and the part of them that is always enough."""
+of a ball or a ramp do at any level; the same of few points, which may gather by chance; and the
+part of them that is always enough."""
+BY_CHANCE = 3.0
+"""Standard deviations by which evenly spread points may seem to gather."""
 HEIGHT_TOLERANCE = 0.05
 """Faces are searched up to this part of the nominal height from it."""
 MOST_OFF = 2.0 * HEIGHT_TOLERANCE
@@ -74,7 +81,7 @@ def find_levels(
     height_mm, tolerance_mm
         Nominal height, and how far from it the levels may be.
     """
-    levels, counts = _levels(points @ normal)
+    levels, counts = _levels(points @ normal, _band_mm(height_mm))
     apart = levels[None, :] - levels[:, None]
     fits = np.abs(apart - height_mm) <= tolerance_mm
     if not fits.any():
@@ -88,22 +95,28 @@ def find_levels(
     return ParallelFaces(normal, float(levels[lower]), float(levels[upper]))
 
 
-def _levels(heights: FloatArray) -> tuple[FloatArray, IntArray]:
+def _band_mm(height_mm: float) -> float:
+    """How near to a level points support it."""
+    return min(SEARCH_BAND_MM, height_mm / LEVEL_BANDS)
+
+
+def _levels(heights: FloatArray, band_mm: float) -> tuple[FloatArray, IntArray]:
     """Local maxima of the heights' density, best filled first, and the points about each."""
     # a stray far away would make too many bins
     middle = np.partition(heights, len(heights) // 2)[len(heights) // 2]
     heights = heights[np.abs(heights - middle) <= MAX_EXTENT_MM / 2.0]
     low = float(heights.min())
-    bins = np.bincount(((heights - low) / BIN_MM).astype(np.int64))
-    width = max(1, round(SEARCH_BAND_MM / BIN_MM))
+    bin_mm = max(band_mm / BINS, (float(heights.max()) - low) / MAX_BINS)
+    bins = np.bincount(((heights - low) / bin_mm).astype(np.int64))
+    width = max(1, round(band_mm / bin_mm))
     filled = np.convolve(bins, np.ones(2 * width + 1), "same").astype(np.int64)
     levels, counts = [], []
     for _ in range(MAX_PEAKS):
         top = int(filled.argmax())
         if filled[top] < MIN_POINTS:
             break
-        about = low + (top + 0.5) * BIN_MM
-        near = heights[np.abs(heights - about) <= SEARCH_BAND_MM + BIN_MM]
+        about = low + (top + 0.5) * bin_mm
+        near = heights[np.abs(heights - about) <= band_mm + bin_mm]
         levels.append(float(np.median(near)))
         counts.append(len(near))
         filled[max(0, top - 2 * width - 1) : top + 2 * width + 2] = 0
@@ -157,10 +170,10 @@ def away_from_ends(
         (N,) number of the stripe that each point is of, None for points without stripes.
     margin_mm
         Left out: points this near, seen along the normal, to a point off the face; of each run
-        of a stripe on the face (points with no gap wider than the margin) this much at either
-        end; and in a cloud this much along the face's outline, where a stripe that lies along an
-        edge is half on the face only. A face of few stripes, more than half of which would go
-        with its outline, keeps it.
+        of a stripe on the face (points with no gap wider than the margin, nor than a few of their
+        spacings) this much at either end; and in a cloud this much along the face's outline, where
+        a stripe that lies along an edge is half on the face only. A face of few stripes, more than
+        half of which would go with its outline, keeps it.
     """
     kept = is_face.copy()
     if margin_mm == 0.0:
@@ -192,6 +205,10 @@ def _off_outline(flat: FloatArray, margin_mm: float) -> BoolArray:
     return np.asarray(is_inside)
 
 
+WIDEST_GAP = 3.0
+"""Spacings of a stripe's points beyond which a gap ends a run: one of them may be missing."""
+
+
 def _inner(flat: FloatArray, stripe: IntArray, margin_mm: float) -> BoolArray:
     number = np.unique(stripe, return_inverse=True)[1]
     along = np.zeros(len(flat))
@@ -202,7 +219,11 @@ def _inner(flat: FloatArray, stripe: IntArray, margin_mm: float) -> BoolArray:
         along[rows] = local @ direction
     order = np.lexsort((along, number))
     s, k = along[order], number[order]
-    begins = np.concatenate([[True], (np.diff(s) > margin_mm) | (np.diff(k) != 0)])
+    step, is_next = np.diff(s), np.diff(k) == 0
+    # coarse stripes would else be all ends
+    spacing = float(np.median(step[is_next])) if is_next.any() else 0.0
+    gap_mm = max(margin_mm, WIDEST_GAP * spacing)
+    begins = np.concatenate([[True], (step > gap_mm) | ~is_next])
     run = np.cumsum(begins) - 1
     first = s[begins]
     last = s[np.concatenate([np.flatnonzero(begins)[1:] - 1, [len(s) - 1]])]
@@ -214,6 +235,9 @@ def _inner(flat: FloatArray, stripe: IntArray, margin_mm: float) -> BoolArray:
 ROUNDS = 6
 FLAT_PROFILE_MM = 0.3
 """Points of one stripe that keep this near to a plane are one profile in one light sheet."""
+COLUMNS, MOST_STEEP = 30, 5.0
+"""A flat cloud is cut into columns; in half of them a profile rises by less than so many of their
+widths, where an area is as high as it is broad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -306,7 +330,7 @@ def inspect_step(
     section = _section(selection)
     if isinstance(section, FitFailure):
         return section
-    start = dominant_flat(section.flat_mm, selection.stripe)
+    start = dominant_flat(section.flat_mm, selection.stripe, _band_mm(height_mm))
     if isinstance(start, FitFailure):
         return start
     if float(start @ section.axes @ _upwards(selection)) < 0.0:
@@ -350,6 +374,7 @@ def _section(selection: Selection) -> _Section | FitFailure:
     middle = points.mean(axis=0)
     whole = _Section(np.eye(3), points - middle, None, np.zeros(len(points)))
     # foreign points may be of one profile, whatever number they bear
+    is_foreign = selection.stripe is None
     stripe = cloud.exposure[rows] if selection.stripe is None else selection.stripe
     if int(np.ptp(stripe)) > 0:
         return whole
@@ -359,7 +384,23 @@ def _section(selection: Selection) -> _Section | FitFailure:
     if float(np.abs(fit.residuals).max()) > FLAT_PROFILE_MM:
         return whole
     axes = fit.value.axes
-    return _Section(axes[:2], (points - middle) @ axes[:2].T, axes[2], fit.residuals)
+    within = (points - middle) @ axes[:2].T
+    if is_foreign and _covers_an_area(within):
+        return whole
+    return _Section(axes[:2], within, axes[2], fit.residuals)
+
+
+def _covers_an_area(within: FloatArray) -> bool:
+    """Whether points (N, 2) of a flat cloud, long axis first, are of a low step, not a profile."""
+    width = float(np.ptp(within[:, 0])) / COLUMNS
+    if not width > 0.0:
+        return False
+    column = ((within[:, 0] - within[:, 0].min()) / width).astype(np.int64)
+    order = np.argsort(column, kind="stable")
+    starts = np.flatnonzero(np.diff(column[order], prepend=-1))
+    across = within[order, 1]
+    high = np.maximum.reduceat(across, starts) - np.minimum.reduceat(across, starts)
+    return bool(np.median(high) > MOST_STEEP * width)
 
 
 def _stripes(search: _Search) -> IntArray | None:
@@ -386,8 +427,9 @@ def _fitted(search: _Search, faces: ParallelFaces) -> _Chosen | FitFailure:
     flat, stripe, margin = search.section.flat_mm, _stripes(search), search.margin_mm
     used = np.zeros(len(flat), dtype=np.bool_)
     masks: list[BoolArray] = []
+    near: list[BoolArray] = []
     for _ in range(ROUNDS):
-        masks, kept = [], []
+        masks, kept, near = [], [], []
         for level in (faces.lower_mm, faces.upper_mm):
             distance = flat @ faces.normal - level
             is_face = np.abs(distance) <= search.thickness_mm
@@ -400,17 +442,22 @@ def _fitted(search: _Search, faces: ParallelFaces) -> _Chosen | FitFailure:
                     f"a face of the step keeps {int(mask.sum())} of {int(is_face.sum())} points "
                     f"after {margin:g} mm at its ends are left out; {MIN_POINTS} are "
                     "needed",
-                    "give a smaller --margin, or measure more of the face",
+                    "measure more of the face"
+                    if int(is_face.sum()) < MIN_POINTS
+                    else "give a smaller --margin, or measure more of the face",
                 )
             fitted = mask.copy()
             fitted[mask] = inliers(distance[mask])
             masks.append(mask)
+            near.append(is_face)
             kept.append(fitted)
         faces = fit_parallel(flat[kept[0]], flat[kept[1]], faces.normal)
         if np.array_equal(used, kept[0] | kept[1]):
             break
         used = kept[0] | kept[1]
-    for level, mask in zip((faces.lower_mm, faces.upper_mm), masks, strict=True):
+    # the margin cuts a strip of a ramp down to points that lie near to its middle
+    for k, mask in ((k, mask) for of in (near, masks) for k, mask in enumerate(of)):
+        level = faces.upper_mm if k else faces.lower_mm
         failure = _no_face(search, flat @ faces.normal - level, mask)
         if failure is not None:
             return failure
@@ -423,7 +470,10 @@ def _no_face(search: _Search, distance: FloatArray, is_face: BoolArray) -> FitFa
     bands_mm = np.minimum(search.selection.search_band_mm[is_face], thickness_mm / 2.0)
     band_mm = float(np.median(bands_mm))
     n_near, n = int((np.abs(distance[is_face]) <= bands_mm).sum()), int(is_face.sum())
-    if n_near >= min(band_mm / thickness_mm + LEAST_GATHERED, MOST_GATHERED) * n:
+    even = band_mm / thickness_mm
+    by_chance = BY_CHANCE * math.sqrt(even * (1.0 - even) / max(n, 1))
+    more = min(max(LEAST_GATHERED, by_chance), FEW_GATHERED)
+    if n_near >= min(even + more, MOST_GATHERED) * n:
         return None
     return FitFailure(
         f"there are no two parallel faces {search.height_mm:g} mm apart: at the best place for "

@@ -11,6 +11,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import MAD_TO_SIGMA
 from armscan.inspection.results import MeasuredLength
 from armscan.records.cloud import PointCloud
 
@@ -40,6 +41,12 @@ TURN_SIZES = np.array([1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 
 LEAST_NOISE = 1e-4
 """Least variance of a point's own noise over that which exposures share: exact ones have none."""
 
+
+LEAST_NEIGHBOURS, SCATTER_OF_VARIANCE = 30, 12.0
+"""Differences of neighbours that tell their noise; and four times what the variance that their
+median tells scatters by, as a part of it, times the root of how many they are: 4 x 2 x 1.17 for a
+median of absolute values (Huber, Robust Statistics, 1981), and a quarter more for each point is in
+two of them."""
 
 LEAST_SHARE = 1e-3
 """Least part of what points share that exposures err each for itself, along any direction."""
@@ -223,10 +230,11 @@ class _ExposureErrors:
         by_calibration, common = _calibration_errors(cloud, rows, fit.directions)
         mean = total - _sums(exposure, n, by_calibration.reshape(-1, 9)).reshape(n, 3, 3)
         mean, total = (one / count[:, None, None] for one in (mean, total))
-        noise = cloud.sigma_noise_mm[rows] ** 2
+        along = share * np.einsum("ni,ni->n", axis, fit.directions) ** 2 + 1.0 - share
+        noise = cloud.sigma_noise_mm[rows] ** 2 * along
+        noise = noise + _unstated_mm2(fit.residuals_mm, cloud, rows, noise)
         if cloud.noise_length is not None:
             noise = noise * cloud.noise_length[rows]
-        along = share * np.einsum("ni,ni->n", axis, fit.directions) ** 2 + 1.0 - share
         values, vectors = np.linalg.eigh(mean)
         least = LEAST_SHARE * np.trace(total, axis1=1, axis2=2)[:, None]
         size = np.sqrt(np.maximum(values, least))
@@ -237,7 +245,7 @@ class _ExposureErrors:
         return _ExposureErrors(
             exposure,
             np.bincount(exposure, cloud.exposure[rows], n) / count,
-            noise * along,
+            noise,
             np.asarray((vectors * size[:, None, :]) @ vectors.transpose(0, 2, 1)),
             np.concatenate([fit.directions, turns], axis=1),
             common,
@@ -418,6 +426,25 @@ class _Scores:
             (vectors.T @ noise @ vectors) / np.outer(size, size),
             (vectors.T @ by) / size[:, None],
         )
+
+
+def _unstated_mm2(
+    residuals_mm: FloatArray, cloud: PointCloud, rows: IntArray, stated_mm2: FloatArray
+) -> float:
+    """Variance that residuals (N,) of neighbours along a stripe differ by beyond the stated (N,).
+
+    A rough surface, or noise that a calibration states too low; 0 where chance may have made it.
+    What neighbours share is not in it, so that it is never too large.
+    """
+    sheet, exposure = cloud.sheet[rows], cloud.exposure[rows]
+    is_next = (np.diff(sheet) == 0) & (np.diff(exposure) == 0)
+    n = int(is_next.sum())
+    if n < LEAST_NEIGHBOURS:
+        return 0.0
+    told = float(np.median((stated_mm2[1:] + stated_mm2[:-1])[is_next])) / 2.0
+    apart = np.abs(np.diff(residuals_mm)[is_next])
+    found = (MAD_TO_SIGMA * float(np.median(apart))) ** 2 / 2.0
+    return found - told if found > (1.0 + SCATTER_OF_VARIANCE / math.sqrt(n)) * told else 0.0
 
 
 def _sums(block: IntArray, n: int, values: FloatArray) -> FloatArray:

@@ -425,15 +425,22 @@ def _file(path: Path) -> dict[str, Any]:
             f"{plural(len(part.vertices_mm), 'corner')}",
             **_ranges(part.vertices_mm.T),
         }
-    if path.suffix.lower() in CLOUDS or _is_own_table(data):
+    if path.suffix.lower() in CLOUDS or _is_table_of_points(data):
         return _cloud(read_cloud(path))
     return _text(path, data)
 
 
-def _is_own_table(data: bytes) -> bool:
-    """Whether this is a cloud that armscan wrote as CSV; probed points have other columns."""
-    heading = data.partition(b"\n")[0].decode("utf-8", "replace")
-    return not COVARIANCE.keys().isdisjoint(heading.split(","))
+POINT_COLUMNS = {*"xyz", "nx", "ny", "nz", "intensity", *"rgb", "red", "green", "blue", "alpha"}
+"""Columns of other programs' clouds; tables of probed points have x_mm, y_mm, z_mm."""
+
+
+def _is_table_of_points(data: bytes) -> bool:
+    """Whether this is a cloud that armscan, or another program, wrote as CSV, by its heading."""
+    heading = data.partition(b"\n")[0].decode("utf-8-sig", "replace")
+    plain = heading.lower().replace("[mm]", "").replace("(mm)", "").replace(";", ",")
+    names = {name.strip(' "\r') for name in plain.split(",")}
+    is_foreign = set("xyz") <= names <= POINT_COLUMNS
+    return is_foreign or not COVARIANCE.keys().isdisjoint(heading.split(","))
 
 
 def _are_markers(path: Path) -> bool:

@@ -18,6 +18,9 @@ from typing import Any
 
 SIGMA_NOTE = "± is one standard deviation."
 """Said once on every report: no other range is written with this sign."""
+MOST_DECIMALS, MOST_DIGITS = 6, 8
+"""With more decimals a sigma is written with an exponent, and its value to so many digits: a sigma
+of 1e-8 mm, as of points without noise, would else make a row of zeros."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,13 +198,33 @@ def _quoted(text: str, paths: Sequence[Path]) -> str:
 def with_sigma(value: float, sigma: float, unit: str = "") -> str:
     """A value rounded to two digits of its standard deviation: ``1431.27 ± 0.85 px``.
 
-    A standard deviation of zero or NaN means that none is known: six digits are shown.
+    A standard deviation of zero or NaN means that none is known: six digits are shown. One that
+    asks for more than `MOST_DECIMALS` is written with an exponent: ``20.000000 ± 1.2e-08 mm``.
     """
     tail = f" {unit}" if unit else ""
     if not math.isfinite(sigma) or sigma <= 0.0 or not math.isfinite(value):
         return f"{value:.6g}{tail}"
     decimals = max(0, 1 - math.floor(math.log10(sigma)))
-    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}{tail}"
+    if decimals <= MOST_DECIMALS:
+        return f"{unsigned_zero(value, decimals):.{decimals}f} ± {sigma:.{decimals}f}{tail}"
+    if value == 0.0:
+        return f"0 ± {sigma:.1e}{tail}"
+    magnitude = math.floor(math.log10(abs(value)))
+    if magnitude < -3:
+        digits = min(max(0, decimals + magnitude), MOST_DIGITS - 1)
+        return f"{value:.{digits}e} ± {sigma:.1e}{tail}"
+    shown = min(decimals, MOST_DIGITS - 1 - magnitude)
+    return f"{value:.{shown}f} ± {sigma:.1e}{tail}"
+
+
+def signed_mm(value: float) -> str:
+    """A deviation with its sign; 0 has +."""
+    return f"{unsigned_zero(value, 4):+.4f} mm"
+
+
+def unsigned_zero(value: float, decimals: int) -> float:
+    """A value rounded to decimals, never -0."""
+    return round(value, decimals) + 0.0
 
 
 def significant(value: float, unit: str = "", digits: int = 3) -> str:
@@ -224,7 +247,7 @@ def share_text(percent: float) -> str:
 
 def triple(values: Iterable[float], digits: int = 4) -> str:
     """Three numbers with commas between them."""
-    return ", ".join(f"{value:.{digits}f}" for value in values)
+    return ", ".join(f"{unsigned_zero(value, digits):.{digits}f}" for value in values)
 
 
 def sentence(text: str) -> str:

@@ -273,15 +273,85 @@ def test_input_without_the_step_is_refused_in_words() -> None:
         StepOptions(margin_mm=-1.0)
 
 
-@pytest.mark.parametrize("height_mm", [4.0, 5.0, 8.0])
-def test_a_ramp_beside_a_floor_is_no_step(height_mm: float) -> None:
-    """Both levels settled on the floor: a height of 0.0000 mm was told."""
+@pytest.mark.parametrize("slope", [0.2, 0.4, 0.6, 1.2])
+@pytest.mark.parametrize("height_mm", [1.0, 2.0, 3.0, 4.0, 5.0, 8.0])
+def test_a_ramp_beside_a_floor_is_no_step(height_mm: float, slope: float) -> None:
+    """Both levels settled on the floor: a height of 0.0000 mm was told. Or the margin cut a strip
+    of the ramp down to its middle, which was taken for the upper face.
+    """
+    for noise_mm in (0.0, 0.02, 0.05):
+        rng = np.random.default_rng(2)
+        x, y = rng.uniform(-20.0, 20.0, (2, 8000))
+        z = np.where(x > 0.0, slope * x, 0.0) + rng.normal(0.0, noise_mm, 8000)
+        failure = inspect_step(cloud_of(np.column_stack([x, y, z])), height_mm)
+        assert isinstance(failure, FitFailure)
+        assert "no two parallel faces" in failure.reason
+
+
+@pytest.mark.parametrize("height_mm", [2.0, 3.0, 8.0])
+def test_a_step_beside_a_ramp_is_a_step(height_mm: float) -> None:
     rng = np.random.default_rng(2)
     x, y = rng.uniform(-20.0, 20.0, (2, 8000))
-    z = np.where(x > 0.0, 0.6 * x, 0.0) + rng.normal(0.0, 0.02, 8000)
-    failure = inspect_step(cloud_of(np.column_stack([x, y, z])), height_mm)
+    rise = np.where(y > 0.0, height_mm, 0.6 * x)
+    z = np.where(x > 0.0, rise, 0.0) + rng.normal(0.0, 0.02, 8000)
+    found = inspected(inspect_step(cloud_of(np.column_stack([x, y, z])), height_mm))
+    assert found.height.value_mm == pytest.approx(height_mm, abs=0.01)
+
+
+@pytest.mark.parametrize("height_mm", [0.3, 0.5, 0.8, 1.0])
+@pytest.mark.parametrize("told", [True, False])
+def test_a_low_step_is_measured(height_mm: float, told: bool) -> None:
+    """A band of 0.2 mm held both faces, or a plane across them; or both were one light sheet's."""
+    rng = np.random.default_rng(5)
+    for noise_mm in (0.0, height_mm / 20.0):
+        x, y = rng.uniform(-20.0, 20.0, (2, 6000))
+        z = np.where(x > 0.0, height_mm, 0.0) + rng.normal(0.0, noise_mm, 6000)
+        exposure = np.floor(1.5 * (y + 20.0)).astype(np.int64) if told else None
+        found = inspected(inspect_step(cloud_of(np.column_stack([x, y, z]), exposure), height_mm))
+        # some 2,500 points on either face
+        assert found.height.value_mm == pytest.approx(height_mm, abs=5 * noise_mm / 35 + 1e-9)
+
+
+@pytest.mark.parametrize("height_mm", [0.3, 0.5, 1.0])
+def test_neither_a_flat_face_nor_a_slope_is_a_low_step(height_mm: float) -> None:
+    rng = np.random.default_rng(5)
+    for slope, noise_mm in ((0.0, 0.01), (0.0, 0.1), (0.1, 0.02), (0.3, 0.02)):
+        x, y = rng.uniform(-20.0, 20.0, (2, 6000))
+        z = np.maximum(slope * x, 0.0) + rng.normal(0.0, noise_mm, 6000)
+        assert isinstance(inspect_step(cloud_of(np.column_stack([x, y, z])), height_mm), FitFailure)
+
+
+def test_a_low_step_in_one_foreign_profile_stays_one_light_sheets() -> None:
+    points = profile(0.0, 0.005)
+    points[:, 2] = 130.0 + (points[:, 2] - 130.0) / 25.0
+    found = inspected(inspect_step(cloud_of(points), 0.8))
+    assert "taken to stand square" in found.normal_rule
+    assert found.height.value_mm == pytest.approx(0.8, abs=0.002)
+
+
+@pytest.mark.parametrize("spacing_mm", [1.1, 2.0, 5.0])
+def test_stripes_whose_points_lie_further_apart_than_the_margin_have_faces(
+    spacing_mm: float,
+) -> None:
+    """Each point was a run of its own, and a smaller margin was advised, which made no run longer.
+
+    The points next to the edge and the ends are left out all the same.
+    """
+    x, y = np.meshgrid(np.arange(-40.0, 40.0, spacing_mm), np.arange(-40.0, 40.0))
+    points = np.column_stack([x.ravel(), y.ravel(), np.where(x.ravel() > 0.0, 5.0, 0.0)])
+    found = inspected(inspect_step(cloud_of(points, np.repeat(np.arange(80), x.shape[1])), 5.0))
+    assert found.height.value_mm == pytest.approx(5.0, abs=1e-9)
+    assert points[found.lower, 0].min() >= -39.0
+    assert points[found.upper, 0].min() >= x[0][x[0] > 0.0].min() + 1.0
+
+
+def test_a_face_of_few_points_is_not_told_to_have_a_smaller_margin() -> None:
+    points, exposure = block_stripes(HEIGHT_MM)
+    rows = np.flatnonzero(points[:, 2] > 10.0)[25:]
+    few = np.setdiff1d(np.arange(len(points)), rows)
+    failure = inspect_step(cloud_of(points[few], exposure[few]), HEIGHT_MM)
     assert isinstance(failure, FitFailure)
-    assert "no two parallel faces" in failure.reason
+    assert "--margin" not in failure.remedy
 
 
 def test_faces_of_a_noisy_step_are_not_doubted() -> None:

@@ -352,3 +352,28 @@ def test_noise_that_the_smoothing_left_counts_as_it_scatters(kind: str) -> None:
     assert 1.0 / SPREAD_LIMIT < scatter / stated < SPREAD_LIMIT
     bare = length_of(kind, replace(smoothed_cloud(kind, 0), noise_length=None))
     assert stated > 2.5 * bare.sigma_propagated_mm
+
+
+@pytest.mark.parametrize("stated_part", [1.0, 0.3, 0.0])
+def test_points_that_scatter_by_more_than_the_cloud_says_have_a_larger_sigma(
+    stated_part: float,
+) -> None:
+    """A rough surface: both sigma and U of a height were as small as what the calibration says.
+
+    Where it says what they do, nothing changes.
+    """
+    points, exposure = block_stripes(20.0)
+    up = np.array([0.0, 0.0, 1.0])
+    found = []
+    for seed in range(N_RUNS):
+        noise = np.random.default_rng(seed).normal(0.0, 0.02, (len(points), 1))
+        told_mm = stated_part * 0.02
+        cloud = cloud_of(
+            points + up * noise, exposure, sigma_mm=1e-4, noise_mm=told_mm, noise_along=up
+        )
+        result = inspect_step(cloud, 20.0)
+        assert not isinstance(result, FitFailure)
+        found.append(result.height)
+    scatter = float(np.std([item.value_mm for item in found], ddof=1))
+    stated = float(np.mean([item.sigma_mm for item in found]))
+    assert 1.0 / SPREAD_LIMIT < scatter / stated < SPREAD_LIMIT

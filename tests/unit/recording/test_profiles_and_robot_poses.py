@@ -268,3 +268,29 @@ def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> No
     with pytest.raises(FileFormatError, match=r"left/1\.png may be left/1\.png or right/1\.png"):
         left_only = written(tmp_path, "r.txt", "left/1.png 1 0 9 0 0 0\n")
         read_robot_poses(left_only, "extrinsic-xyz", files)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'image,x,y,z,a,b,c\nshot#1.png,1,2,3,0,0,0\n"left, #2.png",2,2,3,0,0,0 # moved\n',
+        'shot#1.png 1 2 3 0 0 0#first\n# none\n"left, #2.png"; 2; 2; 3; 0; 0; 0\n',
+        '"left, #2.png","2","2","3","0","0","0"\n"shot#1.png","1","2","3","0","0","0"\n',
+    ],
+)
+def test_names_of_files_may_hold_a_number_sign_and_quoted_ones_commas(
+    tmp_path: Path, text: str
+) -> None:
+    """A # cut the line off, and a comma the name."""
+    files = [Path("shot#1.png"), Path("left, #2.png")]
+    poses = read_robot_poses(written(tmp_path, "p.csv", text), "extrinsic-xyz", files)
+    assert [pose.translation_mm[0] for pose in poses] == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["1 2 3 0 0 0#first\n", '"1","2","3","0","0","0" # first\n', "#a.png 9\n1,2,3,0,0,0,#first\n"],
+)
+def test_comments_behind_numbers_stay_comments(tmp_path: Path, text: str) -> None:
+    (pose,) = read_robot_poses(written(tmp_path, "p.csv", text), "extrinsic-xyz")
+    assert pose.translation_mm.tolist() == [1.0, 2.0, 3.0]

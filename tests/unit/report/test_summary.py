@@ -22,6 +22,7 @@ from armscan.report.quantity import (
     significant,
     summary_json,
     summary_text,
+    triple,
     values,
     with_sigma,
 )
@@ -36,10 +37,20 @@ from armscan.report.quantity import (
         (0.1, 0.0999, "0.100 ± 0.100 px"),
         (12345.6, 0.0, "12345.6 px"),
         (1.5, math.nan, "1.5 px"),
+        (-0.0004, 0.3, "0.00 ± 0.30 px"),
+        (20.0000000123456, 1.234e-8, "20.000000 ± 1.2e-08 px"),
+        (0.0123456789012, 1.234e-9, "0.012345679 ± 1.2e-09 px"),
+        (3.45678e-5, 1.234e-8, "3.4568e-05 ± 1.2e-08 px"),
+        (0.0, 1.234e-8, "0 ± 1.2e-08 px"),
+        (1.25, 0.000012, "1.250000 ± 0.000012 px"),
     ],
 )
 def test_a_value_is_shown_to_two_digits_of_its_sigma(value: float, sigma: float, text: str) -> None:
     assert with_sigma(value, sigma, "px") == text
+
+
+def test_no_zero_has_a_sign() -> None:
+    assert triple([-1e-9, -0.00006, 2.0]) == "0.0000, -0.0001, 2.0000"
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,15 @@ from armscan.report.inspection.shapes import (
     share_card,
     sigma_facts,
 )
-from armscan.report.quantity import Quantity, fact, only, significant, triple, with_sigma
+from armscan.report.quantity import (
+    Quantity,
+    fact,
+    only,
+    signed_mm,
+    significant,
+    triple,
+    with_sigma,
+)
 
 NARROW_ARC_DEG = 90.0
 """Less of a turn tells radius and place poorly apart: their errors grow as 1 / arc^2."""
@@ -150,7 +158,7 @@ def _diameter(found: FeatureInspection, diameter: MeasuredLength) -> list[Quanti
         error = diameter.value_mm - nominal
         told += [
             Quantity("nominal.diameter_mm", "", nominal),
-            Quantity("diameter_error_mm", "Fitted minus nominal", error, shown=f"{error:+.4f} mm"),
+            Quantity("diameter_error_mm", "Fitted minus nominal", error, shown=signed_mm(error)),
         ]
     return told
 

@@ -44,6 +44,7 @@ from armscan.report.quantity import (
     only,
     sentence,
     share_text,
+    signed_mm,
     significant,
     triple,
     with_sigma,
@@ -134,7 +135,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
             "fitted.plane",
             "Plane A, B, C, D",
             [a, b, c, d],
-            shown=f"{a:.7f}, {b:.7f}, {c:.7f}, {d:.4f} mm",
+            shown=f"{triple((a, b, c), 7)}, {d:.4f} mm",
         ),
         fact("Middle of the points", f"{triple(found.plane.point_mm)} mm"),
         fact("Positive", found.side_text),
@@ -211,7 +212,7 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
             "fitted.diameter", "Fitted diameter", found.diameter, f"nominal {nominal_mm:g} mm"
         ),
         Quantity("nominal.diameter_mm", "", nominal_mm),
-        Quantity("diameter_error_mm", "Fitted minus nominal", error, shown=f"{error:+.4f} mm"),
+        Quantity("diameter_error_mm", "Fitted minus nominal", error, shown=signed_mm(error)),
         place_quantity("fitted.centre_mm", "Centre", found.sphere.centre_mm, found.centre_sigma_mm),
         Quantity("fitted.centre_u_mm", "", COVERAGE * found.centre_sigma_mm),
         Quantity(
@@ -359,7 +360,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
             f"{found.height.value_mm:.4f} mm" if is_still else "",
         ),
         Quantity("nominal.height_mm", "", nominal_mm),
-        Quantity("height_error_mm", "Fitted minus nominal", error, shown=f"{error:+.4f} mm"),
+        Quantity("height_error_mm", "Fitted minus nominal", error, shown=signed_mm(error)),
         Quantity(
             "nominal.mean_height_mm",
             "Heights of the points",

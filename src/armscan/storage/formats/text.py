@@ -57,6 +57,8 @@ LOOKED_AT = 1000
 """Lines in which decimal commas are sought: a table that has them has them everywhere."""
 EMPTY_FIELD = re.compile(r"(^|[,;])[ \t]*(?=[,;])", re.MULTILINE)
 """Nothing between two separators: a value that is missing, which must not move the next ones."""
+UNIT_IN_BRACKETS = re.compile(r"(\w)[ \t]*[\[(][ \t]*([A-Za-z]+)[ \t]*[\])]")
+"""A column's name, its last character, and its unit: ``X [mm]``, ``y(m)``."""
 OWN_HEADER, OWN_NOTE = "x_mm y_mm z_mm in frame ", "written by armscan"
 COUNT = re.compile(r"points (\d+)")
 """Note of a file that armscan wrote: of how many points, so that one that was cut is told."""
@@ -106,7 +108,7 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
         )
     for line in filled:
         _refuse_decimal_commas(line, path)
-    heading = _words(lines[0]) if start else []
+    heading = _words(_with_units_named(lines[0])) if start else []
     if len(heading) > 1 and len(_words(filled[0])) == 2 * len(heading):
         raise FileFormatError(
             f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'",
@@ -215,9 +217,14 @@ def _notes(notes: list[str]) -> tuple[str, ...]:
     return (*found, *(f"{FORCED} {k} {json.dumps(text)}" for k, text in enumerate(reasons)))
 
 
+def _with_units_named(line: str) -> str:
+    """A heading whose units in brackets are part of the columns' names: ``X [mm]`` is ``X_mm``."""
+    return UNIT_IN_BRACKETS.sub(r"\1_\2", line)
+
+
 def _is_heading(lines: list[str], path: Path) -> bool:
     """Whether the first line is no point but a count of points, or names of columns."""
-    words = _words(lines[0]) if lines else []
+    words = _words(_with_units_named(lines[0])) if lines else []
     if not words or lines[0].startswith("#"):
         return False
     if len(words) == 1 and words[0].isdecimal():

@@ -427,19 +427,19 @@ def _from_text(data: bytes, where: str) -> _PoseTable:
     names: list[str] = []
     is_named = False
     for number, whole in enumerate(lines, start=1):
-        line, place = whole.split("#")[0].replace('"', "").strip(), f"{where}, line {number}"
-        words = _words(line)
-        if not words:
+        quoted, line = _quoted_name(whole)
+        place, words = f"{where}, line {number}", _words(line)
+        if not words and not quoted:
             continue
-        if not rows and not header and not any(map(NUMBER.match, words)):
+        if not (quoted or rows or header) and not any(map(NUMBER.match, words)):
             is_named = words[0].lower() in NAME_TITLES
             line = _after_first(line) if is_named else line
             header = _header(line.rstrip(",;"), _words(line), place)
             continue
-        if is_named or not (rows or reads_as_float(words[0])):
+        if quoted or is_named or not (rows or reads_as_float(words[0])):
             is_named = True
-            names.append(_file_of(line))
-            line = _after_first(line)
+            names.append(quoted or _file_of(line))
+            line = line if quoted else _after_first(line)
         if _has_decimal_commas(line.rstrip(",;")):
             raise FileFormatError(
                 "the numbers have commas as decimal signs",
@@ -456,6 +456,29 @@ def _from_text(data: bytes, where: str) -> _PoseTable:
 
 def _words(line: str) -> list[str]:
     return [word for word in re.split(r"[\s,;\[\]]+", line) if word]
+
+
+_QUOTED = re.compile(r'\s*"((?:[^"]|"")*)"\s*[,;]?')
+"""A field in quotes with which a line begins, and what parts it from the next."""
+
+
+def _quoted_name(line: str) -> tuple[str, str]:
+    """The name in quotes with which a pose's line begins, or none, and the rest of the line.
+
+    The rest has no quotes and no comment: that begins with a # at its start, behind what parts
+    fields or behind a number; a # within a name is part of it.
+    """
+    first, name = _QUOTED.match(line), ""
+    if first and NUMBER.match(line[first.end() :].strip().lstrip('"')):
+        told = first[1].replace('""', '"').strip()
+        if not reads_as_float(told):
+            name, line = told, line[first.end() :]
+    for mark in re.finditer("#", line):
+        before = re.split(r'[\s,;\[\]"]', line[: mark.start()])[-1]
+        if not before or reads_as_float(before):
+            line = line[: mark.start()]
+            break
+    return name, line.replace('"', "").strip()
 
 
 _FIRST = re.compile(r"([^,;]*[^,;\s])\s*[,;]\s*|(\S+)\s+")

@@ -389,8 +389,8 @@ class LaserFit(ArrayRecord):
     print_reason
         Why the target's print was subtracted, in words; empty where it was not.
     board_bow_mm
-        (2,) bow of the board along x and along y that stripes were placed with; zero for a flat
-        one, empty where its views do not tell.
+        (2,) bow of the board along x and along y that stripes were placed with; zero where its
+        views show none, empty where it is known to have none.
     """
 
     sheets: tuple[SheetFit, ...]

@@ -235,9 +235,11 @@ def _inner(flat: FloatArray, stripe: IntArray, margin_mm: float) -> BoolArray:
 ROUNDS = 6
 FLAT_PROFILE_MM = 0.3
 """Points of one stripe that keep this near to a plane are one profile in one light sheet."""
-COLUMNS, MOST_STEEP = 30, 5.0
-"""A flat cloud is cut into columns; in half of them a profile rises by less than so many of their
-widths, where an area is as high as it is broad."""
+COLUMNS, MOST_STEEP = 30, 4.0
+"""A flat cloud is cut into columns; in half of them a profile without its strays rises by less than
+so many of their widths, where an area is as high as it is broad."""
+STRAYS = 0.1
+"""Part of a column's points on either side that may be strays, which fill a light sheet's plane."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -396,10 +398,12 @@ def _covers_an_area(within: FloatArray) -> bool:
     if not width > 0.0:
         return False
     column = ((within[:, 0] - within[:, 0].min()) / width).astype(np.int64)
-    order = np.argsort(column, kind="stable")
+    order = np.lexsort((within[:, 1], column))
     starts = np.flatnonzero(np.diff(column[order], prepend=-1))
+    n_strays = (STRAYS * np.diff(starts, append=len(order))).astype(np.int64)
+    ends = np.append(starts[1:], len(order)) - 1
     across = within[order, 1]
-    high = np.maximum.reduceat(across, starts) - np.minimum.reduceat(across, starts)
+    high = across[ends - n_strays] - across[starts + n_strays]
     return bool(np.median(high) > MOST_STEEP * width)
 
 

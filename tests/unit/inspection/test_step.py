@@ -362,3 +362,18 @@ def test_faces_of_a_noisy_step_are_not_doubted() -> None:
     cloud = cloud_of(np.column_stack([x, y, z]), sigma_mm=0.0)
     found = inspected(inspect_step(cloud, HEIGHT_MM))
     assert not any("not flat" in text for text in step_report(found, cloud).warnings)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_strays_in_the_sheet_of_one_foreign_profile_make_it_no_area(seed: int) -> None:
+    """Three in a hundred points of a line made each part of it as high as an area is."""
+    rng = np.random.default_rng(seed)
+    x = np.linspace(-30.0, 30.0, 900)
+    z = np.where(x > 5.0, 5.0, 0.0) + rng.normal(0.0, 0.01, 900)
+    strays = np.arange(600, 900, 11)
+    z[strays] = rng.uniform(-30.0, 30.0, len(strays))
+    strays = np.arange(15, 300, 11)
+    z[strays] = rng.uniform(-30.0, 30.0, len(strays))
+    found = inspected(inspect_step(cloud_of(np.column_stack([x, 0.0 * x, z])), 5.0))
+    assert "taken to stand square" in found.normal_rule
+    assert found.height.value_mm == pytest.approx(5.0, abs=0.005)

@@ -644,19 +644,30 @@ class _OneSheet:
         """Raise the stripes' sigmas until the model fits, if it did not.
 
         What neither the model nor the boards' scatter explains is charged to the stripes. The
-        covariance of the sheet grows with it.
+        covariance of the sheet grows with it. Where a small bow explains it, nothing is charged;
+        else that bow is made by the same error, and takes none of it away.
         """
-        factor, tests = model.noise.sigma_factor, list[FTest]()
+        factor = model.noise.sigma_factor
+        solution = self.solve_again(model, factor)
+        if isinstance(solution, FitFailure):
+            return solution
+        test = self.lack_of_fit(solution, model.noise)
+        model = replace(model, sheet=solution.sheets[0], final_test=test, sigma_factor=factor)
+        if _is_explained(test):
+            return model
         for _ in range(MAX_RAISES):
-            solution = self.solve_again(model, factor)
+            solution = self.solve(model.sheet, factor, is_bowed=model.is_bowed)
             if isinstance(solution, FitFailure):
                 return solution
-            model = replace(model, sheet=solution.sheets[0], sigma_factor=factor)
-            tests.append(self.lack_of_fit(solution, model.noise, factor))
-            if tests[-1].p_value >= LACK_OF_FIT_P or tests[-1].f_ratio <= 1.0:
+            test = self.lack_of_fit(solution, model.noise, factor)
+            if _is_explained(test):
                 break
-            factor *= float(np.sqrt(tests[-1].f_ratio))
-        return replace(model, final_test=tests[0])
+            factor *= float(np.sqrt(test.f_ratio))
+        return replace(model, sheet=solution.sheets[0], sigma_factor=factor)
+
+
+def _is_explained(test: FTest) -> bool:
+    return test.p_value >= LACK_OF_FIT_P or test.f_ratio <= 1.0
 
 
 def _bow_condition(observations: SheetObservations, flat: SheetSolution) -> float:

@@ -289,7 +289,12 @@ def test_names_of_files_may_hold_a_number_sign_and_quoted_ones_commas(
 
 @pytest.mark.parametrize(
     "text",
-    ["1 2 3 0 0 0#first\n", '"1","2","3","0","0","0" # first\n', "#a.png 9\n1,2,3,0,0,0,#first\n"],
+    [
+        "1 2 3 0 0 0#first\n",
+        "x,y,z,a,b,c#deg\n1,2,3,0,0,0\n",
+        '"1","2","3","0","0","0" # first\n',
+        "#a.png 9\n1,2,3,0,0,0,#first\n",
+    ],
 )
 def test_comments_behind_numbers_stay_comments(tmp_path: Path, text: str) -> None:
     (pose,) = read_robot_poses(written(tmp_path, "p.csv", text), "extrinsic-xyz")

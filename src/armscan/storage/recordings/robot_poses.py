@@ -432,6 +432,7 @@ def _from_text(data: bytes, where: str) -> _PoseTable:
         if not words and not quoted:
             continue
         if not (quoted or rows or header) and not any(map(NUMBER.match, words)):
+            line = line.partition("#")[0].strip()
             is_named = words[0].lower() in NAME_TITLES
             line = _after_first(line) if is_named else line
             header = _header(line.rstrip(",;"), _words(line), place)

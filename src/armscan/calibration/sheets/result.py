@@ -390,7 +390,7 @@ class LaserFit(ArrayRecord):
         Why the target's print was subtracted, in words; empty where it was not.
     board_bow_mm
         (2,) bow of the board along x and along y that stripes were placed with; zero where its
-        views show none, empty where it is known to have none.
+        views show none, empty where nothing of it was asked of them.
     """
 
     sheets: tuple[SheetFit, ...]

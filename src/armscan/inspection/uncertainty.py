@@ -47,6 +47,8 @@ LEAST_NEIGHBOURS, SCATTER_OF_VARIANCE = 30, 12.0
 median tells scatters by, as a part of it, times the root of how many they are: 4 x 2 x 1.17 for a
 median of absolute values (Huber, Robust Statistics, 1981), and a quarter more for each point is in
 two of them."""
+LEAST_PART = 0.01
+"""Of their mean that stated variances count as at least, where differences are held to them."""
 
 LEAST_SHARE = 1e-3
 """Least part of what points share that exposures err each for itself, along any direction."""
@@ -441,8 +443,11 @@ def _unstated_mm2(
     n = int(is_next.sum())
     if n < LEAST_NEIGHBOURS:
         return 0.0
-    told = float(np.median((stated_mm2[1:] + stated_mm2[:-1])[is_next])) / 2.0
-    apart = np.abs(np.diff(residuals_mm)[is_next])
+    stated = (stated_mm2[1:] + stated_mm2[:-1])[is_next] / 2.0
+    told = float(np.mean(stated))
+    # each over its own: of points some of which are noisier, medians of both would not be alike
+    part = np.maximum(stated / told, LEAST_PART) if told > 0.0 else np.ones(n)
+    apart = np.abs(np.diff(residuals_mm)[is_next]) / np.sqrt(part)
     found = (MAD_TO_SIGMA * float(np.median(apart))) ** 2 / 2.0
     return found - told if found > (1.0 + SCATTER_OF_VARIANCE / math.sqrt(n)) * told else 0.0
 

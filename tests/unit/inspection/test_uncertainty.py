@@ -18,7 +18,7 @@ from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import MeasuredLength
 from armscan.inspection.sphere import DIAMETER_OF_SPHERE, inspect_sphere, linearised_sphere
 from armscan.inspection.step import inspect_step
-from armscan.inspection.uncertainty import measured_length
+from armscan.inspection.uncertainty import _unstated_mm2, measured_length
 from armscan.records.cloud import FIELD_POWERS, CalibrationErrors, PointCloud
 from armscan.report.inspection.shapes import sigma_facts
 from armscan.vision.stripe.smooth import Polyline, smooth
@@ -377,3 +377,15 @@ def test_points_that_scatter_by_more_than_the_cloud_says_have_a_larger_sigma(
     scatter = float(np.std([item.value_mm for item in found], ddof=1))
     stated = float(np.mean([item.sigma_mm for item in found]))
     assert 1.0 / SPREAD_LIMIT < scatter / stated < SPREAD_LIMIT
+
+
+def test_points_of_unlike_noise_that_is_stated_rightly_widen_nothing() -> None:
+    """Every fourth is four times as noisy: medians of all differences tell more than is stated."""
+    points, exposure = block_stripes(20.0)
+    up, rng = np.array([0.0, 0.0, 1.0]), np.random.default_rng(4)
+    told_mm = np.where(rng.random(len(points)) < 0.25, 0.04, 0.01)
+    noise = told_mm[:, None] * rng.standard_normal((len(points), 1))
+    sheet = np.zeros(len(points), dtype=np.int64)
+    cloud = replace(cloud_of(points + up * noise, exposure, sigma_mm=1e-4), sheet=sheet)
+    assert _unstated_mm2(noise[:, 0], cloud, np.arange(len(points)), told_mm**2) == 0.0
+    assert _unstated_mm2(3.0 * noise[:, 0], cloud, np.arange(len(points)), told_mm**2) > 0.0

@@ -498,21 +498,26 @@ class _OneSheet:
     is_bow_allowed: bool
 
     def solve(
-        self, start: LightSheet, sigma_factor: float, *, is_bowed: bool = False
+        self,
+        start: LightSheet,
+        sigma_factor: float,
+        *,
+        is_bowed: bool = False,
+        may_bow: bool = False,
     ) -> SheetSolution | FitFailure:
         return solve_sheets(
-            self.points, [start], self.errors, [is_bowed], sigma_factor=sigma_factor
+            self.points,
+            [start],
+            self.errors,
+            [is_bowed],
+            sigma_factor=sigma_factor,
+            may_bow=may_bow,
         )
 
-    def solve_again(self, model: SheetModel, sigma_factor: float) -> SheetSolution | FitFailure:
-        """The model as it is stored: with the likeliest of small bows where none is free."""
-        return solve_sheets(
-            self.points,
-            [model.sheet],
-            self.errors,
-            [model.is_bowed],
-            sigma_factor=sigma_factor,
-            may_bow=self.is_bow_allowed,
+    def solve_as_stored(self, model: SheetModel, sigma_factor: float) -> SheetSolution | FitFailure:
+        """With the likeliest of small bows where none is free."""
+        return self.solve(
+            model.sheet, sigma_factor, is_bowed=model.is_bowed, may_bow=self.is_bow_allowed
         )
 
     def lack_of_fit(
@@ -617,7 +622,7 @@ class _OneSheet:
         """
         for _ in range(SCATTER_ROUNDS):
             wider = replace(self, errors=self.errors.with_boards(factors))
-            solution = wider.solve_again(model, model.noise.sigma_factor)
+            solution = wider.solve_as_stored(model, model.noise.sigma_factor)
             if isinstance(solution, FitFailure):
                 return solution
             if not solution.has_converged:
@@ -630,7 +635,7 @@ class _OneSheet:
             if isinstance(charged, FitFailure) or len(np.unique(self.points.board)) <= NO_SPARE:
                 return charged
             model = charged
-            solution = wider.solve_again(model, model.sigma_factor)
+            solution = wider.solve_as_stored(model, model.sigma_factor)
             if isinstance(solution, FitFailure):
                 return solution
             found = np.array(self.likeliest_scatter(solution, model.noise).of_boards)
@@ -648,7 +653,7 @@ class _OneSheet:
         else that bow is made by the same error, and takes none of it away.
         """
         factor = model.noise.sigma_factor
-        solution = self.solve_again(model, factor)
+        solution = self.solve_as_stored(model, factor)
         if isinstance(solution, FitFailure):
             return solution
         test = self.lack_of_fit(solution, model.noise)

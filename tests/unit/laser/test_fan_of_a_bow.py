@@ -26,7 +26,7 @@ class _Stated(_OneSheet):
         super().__init__(None, errors, is_bow_allowed=True)
         object.__setattr__(self, "told", (bow_mm, sigma_mm, chi2_of_fan))
 
-    def solve(self, start, sigma_factor, *, is_bowed=False):
+    def solve(self, start, sigma_factor, *, is_bowed=False, may_bow=False):
         bow_mm, sigma_mm, chi2_of_fan = self.told
         bow = np.zeros(5)
         bow[U2] = bow_mm

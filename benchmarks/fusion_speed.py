@@ -1,32 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thinning a cloud to one point a voxel, beside small_gicp's voxel sampling of the same points.
-
-Command: ``OMP_NUM_THREADS=1 python benchmarks/fusion_speed.py [millions] [repeats]`` (default 2
-and 5; seed 0). Without small_gicp, which the package does not need, its row is left out.
+"""Thinning a cloud to one point a voxel: the part ``fusion`` of ``speed.py``, one thread, seed 0.
 
 Points with covariance, noise and normals lie in lines on a ball's cap of 40 mm radius, scanned
-again and again. Told are medians over the repeats of processor time, in millions of points a
-second, and the voxels made. small_gicp averages places alone: it knows no weights, covariances,
-normals or counts. ``places and normals`` adds up places, normals and counts by armscan's grid.
-``to disk`` holds a sixteenth of the voxels in memory and merges the rest from disk.
+again and again. small_gicp (if it is installed) and NumPy average places alone: they know no
+weights, covariances, normals or counts.
 """
 
 from __future__ import annotations
 
 import importlib
-import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from timing import Comparison, compare
 
 from armscan.fusion.cell_sums import CellSums, cell_numbers
 from armscan.fusion.voxel_map import VoxelMap
 from armscan.records.cloud import PointCloud
 
-RADIUS_MM, VOXEL_MM = 40.0, 0.2
+RADIUS_MM, VOXEL_MM, MANY = 40.0, 0.2, 1_000_000
+SMALL_GICP, NUMPY = "small_gicp, places", "NumPy `unique` and `add.at`, places"
 
 
 def drawn(n: int) -> PointCloud:
@@ -75,6 +70,14 @@ def places_alone(cloud: PointCloud) -> int:
     return sum(len(keys) for keys, _ in sums.merged())
 
 
+def by_numpy(cloud: PointCloud) -> int:
+    cells = np.floor(cloud.points_mm / VOXEL_MM).astype(np.int64)
+    found, owner, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(found), 3))
+    np.add.at(sums, owner.ravel(), cloud.points_mm)
+    return len(sums / counts[:, None])
+
+
 def small_gicp(cloud: PointCloud) -> Callable[[], int] | None:
     try:
         library = importlib.import_module("small_gicp")
@@ -84,37 +87,25 @@ def small_gicp(cloud: PointCloud) -> Callable[[], int] | None:
     return lambda: int(library.voxelgrid_sampling(points, VOXEL_MM).size())
 
 
-def timed(work: Callable[[], int], repeats: int) -> tuple[float, int]:
-    n, times = work(), []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return float(np.median(times)), n
-
-
-def main() -> None:
-    millions = float(sys.argv[1]) if len(sys.argv) > 1 else 2.0
-    repeats = int(sys.argv[2]) if len(sys.argv) > 2 else 5
-    cloud = drawn(round(1e6 * millions))
-    print("| | million points/s | voxels |")
-    print("|---|--:|--:|")
+def fusion(repeats: int) -> Comparison:
+    """A million points to voxels of 0.2 mm."""
+    cloud = drawn(MANY)
+    n_voxels = ours(cloud)
     with tempfile.TemporaryDirectory() as temporary:
-        n_voxels = ours(cloud)
-        rows: list[tuple[str, Callable[[], int] | None]] = [
-            ("armscan, with covariances", lambda: ours(cloud)),
-            (
-                "armscan, to disk",
-                lambda: ours(cloud, Path(temporary), 33 * 8 * n_voxels // 16),
+        ways: dict[str, Callable[[], int]] = {
+            "**armscan: covariances, normals, counts**": lambda: ours(cloud),
+            "**armscan: the same, a sixteenth in memory**": lambda: ours(
+                cloud, Path(temporary), 33 * 8 * n_voxels // 16
             ),
-            ("armscan, places and normals", lambda: places_alone(cloud)),
-            ("small_gicp voxelgrid_sampling", small_gicp(cloud)),
-        ]
-        for name, work in rows:
-            if work is not None:
-                seconds, n = timed(work, repeats)
-                print(f"| {name} | {millions / seconds:.2f} | {n:,} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+            "armscan: places and normals": lambda: places_alone(cloud),
+            NUMPY: lambda: by_numpy(cloud),
+        }
+        if (sampled := small_gicp(cloud)) is not None:
+            ways[SMALL_GICP] = sampled
+        return compare(
+            f"{MANY:,} points to voxels of {VOXEL_MM} mm",
+            ways,
+            repeats,
+            usual=SMALL_GICP if SMALL_GICP in ways else NUMPY,
+            tell=lambda n: (f"{n:,} voxels", ""),
+        )

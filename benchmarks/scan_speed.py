@@ -1,37 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time that placing a scan takes, besides extracting its stripes.
+"""Names, places and normals beside NumPy and OpenCV: the part ``placing`` of ``speed.py``.
 
-Command: ``OMP_NUM_THREADS=1 python benchmarks/scan_speed.py [repeats]`` (default 15; seed 0).
-
-Median milliseconds of processor time over the repeats, one thread; beside work on many points the
-millions of them a second:
-
-- *triangulate*: 3000 stripe points of one exposure, with the derivatives of their covariance;
-- *place*: the same points in Base with full covariance;
-- *an exposure after its stripes*: 1050 of them named, measured, placed and kept in the spool of a
-  scan, one sheet, one camera;
-- *poses*: 2000 exposures looked up by time among 20,000 samples of the arm;
-- *naming*, *points of pairs*: twelve exposures of the thesis's head of eleven lines (the scenes of
-  `multi_naming.py`), each of both cameras: names and epipolar offset, then points; a pair;
-- *undistort, sheet, pose*: 100,000 pixels to points in Base without covariance; *with covariance*:
-  triangulate and place; *NumPy and OpenCV*: the same without covariance by
-  `cv2.undistortPoints`, the plane's formula and a matrix product, which knows no bow;
-- *normals*: 200,000 points of a plate, and of a ball, scanned in 200 lines;
-- *arm forward*, *arm Jacobian*: 10,000 joint vectors of seven axes; Jacobian by 28 parameters.
+One thread, seed 0, stripe points given. Pixels go to points in Base by the camera, a bowed sheet,
+the hand-eye and the arm's pose; the same by `cv2.undistortPoints`, the plane's formula and a matrix
+product knows no bow and no covariance. An exposure's points are kept in the spool of a scan. Pairs
+are of the scenes of `multi_naming.py`.
 """
 
 from __future__ import annotations
 
-import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, Slerp
+from timing import Comparison, compare
 
 from armscan.geometry.arrays import FloatArray, homogeneous
 from armscan.models.arm import forward, parameter_jacobian, thesis_arm
-from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.scan import scan_spool
 from armscan.reconstruction.label_stereo import StereoLabeller
 from armscan.reconstruction.labels import SingleLabeller
@@ -53,17 +40,8 @@ from rigs.stereo_scenes import KINDS, Noise, draw_surfaces, expose
 ARM = thesis_arm((300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0))
 RNG = np.random.default_rng(0)
 MANY = 100_000
-
-
-def median_ms(work: Callable[[], object], repeats: int) -> float:
-    """Median time of a piece of work, after one that is not counted."""
-    work()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return 1e3 * float(np.median(times))
+OPENCV, TREE = "OpenCV and NumPy, plane", "SciPy k-d tree, NumPy, of a plate"
+SLERP = "SciPy `Slerp`, NumPy"
 
 
 def surface(is_ball: bool) -> FloatArray:
@@ -86,29 +64,24 @@ def track(n: int = 20_000) -> ArmTrack:
     )
 
 
-Row = tuple[str, Callable[[], object], int, int]
-
-
-def pair_rows(repeats: int) -> list[Row]:
-    """Exposures of two cameras: name, work, repeats, and count of pairs."""
+def pairs(repeats: int) -> Comparison:
+    """Twelve exposures of both cameras of the thesis's head of eleven lines, a pair."""
     head = StereoHead.thesis()
     sensor = head.drawn_calibration(RNG)
-    pairs = []
+    seen = []
     for kind in KINDS:
         for _ in range(3):
             left, right = expose(head, draw_surfaces(kind, RNG), Noise(), RNG)
-            pairs.append([left.profile, right.profile])
+            seen.append([left.profile, right.profile])
     labeller = StereoLabeller(sensor)
-    named = [labeller.label(pair) for pair in pairs]
-    return [
-        ("naming, a pair", lambda: [labeller.label(pair) for pair in pairs], repeats, len(pairs)),
-        (
-            "points of pairs, a pair",
-            lambda: [measure_points(one, sensor, LABEL_DEPTHS) for one in named],
-            repeats,
-            len(pairs),
-        ),
-    ]
+    named = [labeller.label(pair) for pair in seen]
+    ways: dict[str, Callable[[], object]] = {
+        "armscan: names and epipolar offset": lambda: [labeller.label(pair) for pair in seen],
+        "armscan: points": lambda: [measure_points(one, sensor, LABEL_DEPTHS) for one in named],
+    }
+    n = sum(len(left) + len(right) for left, right in seen) / len(seen)
+    work = f"a pair of images of eleven lines, {n:,.0f} stripe points"
+    return compare(work, ways, repeats, parts=len(seen))
 
 
 def after_stripes(placing: BaseTransform) -> Callable[[], object]:
@@ -131,74 +104,86 @@ def after_stripes(placing: BaseTransform) -> Callable[[], object]:
     return work
 
 
-def ray_rows(sensor: SensorCalibration, placing: BaseTransform, repeats: int) -> list[Row]:
-    """Pixels to Base: name, work, repeats, and 0: the work is one."""
+def rays(repeats: int) -> Comparison:
+    """100,000 pixels to points in Base."""
+    scanner = rig.scanner()
+    placing, sensor = BaseTransform.of(scanner), rig.sensor_of(thesis_rig().camera, rig.sheets())
     pixels = RNG.uniform([200.0, 600.0], [1800.0, 800.0], (MANY, 2))
     profile, sheet = rig.profile_at(pixels), np.zeros(MANY, dtype=np.int64)
     camera, plane = sensor.camera.camera, sensor.sheets[0].sheet.plane
-    base_from_sensor = rig.BASE_FROM_TOOL @ placing.scanner.hand_eye.tool_from_sensor
+    base_from_sensor = rig.BASE_FROM_TOOL @ scanner.hand_eye.tool_from_sensor
 
     def by_opencv() -> object:
         xy = cv2.undistortPoints(pixels[:, None], camera.matrix, camera.distortion)[:, 0]
-        rays = homogeneous(xy)
-        points = rays * (-plane[3] / (rays @ plane[:3]))[:, None]
+        directions = homogeneous(xy)
+        points = directions * (-plane[3] / (directions @ plane[:3]))[:, None]
         return points @ base_from_sensor.rotation.T + base_from_sensor.translation_mm
 
     def with_covariance() -> object:
         stripe = triangulate_stripe(profile, sheet, sensor)
         return propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing)
 
-    return [
-        (
-            "undistort, sheet, pose",
-            lambda: intersect_sheets(pixels, sheet, sensor, base_from_sensor),
-            repeats,
-            0,
-        ),
-        ("NumPy and OpenCV", by_opencv, repeats, 0),
-        ("with covariance", with_covariance, repeats, 0),
-    ]
+    ways: dict[str, Callable[[], object]] = {
+        "**armscan: places**": lambda: intersect_sheets(pixels, sheet, sensor, base_from_sensor),
+        "**armscan: places and covariance**": with_covariance,
+        OPENCV: by_opencv,
+    }
+    return compare(f"{MANY:,} pixels to places in Base", ways, repeats, usual=OPENCV)
 
 
-def main() -> None:
-    repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 15
-    scanner = rig.scanner()
-    placing = BaseTransform.of(scanner)
-    sensor = rig.sensor_of(thesis_rig().camera, rig.sheets())
-    pixels = np.stack([np.linspace(200.0, 1800.0, 3000), np.full(3000, 700.0)], axis=1)
-    profile, sheet = rig.profile_at(pixels), np.zeros(3000, dtype=np.int64)
-    stripe = triangulate_stripe(profile, sheet, sensor)
-    samples = track()
-    times = np.sort(RNG.integers(0, int(samples.t_ns[-1]), 2000))
+def surfaces(repeats: int) -> Comparison:
+    """Normals of 200,000 points scanned in 200 lines."""
+    plate, ball = surface(is_ball=False), surface(is_ball=True)
+    seen = np.tile([0.0, 0.0, 150.0], (len(plate), 1))
+
+    def by_scipy() -> object:
+        near = plate[cKDTree(plate).query(plate, 32)[1]]
+        near -= near.mean(axis=1, keepdims=True)
+        return np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
+
+    ways: dict[str, Callable[[], object]] = {
+        "**armscan: of a plate**": lambda: estimate_normals(plate, seen),
+        "**armscan: of a ball**": lambda: estimate_normals(ball, seen),
+        TREE: by_scipy,
+    }
+    return compare("normals of 200,000 points", ways, repeats, usual=TREE)
+
+
+def arms(repeats: int) -> Iterator[Comparison]:
+    """The arm's model, and its poses at the times of exposures."""
+    samples, joints = track(), RNG.uniform(-3.0, 3.0, (10_000, 7))
+    times = np.sort(RNG.integers(0, int(samples.t_ns[-1]), 10_000))
     rows = [
         ExposureRow(index=k, t_ns=int(t), camera=0, source=f"{k}.png") for k, t in enumerate(times)
     ]
-    joints = RNG.uniform(-3.0, 3.0, (10_000, 7))
-    plate, ball = surface(is_ball=False), surface(is_ball=True)
-    seen = np.tile([0.0, 0.0, 150.0], (len(plate), 1))
-    few = max(1, repeats // 5)
-    table: list[tuple[str, Callable[[], object], int]] = [
-        ("triangulate 3000", lambda: triangulate_stripe(profile, sheet, sensor), repeats),
-        (
-            "place 3000",
-            lambda: propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing),
-            repeats,
+
+    def by_scipy() -> object:
+        turns = Slerp(samples.t_ns, Rotation.from_matrix(samples.rotations))(times)
+        places = [np.interp(times, samples.t_ns, axis) for axis in samples.translations_mm.T]
+        return turns.as_matrix(), places
+
+    at_times: dict[str, Callable[[], object]] = {
+        "**armscan: with gaps, standstills, steps looked for**": lambda: exposure_poses(
+            rows, samples
         ),
-        ("after stripes 1050", after_stripes(placing), repeats),
-        ("poses 2000", lambda: exposure_poses(rows, samples), repeats),
-        ("normals 200,000 plate", lambda: estimate_normals(plate, seen), few),
-        ("normals 200,000 ball", lambda: estimate_normals(ball, seen), few),
-        ("arm forward 10,000", lambda: forward(ARM, joints), repeats),
-        ("arm Jacobian 10,000", lambda: parameter_jacobian(ARM, joints), few),
-    ]
-    for name, work, count in table:
-        print(f"{name:24} {median_ms(work, count):10.2f} ms")
-    for name, work, count, n_pairs in pair_rows(few):
-        print(f"{name:24} {median_ms(work, count) / n_pairs:10.2f} ms")
-    for name, work, count, _ in ray_rows(sensor, placing, repeats):
-        taken = median_ms(work, count)
-        print(f"{name:24} {taken:10.2f} ms {1e-3 * MANY / taken:7.2f} million/s")
+        SLERP: by_scipy,
+    }
+    yield compare("10,000 poses of 20,000 samples at given times", at_times, repeats, usual=SLERP)
+    model: dict[str, Callable[[], object]] = {
+        "armscan: poses": lambda: forward(ARM, joints),
+        "armscan: derivatives by 28 parameters": lambda: parameter_jacobian(ARM, joints),
+    }
+    yield compare("10,000 poses of seven joints", model, repeats)
 
 
-if __name__ == "__main__":
-    main()
+def placing(repeats: int) -> Iterator[Comparison]:
+    """All of these."""
+    base_transform = BaseTransform.of(rig.scanner())
+    yield rays(repeats)
+    after: dict[str, Callable[[], object]] = {
+        "armscan: named, measured, placed, kept": after_stripes(base_transform)
+    }
+    yield compare("an exposure of 1,050 stripe points", after, repeats)
+    yield pairs(max(1, repeats // 2))
+    yield surfaces(max(1, repeats // 2))
+    yield from arms(max(1, repeats // 2))

@@ -1,25 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time and accuracy of stripe extraction beside the usual ways, in one run, as a Markdown table.
+"""Stripe extraction beside the usual ways: the part ``stripes`` of ``speed.py``.
 
-Command: ``python benchmarks/stripe_speed.py [repeats]`` (default 15). One thread; the least
-processor time of the repeats. Trust the ratios: times on a shared machine vary. Images: 11 nearly
-horizontal lines at 2658 x 800, one line at 3072 x 2048, 11 lines at 45 degrees at 2658 x 800; line
-sigma 3, peak 150, speckle 0.2, seed 0. Error: RMS distance from the true line of the points within
-3 px of one. The floor reads the frame once. scikit-image is used if it is installed; its
-eigenvalues come without points.
+One thread. Lines of sigma 3 px, peak 150, speckle contrast 0.2, seed 0: nearly level ones, and some
+at 45 degrees. Error: RMS distance from the true line of the points within 3 px of one. OpenCV's
+Steger gives points without sigma and flags, scikit-image eigenvalues without points, ridge-detector
+linked points without sigma (both if they are installed); the floor reads the frame once.
 """
 
 from __future__ import annotations
 
-import platform
-import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
-from pathlib import Path
 
 import cv2
 import numpy as np
+from timing import Comparison, compare
 
 from armscan.geometry.arrays import FloatArray
 from armscan.kernels.stripe.ridge import gaussian_taps
@@ -31,6 +26,7 @@ from rigs.stripe_image import SimulatedStripe, StripeScene, WaveCurve
 
 SIGMA_PX = 3.0
 NEAR_PX = 3.0
+USUAL = "OpenCV + numpy Steger"
 NO_POINTS = np.zeros((0, 2))
 
 
@@ -94,6 +90,22 @@ def column_centroid(image: np.ndarray) -> FloatArray:
     return np.stack([columns, (light * rows).sum(axis=0) / light.sum(axis=0)]).T
 
 
+def ridge_detector(image: np.ndarray) -> FloatArray:
+    """Steger's lines by the package of that name, which links them, too."""
+    from ridge_detector import RidgeDetector
+
+    detector = RidgeDetector(
+        line_widths=np.array([2.0 * SIGMA_PX]),
+        low_contrast=20,
+        high_contrast=60,
+        dark_line=False,
+        estimate_width=False,
+    )
+    detector.detect_lines(image)
+    lines = [np.stack([one.col, one.row], axis=1) for one in detector.contours]
+    return np.concatenate(lines) if lines else NO_POINTS
+
+
 def read_once(image: np.ndarray) -> FloatArray:
     """The floor: each pixel once."""
     image.max()
@@ -116,25 +128,6 @@ def accepted_points(exposure: Exposure, options: StripeOptions | None = None) ->
     return profile.points_px[profile.is_accepted]
 
 
-def best_ms(work: Callable[[], object], repeats: int) -> float:
-    """Least processor time."""
-    times = []
-    work()
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return 1e3 * min(times)
-
-
-def machine() -> str:
-    """The processor's name."""
-    names = Path("/proc/cpuinfo")
-    found = names.read_text("utf-8").splitlines() if names.exists() else []
-    models = [line.partition(":")[2].strip() for line in found if line.startswith("model name")]
-    return f"{len(models)} cores, {models[0]}" if models else platform.machine()
-
-
 def error_px(scene: StripeScene, points: FloatArray) -> str:
     """RMS distance from the true lines, in words."""
     if not len(points):
@@ -144,39 +137,47 @@ def error_px(scene: StripeScene, points: FloatArray) -> str:
     return f"{np.sqrt((near**2).mean()):.3f} px"
 
 
-def main() -> None:
-    """Print the table."""
+def stripes(repeats: int) -> Iterator[Comparison]:
+    """Extraction beside the usual ways, by scene; then against the size of the frame and lines."""
     cv2.setNumThreads(1)
-    repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 15
-    print(f"{machine()}, {time.strftime('%Y-%m-%d')}\n")
-    print("| image | method | points | error | ms | OpenCV + numpy Steger over it |")
-    print("|---|---|---|---|---|---|")
     for name, scene in (
         ("11 lines, 2658 x 800", horizontal(11, 2658, 800)),
         ("1 line, 3072 x 2048", horizontal(1, 3072, 2048)),
-        ("lines at 45 degrees, 2658 x 800", slanted(11, 2658, 800)),
+        ("11 lines at 45 degrees, 2658 x 800", slanted(11, 2658, 800)),
     ):
-        exposure = scene.expose(0)
-        image = exposure.image
-        work: dict[str, Callable[[], FloatArray]] = {
-            "points, sigma, flags": lambda e=exposure: accepted_points(e),
-            "points, sigma, flags: fast": lambda e=exposure: accepted_points(e, FAST),
-            "ridge points, linked": lambda e=exposure: ridge_points(e),
-            "OpenCV + numpy Steger": lambda i=image: opencv_steger(i),
-        }
+        yield compare_ways(name, scene, repeats)
+    for width, height in ((640, 480), (1280, 1024), (2658, 800), (4096, 3000)):
+        for n in (1, 5, 11):
+            if (n, width) not in ((11, 2658), (11, 640)):
+                yield compare_ways(
+                    f"{n} line{'s' if n > 1 else ''}, {width} x {height}",
+                    horizontal(n, width, height),
+                    repeats,
+                    is_short=True,
+                )
+
+
+def compare_ways(
+    name: str, scene: StripeScene, repeats: int, *, is_short: bool = False
+) -> Comparison:
+    exposure = scene.expose(0)
+    image = exposure.image
+    ways: dict[str, Callable[[], FloatArray]] = {
+        "**armscan: points, sigma, flags**": lambda: accepted_points(exposure),
+        "**armscan, `fast`: the same**": lambda: accepted_points(exposure, FAST),
+        USUAL: lambda: opencv_steger(image),
+    }
+    if not is_short:
+        ways["armscan: ridge points, linked"] = lambda: ridge_points(exposure)
         if find_spec("skimage"):
-            work["scikit-image eigenvalues"] = lambda i=image: skimage_hessian(i)
+            ways["scikit-image eigenvalues"] = lambda: skimage_hessian(image)
+        if find_spec("ridge_detector"):
+            ways["ridge-detector, linked"] = lambda: ridge_detector(image)
         if len(scene.stripes) == 1:
-            work["per-column centroid"] = lambda i=image: column_centroid(i)
-        work["frame read once"] = lambda i=image: read_once(i)
-        times = {label: best_ms(call, repeats) for label, call in work.items()}
-        for label, ms in times.items():
-            points = work[label]()
-            ratio = times["OpenCV + numpy Steger"] / ms
-            count = f"{len(points):,}" if len(points) else ""
-            cells = (name, label, count, error_px(scene, points), f"{ms:.1f}", f"{ratio:.2g}")
-            print(f"| {' | '.join(cells)} |")
+            ways["centroid of each column"] = lambda: column_centroid(image)
+        ways["each pixel read once"] = lambda: read_once(image)
 
+    def tell(points: FloatArray) -> tuple[str, str]:
+        return (f"{len(points):,} points" if len(points) else ""), error_px(scene, points)
 
-if __name__ == "__main__":
-    main()
+    return compare(f"stripes: {name} px", ways, repeats, usual=USUAL, tell=tell)

@@ -28,6 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -192,7 +193,16 @@ def processor_seconds(command: list[str]) -> tuple[float, float, str]:
     return used, wall, done.stdout
 
 
-def beside_opencv(folder: Path, paths: list[Path], text: str) -> None:
+@dataclass(frozen=True)
+class Beside:
+    """Processor and wall-clock seconds of our command and of OpenCV's script; boards it found."""
+
+    ours: tuple[float, float]
+    opencv: tuple[float, float]
+    n_found: str
+
+
+def beside_opencv(paths: list[Path], text: str, repeats: int = 3) -> Iterator[Beside]:
     """Whole command beside OpenCV's finder and calibration, after one run that warms the files."""
     target = parse_target(text)
     kind = "corners"
@@ -207,15 +217,20 @@ def beside_opencv(folder: Path, paths: list[Path], text: str) -> None:
         ours = [sys.executable, "-c", program, "calibrate", "camera", *names]
         ours += ["--target", text, *out]
         processor_seconds(ours)
-        for _ in range(3):
-            used, wall, _ = processor_seconds(ours)
-            other, other_wall, n = processor_seconds(theirs)
-            print(
-                f"{folder.name:24s} {len(paths):3d} images: ours {used:.2f} s processor, "
-                f"{wall:.2f} s wall; OpenCV {other:.2f} and {other_wall:.2f} s, {n.strip()} found; "
-                f"ratio {used / other:.2f}",
-                flush=True,
-            )
+        for _ in range(repeats):
+            *taken, _ = processor_seconds(ours)
+            *other, found = processor_seconds(theirs)
+            yield Beside((taken[0], taken[1]), (other[0], other[1]), found.strip())
+
+
+def tell_beside(folder: Path, paths: list[Path], text: str) -> None:
+    for one in beside_opencv(paths, text):
+        print(
+            f"{folder.name:24s} {len(paths):3d} images: ours {one.ours[0]:.2f} s processor, "
+            f"{one.ours[1]:.2f} s wall; OpenCV {one.opencv[0]:.2f} and {one.opencv[1]:.2f} s, "
+            f"{one.n_found} found; ratio {one.ours[0] / one.opencv[0]:.2f}",
+            flush=True,
+        )
 
 
 def main() -> None:
@@ -228,7 +243,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.command:
         for folder in options.folders:
-            beside_opencv(folder, sorted(folder.glob(options.pattern)), options.target)
+            tell_beside(folder, sorted(folder.glob(options.pattern)), options.target)
         return
     cv2.setNumThreads(1)
     target = parse_target(options.target)

@@ -8,6 +8,7 @@ exposure are consecutive; a piece, which is all that is read at a time, holds wh
 from __future__ import annotations
 
 import io
+from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -74,9 +75,9 @@ class PointSpool:
     _sigmas: BinaryIO = field(init=False)
     _rest: BinaryIO = field(init=False)
     _sources: list[str] = field(default_factory=list)
-    _ends: list[int] = field(default_factory=lambda: [0])
-    _instants: list[int] = field(default_factory=list)
-    _corners: list[FloatArray] = field(default_factory=list)
+    _ends: array[int] = field(default_factory=lambda: array("q", [0]))
+    _instants: array[int] = field(default_factory=lambda: array("q"))
+    _corners: array[float] = field(default_factory=lambda: array("d"))
     _kept: IntArray | None = None
     _normals: BinaryIO | None = None
     _has_noise_length: bool | None = None
@@ -119,7 +120,7 @@ class PointSpool:
     @property
     def corners_mm(self) -> FloatArray:
         """(2, 3) lowest and highest coordinates of the points kept."""
-        found = np.array([self._corners[k] for k in self.kept if self.count(int(k))])
+        found = np.array(self._corners).reshape(-1, 2, 3)[self.kept[self._counts() > 0]]
         return np.stack([found[:, 0].min(axis=0), found[:, 1].max(axis=0)])
 
     def count(self, exposure: int) -> int:
@@ -171,7 +172,8 @@ class PointSpool:
         self._sources.append(cloud.exposure_sources[0])
         self._ends.append(self._ends[-1] + len(cloud))
         self._instants.append(-1 - n if instant is None else instant)
-        self._corners.append(extents(cloud.points_mm if len(cloud) else np.zeros((1, 3))))
+        corners = extents(cloud.points_mm if len(cloud) else np.zeros((1, 3)))
+        self._corners.extend(corners.ravel())
 
     def keep(self, exposures: Sequence[int]) -> None:
         """Leave out all other exposures from now on; rising numbers, as appended."""

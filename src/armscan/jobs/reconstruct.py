@@ -412,8 +412,9 @@ def _scan(
     reader, about = None, ""
     if scanner.sensor is not None:
         cameras = cameras_of(scanner.sensor)
-        seen = ScanInstants(recording, len(cameras))
-        measure, about = scan_as_seen(seen, scanner.sensor, options.measure, cache)
+        measure, about = scan_as_seen(
+            ScanInstants(recording, len(cameras)), scanner.sensor, options.measure, cache
+        )
         options = replace(options, measure=measure)
         if cluster is not None:
             stripes = stripes_for(scanner.sensor, measure.stripes)

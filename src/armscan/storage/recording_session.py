@@ -172,13 +172,15 @@ def exposure_rows(table: CsvTable) -> tuple[tuple[ExposureRow, ...], Columns]:
     camera = table.ints("camera")
     triggers = table.ints("trigger_id", NO_TRIGGER) if "trigger_id" in table else None
     views = table.columns.get("view", ("",) * n)
+    cells = table.columns["lasers"]
+    lasers = {cell: _lasers(cell, table.place(cells.index(cell))) for cell in dict.fromkeys(cells)}
     rows = [
         ExposureRow(
             index=int(index[k]),
             t_ns=int(times[k]),
             camera=int(camera[k]),
             source=_relative(table.columns["file"][k], table.place(k)),
-            lasers=_lasers(table.columns["lasers"][k], table.place(k)),
+            lasers=lasers[cells[k]],
             trigger_id=_trigger(table, triggers, k),
             view=views[k] or None,
         )

@@ -85,7 +85,7 @@ def compare(
             if least[by] < LONG_MS:
                 way()
             start = time.process_time()
-            way()
+            results[by] = way()
             least[by] = min(least[by], 1e3 * (time.process_time() - start))
     rows = [Row(by, least[by] / parts, *tell(results[by])) for by in ways]
     return Comparison(work, tuple(rows), usual)

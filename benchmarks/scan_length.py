@@ -36,7 +36,16 @@ from rigs.scan_fake import line_image, looking_down, scanner
 
 IMAGES, PERIOD_NS = 16, 12_500_000
 STEP_MM, LANE_MM, LANE_APART_MM = 0.5, 150.0, 30.0
-RUN = "import sys; from armscan.cli import main; sys.exit(main())"
+RUN = """
+import sys
+from armscan.cli import main
+code = main()
+with open("/proc/self/status") as status:
+    print(*(line.split()[1] for line in status if line.startswith("VmHWM:")), file=sys.stderr)
+sys.exit(code)
+"""
+"""The command, then the kilobytes that its process held at most: what `os.wait4` tells counts the
+process that started it, too."""
 STRIPES_KEPT = f"""
 from dataclasses import replace
 from pathlib import Path
@@ -109,10 +118,13 @@ def run(folder: Path, sources: Path, before: str = "") -> Run:
         [sys.executable, "-c", before + RUN, *words, "-o", str(cloud), "--no-cache", "--force"],
         env=environment,
         stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
+    told = child.stderr.read() if child.stderr is not None else ""
     _, status, used = os.wait4(child.pid, 0)
     if status:
-        raise SystemExit(f"the command failed with status {status}")
+        raise SystemExit(f"the command failed with status {status}: {told}")
     wall = time.perf_counter() - start
     digest = hashlib.sha256()
     n_points = 0
@@ -123,7 +135,11 @@ def run(folder: Path, sources: Path, before: str = "") -> Run:
             digest.update(piece)
     cloud.unlink()
     return Run(
-        wall, used.ru_utime + used.ru_stime, used.ru_maxrss / MB, n_points, digest.hexdigest()
+        wall_s=wall,
+        processor_s=used.ru_utime + used.ru_stime,
+        peak_mb=int(told.split()[-1]) / MB,
+        n_points=n_points,
+        digest=digest.hexdigest(),
     )
 
 

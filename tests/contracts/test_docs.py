@@ -28,6 +28,33 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
+def anchors(page: Path) -> set[str]:
+    """Of the headings of a page, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    slugs = []
+    for heading in re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE):
+        words = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).strip().lower()
+        slug = re.sub(r"[^\w\- ]", "", words).replace(" ", "-")
+        slugs.append(f"{slug}-{slugs.count(slug)}" if slug in slugs else slug)
+    return set(slugs)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=PAGE_IDS)
+def test_links_to_headings_lead_to_one(page: Path) -> None:
+    lost = []
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", page.read_text()):
+        other = page.parent / target if target else page
+        if "://" not in target and other.suffix == ".md" and anchor not in anchors(other):
+            lost.append(f"{target}#{anchor}")
+    assert lost == []
+
+
+def test_a_heading_that_does_not_exist_is_noticed() -> None:
+    found = anchors(ROOT / "docs" / "reference" / "commands.md")
+    assert "for-all-commands" in found
+    assert "for-no-command" not in found
+
+
 def named_objects(page: Path) -> list[str]:
     return sorted(set(re.findall(r"`(armscan(?:\.\w+)+)`", page.read_text())))
 

@@ -159,6 +159,9 @@ KEPT, NEAR_PX = 0.8, 2.0
 """Share of the colour's own points that have one of the difference's beside them."""
 RIVAL = 1.0 / 3.0
 """Least height of another colour's lines, of that of the strongest, to be the laser's."""
+BESIDE_PX, REACH_PX = 0.5, 6.0
+"""Where a colour's lines lie this far from the light's, most of them to one side, they are its glow
+on that side, or the camera's colours lie beside its light."""
 
 
 def _laser_colours(paths: Sequence[Path], options: ImageOptions) -> Sequence[LaserColour]:
@@ -198,7 +201,7 @@ def _clearest(
     shown = _shown_by(first, judges, stripes)
     clearest = _of_family(first, shown, judges)
     if shown[first].n_long >= LONG * len(judges):
-        return clearest
+        return _where_light_is(first, shown[clearest], judges, stripes) or clearest
     for rival in rivals:
         own = _shown_in(rival, judges, stripes)
         if own.n_long > TOO_MUCH * shown[clearest].n_long and own.n_good > own.n_flagged:
@@ -224,15 +227,22 @@ class _Shown:
         return sum(map(len, self.long_px))
 
 
-def _shown_in(channel: LaserColour, judges: Sequence[Exposure], stripes: StripeOptions) -> _Shown:
+def _shown_in(
+    channel: LaserColour,
+    judges: Sequence[Exposure],
+    stripes: StripeOptions,
+    colour: LaserColour | None = None,
+) -> _Shown:
+    """What a channel shows; of a colour itself, or of a ``colour`` that is given, its lines."""
+    colour = channel if channel in COLOURS else colour
     chosen = replace(stripes, laser_colour=channel)
     profiles = [extract_stripes(exposure, chosen) for exposure in judges]
     n_good = sum(int(profile.is_accepted.sum()) for profile in profiles)
     n_all = sum(len(profile) for profile in profiles)
     lines = [_long_lines(profile) for profile in profiles]
     n_long = sum(map(len, lines))
-    if channel in COLOURS:
-        lines = _coloured(lines, channel, judges)
+    if colour is not None:
+        lines = _coloured(lines, colour, judges)
     n_plain = n_long - sum(map(len, lines))
     return _Shown([line.points_px for line in lines], n_good, n_all - n_good, n_plain)
 
@@ -279,6 +289,33 @@ def _of_family(
         and _n_near(own, other) >= KEPT * own.n_long
     ]
     return max(better, key=lambda channel: shown[channel].n_long, default=colour)
+
+
+def _where_light_is(
+    colour: LaserColour, taken: _Shown, judges: Sequence[Exposure], stripes: StripeOptions
+) -> LaserColour | None:
+    """Grey, if what is taken for a colour's lines lies beside the light itself.
+
+    Webcams and video hold colours more coarsely than light, and some of them a pixel or two beside
+    it; and where a core is white, a difference shows its halo, on the side where that is brighter.
+    """
+    light = _shown_in("grey", judges, stripes, colour)
+    shift = _shift_of(taken, light)
+    # prints and things in the room's light show in grey, too
+    is_same = light.n_long >= KEPT * max(taken.n_long, light.n_long + light.n_plain)
+    return "grey" if is_same and shift > BESIDE_PX else None
+
+
+def _shift_of(own: _Shown, light: _Shown) -> float:
+    """By how many px points of a channel lie beside the light's nearest, most to the same side."""
+    shifts = [np.zeros((0, 2))]
+    for ours, theirs in zip(own.long_px, light.long_px, strict=True):
+        if len(ours) and len(theirs):
+            distance, nearest = cKDTree(theirs).query(ours)
+            is_near = np.asarray(distance) < REACH_PX
+            shifts.append((ours - theirs[nearest])[is_near])
+    every = np.concatenate(shifts)
+    return float(np.abs(np.median(every, axis=0)).max()) if len(every) else 0.0
 
 
 def _n_near(own: _Shown, other: _Shown) -> int:

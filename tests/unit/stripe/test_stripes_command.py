@@ -293,3 +293,25 @@ def test_print_of_the_lasers_colour_takes_no_difference(
     other = ["stripes", str(folder), "--laser-colour", "red-blue", "-o", str(out), "--force"]
     assert main([*other, "--json"]) == 0
     assert np.mean(written(out, capsys)[1] < 0.5) < 0.5
+
+
+def test_light_is_taken_where_colours_lie_beside_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A webcam's colours, coarser than its light and three pixels below it, beside a white core."""
+    folder = tmp_path / "webcam"
+    folder.mkdir()
+    for k in range(3):
+        image = SCENE.expose_red(k, 2.0).image
+        light = cv2.cvtColor(np.asarray(image, np.uint8), cv2.COLOR_RGB2YCrCb)
+        colours = cv2.GaussianBlur(np.roll(light[..., 1:], 3, axis=0), (0, 0), 2.0)
+        light[..., 1:] = colours
+        write_colour(folder / f"{k}.png", cv2.cvtColor(light, cv2.COLOR_YCrCb2RGB))
+    out = tmp_path / "lines.csv"
+    assert main(["stripes", str(folder), "-o", str(out), "--json"]) == 0
+    report, away = written(out, capsys)
+    assert report["laser_colour"] == "grey"
+    assert len(away) > 0.9 * 3 * 320
+    red = ["stripes", str(folder), "--laser-colour", "red", "-o", str(out), "--json", "--force"]
+    assert main(red) == 0
+    assert np.median(written(out, capsys)[1]) > 1.5 > 2.0 * np.median(away)

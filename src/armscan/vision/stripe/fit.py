@@ -196,6 +196,7 @@ CERTAIN_SIGMAS = 2.0
 
 
 NOISE_SAMPLE = 1500
+"""Points that noise and section are told from, give or take a third."""
 NOISE_ROUNDS = 2
 SECTION_ROUNDS = 2
 """More of them where the section is no Gaussian."""
@@ -256,7 +257,7 @@ def fit_ridge(
     guess = noise = start_noise(background_noise)
     bare, black = plane, 0.0
     section = np.zeros(4)
-    pick = np.arange(0, len(table), max(len(table) // NOISE_SAMPLE, 1))
+    pick = np.arange(0, len(table), max(round(len(table) / NOISE_SAMPLE), 1))
     sample = np.zeros((len(pick), FIT_COLUMNS))
     for round_ in range(NOISE_ROUNDS + SECTION_ROUNDS):
         if round_ >= NOISE_ROUNDS and not section.any():

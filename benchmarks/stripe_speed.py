@@ -28,6 +28,11 @@ SIGMA_PX = 3.0
 NEAR_PX = 3.0
 USUAL = "OpenCV + numpy Steger"
 NO_POINTS = np.zeros((0, 2))
+SIZES = (
+    (1, 640, 480), (5, 640, 480), (1, 1280, 1024), (5, 1280, 1024), (11, 1280, 1024),
+    (1, 2658, 800), (5, 2658, 800), (1, 4096, 3000), (11, 4096, 3000),
+)  # fmt: skip
+"""Lines, width and height: how the cost grows."""
 
 
 def horizontal(n: int, width: int, height: int) -> StripeScene:
@@ -146,15 +151,13 @@ def stripes(repeats: int) -> Iterator[Comparison]:
         ("11 lines at 45 degrees, 2658 x 800", slanted(11, 2658, 800)),
     ):
         yield compare_ways(name, scene, repeats)
-    for width, height in ((640, 480), (1280, 1024), (2658, 800), (4096, 3000)):
-        for n in (1, 5, 11):
-            if (n, width) not in ((11, 2658), (11, 640)):
-                yield compare_ways(
-                    f"{n} line{'s' if n > 1 else ''}, {width} x {height}",
-                    horizontal(n, width, height),
-                    repeats,
-                    is_short=True,
-                )
+    for n, width, height in SIZES:
+        yield compare_ways(
+            f"{n} line{'s' if n > 1 else ''}, {width} x {height}",
+            horizontal(n, width, height),
+            repeats,
+            is_short=True,
+        )
 
 
 def compare_ways(

@@ -4,8 +4,7 @@
 Simulated: the first instants of the strokes over the plate, preset thesis, seed 1; the scanner is
 the twin's own, so that nothing is calibrated. Told is one instant, of a head of two cameras a pair.
 Images are in memory; to decode the files is a row of its own. OpenCV and numpy
-(`stripe_speed.opencv_steger`) give points without sigma, flags, names and places. One core, unless
-two are named; processor time counts all threads.
+(`stripe_speed.opencv_steger`) give points without sigma, flags, names and places. One core.
 """
 
 from __future__ import annotations
@@ -49,11 +48,11 @@ class InMemory:
         return self._exposures[row]
 
 
-def chain(source: Any, scanner: ScannerCalibration, method: StripeMethod, cores: int) -> str:
+def chain(source: Any, scanner: ScannerCalibration, method: StripeMethod) -> str:
     """Points of a scan in Base, with normals, and what its stages took."""
     options = ScanOptions(measure=MeasureOptions(stripes=StripeOptions(method=method)))
     clock, before = StageClock(), os.sched_getaffinity(0)
-    os.sched_setaffinity(0, set(sorted(before)[:cores]))
+    os.sched_setaffinity(0, set(sorted(before)[:1]))
     try:
         with tempfile.TemporaryDirectory() as place:
             spool = scan_spool(scanner, Path(place))
@@ -94,9 +93,8 @@ def _beside_steger(
         return ""
 
     ways: dict[str, Callable[[], str]] = {
-        "**armscan**": lambda: chain(kept, scanner, "fit", 1),
-        "**armscan, `fast`**": lambda: chain(kept, scanner, "fast", 1),
-        "armscan, `fast`, two cores": lambda: chain(kept, scanner, "fast", 2),
+        "**armscan**": lambda: chain(kept, scanner, "fit"),
+        "**armscan, `fast`**": lambda: chain(kept, scanner, "fast"),
         f"{USUAL} alone": steger,
         "PNG files decoded": decode,
     }

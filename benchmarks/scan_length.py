@@ -11,7 +11,7 @@ names of their own, 80 a second; the arm carries the line to and fro over lanes 
 aside each, 0.5 mm an exposure, so that new surface comes all the time. Simulated: drawn without
 the renderer. Each length is one run of the command in a process of its own, without cache. Told
 are exposures and points a second by the wall clock, processor time an exposure, the process's peak
-memory, and the beginning of the hash of the cloud's points.
+memory (of 2^20 bytes an MB), and the beginning of the hash of the cloud's points. Needs Linux.
 """
 
 from __future__ import annotations

@@ -184,6 +184,6 @@ def placing(repeats: int) -> Iterator[Comparison]:
         "armscan: named, measured, placed, kept": after_stripes(base_transform)
     }
     yield compare("an exposure of 1,050 stripe points", after, repeats)
-    yield pairs(max(1, repeats // 2))
-    yield surfaces(max(1, repeats // 2))
-    yield from arms(max(1, repeats // 2))
+    yield pairs(repeats)
+    yield surfaces(repeats)
+    yield from arms(repeats)

@@ -4,8 +4,8 @@
     python benchmarks/speed.py [PART ...] [--repeats 5]
 
 Parts: ``stripes``, ``placing``, ``chain``, ``fusion``, ``camera``, ``length``; all of them take a
-quarter of an hour. Told is the least processor time of the repeats, of all threads; the ways to do
-one work take turns, so that a loaded machine slows all alike: trust the ratios. The usual way of
+quarter of an hour, on Linux. Told is the least processor time of the repeats, of all threads; the
+ways to do one work take turns, so that a loaded machine slows all alike: trust the ratios. The usual way of
 each work has the ratio 1. *Gives* and *error* say what the time buys. scikit-image, ridge-detector
 and small_gicp have their rows if they are installed. Everything is drawn or simulated.
 """
@@ -46,7 +46,7 @@ def camera(repeats: int) -> Iterator[Comparison]:
         folder = Path(place) / "camera"
         write_recording(folder, TwinName("thesis-single", "thesis", 1).build().scan("camera"))
         paths = [folder / row.source for row in read_recording(folder).rows]
-        runs = list(beside_opencv(paths, TARGET, max(1, repeats // 2)))
+        runs = list(beside_opencv(paths, TARGET, repeats))
     usual = "OpenCV's finder and `calibrateCamera`"
     rows = (
         Row("**armscan calibrate camera**", 1e3 * min(one.ours[0] for one in runs)),
@@ -67,7 +67,7 @@ def length(repeats: int) -> Iterator[Comparison]:
             1e3 * one.processor_s / n,
             f"{one.n_points:,} points; {one.peak_mb:.0f} MB at most",
         )
-        yield Comparison(f"recording of {n:,} exposures of 320 x 240 px, one", (row,))
+        yield Comparison(f"recording of {n:,} exposures of 320 x 240 px, one, run once", (row,))
 
 
 PARTS: dict[str, Callable[[int], Iterator[Comparison]]] = {

@@ -174,7 +174,7 @@ def compare_ways(
         ways["armscan: ridge points, linked"] = lambda: ridge_points(exposure)
         if find_spec("skimage"):
             ways["scikit-image eigenvalues"] = lambda: skimage_hessian(image)
-        if find_spec("ridge_detector"):
+        if find_spec("ridge_detector") and len(scene.stripes) > 1:
             ways["ridge-detector, linked"] = lambda: ridge_detector(image)
         if len(scene.stripes) == 1:
             ways["centroid of each column"] = lambda: column_centroid(image)

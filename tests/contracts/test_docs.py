@@ -31,12 +31,15 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
 def anchors(page: Path) -> set[str]:
     """Of the headings of a page, as GitHub makes them."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
-    slugs = []
+    slugs: list[str] = []
     for heading in re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE):
         words = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).strip().lower()
         slug = re.sub(r"[^\w\- ]", "", words).replace(" ", "-")
-        slugs.append(f"{slug}-{slugs.count(slug)}" if slug in slugs else slug)
-    return set(slugs)
+        slugs.append(slug)
+    return {
+        slug if (before := slugs[:k].count(slug)) == 0 else f"{slug}-{before}"
+        for k, slug in enumerate(slugs)
+    }
 
 
 @pytest.mark.parametrize("page", PAGES, ids=PAGE_IDS)

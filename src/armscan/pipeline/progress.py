@@ -116,7 +116,7 @@ def peak_memory_mb() -> float | None:
     status = Path("/proc/self/status")
     if status.exists():
         # resource counts what the process held that started this one
-        held = re.search(r"^VmHWM:\s+(\d+) kB", status.read_text("ascii"), re.MULTILINE)
+        held = re.search(rb"^VmHWM:\s+(\d+) kB", status.read_bytes(), re.MULTILINE)
         if held is not None:
             return 1.024e-3 * int(held[1])
     if resource is None:

@@ -295,18 +295,34 @@ def test_print_of_the_lasers_colour_takes_no_difference(
     assert np.mean(written(out, capsys)[1] < 0.5) < 0.5
 
 
-def test_light_is_taken_where_colours_lie_beside_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def write_webcam(folder: Path, white_rows: tuple[int, ...] = ()) -> None:
     """A webcam's colours, coarser than its light and three pixels below it, beside a white core."""
-    folder = tmp_path / "webcam"
     folder.mkdir()
     for k in range(3):
-        image = SCENE.expose_red(k, 2.0).image
-        light = cv2.cvtColor(np.asarray(image, np.uint8), cv2.COLOR_RGB2YCrCb)
+        image = np.asarray(SCENE.expose_red(k, 2.0).image, np.uint8).copy()
+        for row in white_rows:
+            image[row : row + 4] = 200
+        light = cv2.cvtColor(image, cv2.COLOR_RGB2YCrCb)
         colours = cv2.GaussianBlur(np.roll(light[..., 1:], 3, axis=0), (0, 0), 2.0)
         light[..., 1:] = colours
         write_colour(folder / f"{k}.png", cv2.cvtColor(light, cv2.COLOR_YCrCb2RGB))
+
+
+def test_colour_stays_where_light_shows_other_lines(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """White strips in the room's light are no laser, wherever the camera's colours lie."""
+    folder, out = tmp_path / "strips", tmp_path / "lines.csv"
+    write_webcam(folder, white_rows=(20, 220))
+    assert main(["stripes", str(folder), "-o", str(out), "--json"]) == 0
+    assert written(out, capsys)[0]["laser_colour"] != "grey"
+
+
+def test_light_is_taken_where_colours_lie_beside_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "webcam"
+    write_webcam(folder)
     out = tmp_path / "lines.csv"
     assert main(["stripes", str(folder), "-o", str(out), "--json"]) == 0
     report, away = written(out, capsys)

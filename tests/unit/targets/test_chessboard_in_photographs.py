@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
@@ -199,3 +200,19 @@ def test_texture_is_no_chessboard() -> None:
     stripes = 128.0 + 100.0 * np.sign(np.sin(np.arange(800) / 9.0)) * np.ones((600, 1))
     for image in (coarse, stripes, rng.uniform(0.0, 255.0, (600, 800))):
         assert not isinstance(detect_target(exposure(image), Chessboard(3, 3, 1.0)), TargetView)
+
+
+def test_a_board_before_ribs_that_make_larger_lattices_is_found() -> None:
+    """Of ribs, linked by chance to eight trees of more crossings than the board has."""
+    rng = np.random.default_rng(2)
+    y, x = np.mgrid[:600, :800]
+    image = 60.0 * np.sin(0.2 * np.pi * x) * np.sin(0.2 * np.pi * y)
+    image += 120.0 * gaussian_filter(rng.normal(0.0, 1.0, (600, 800)), 2.0) + 128.0
+    row, column = np.mgrid[:6, :9]
+    squares = np.where((row + column) % 2 == 0, 20.0, 230.0)
+    board = np.pad(np.kron(squares, np.ones((24, 24))), 24, constant_values=230.0)
+    image[200 : 200 + board.shape[0], 300 : 300 + board.shape[1]] = board
+    corners = np.mgrid[1:6, 1:9].reshape(2, -1).T[:, ::-1] * 24.0 + np.array([323.5, 223.5])
+    view = found(np.clip(gaussian_filter(image, 0.8), 0.0, 255.0), 2)
+    assert len(view) == 40
+    assert_right(view, corners)

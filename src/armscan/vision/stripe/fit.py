@@ -196,7 +196,7 @@ CERTAIN_SIGMAS = 2.0
 
 
 NOISE_SAMPLE = 1500
-"""Points that noise and section are told from, give or take a third."""
+"""Points that noise and section are told from; three quarters to one and a half times as many."""
 NOISE_ROUNDS = 2
 SECTION_ROUNDS = 2
 """More of them where the section is no Gaussian."""

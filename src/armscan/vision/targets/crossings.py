@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import itemgetter
 
 import cv2
 import numpy as np
@@ -37,7 +38,7 @@ from armscan.geometry.arrays import (
     homogeneous,
 )
 from armscan.models.camera import FISHEYE_FOCALS, NEAR_AXIS, WIDEST_RAD, CameraModel
-from armscan.vision.targets.saddle import Grey32
+from armscan.vision.targets.saddle import Grey32, half_turn, ring_levels
 
 _BLUR_PX = 1.2
 _RING_PX = 4.0
@@ -88,7 +89,7 @@ def _crossings_in(grey: Grey32, min_contrast: float) -> FloatArray:
     """Rows u, v, rising, falling, contrast of the crossings at one scale, strongest first."""
     blurred = np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float32)
     points = _saddles(blurred, min_contrast)
-    ring = _ring_levels(blurred, points)
+    ring = ring_levels(blurred, points, _RING_PX, _N_RING)
     half = ring.shape[1] // 2
     even = 0.5 * (ring[:, :half] + ring[:, half:])
     odd = 0.5 * (ring[:, :half] - ring[:, half:])
@@ -131,17 +132,6 @@ def _saddles(blurred: Grey32, min_contrast: float) -> FloatArray:
     dv = (a * gradient_v - b * gradient_u) / size
     is_near = np.maximum(np.abs(du), np.abs(dv)) < 1.5
     return np.column_stack([u + du, v + dv])[is_near].astype(np.float64)
-
-
-def _ring_levels(blurred: Grey32, points: FloatArray) -> FloatArray:
-    """Levels (N, steps) on a ring around each point."""
-    angle = 2.0 * np.pi * np.arange(_N_RING) / _N_RING
-    at_u = (points[:, :1] + _RING_PX * np.cos(angle)).astype(np.float32)
-    at_v = (points[:, 1:] + _RING_PX * np.sin(angle)).astype(np.float32)
-    if not len(points):
-        return np.zeros((0, _N_RING))
-    levels = cv2.remap(blurred, at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(levels, dtype=np.float64)
 
 
 def _where_it_passes(even: FloatArray, middle: FloatArray, step: IntArray) -> FloatArray:
@@ -193,29 +183,45 @@ _FLAT = 0.01
 
 
 def find_lattices(crossings: Crossings) -> Iterator[Lattice]:
-    """Yield lattices of at least `_MIN_CELLS` crossings, the largest first.
+    """Yield lattices of at least `_MIN_CELLS` crossings, those of most whole squares first.
 
     A smaller one is extended only when it is asked for, as one that holds the board mostly is not.
     """
     seeds, held = _linked(crossings), set[int]()
-    grown: list[Lattice] = []
-    for k, lattice in enumerate(seeds):
+    grown: list[tuple[int, Lattice]] = []
+    for k, (_, lattice) in enumerate(seeds):
         if len(held.intersection(lattice.values())) < 0.5 * len(lattice):
             whole = _extended(crossings, _regular(crossings, lattice))
             held.update(whole.values())
-            grown.append(whole)
-            grown.sort(key=len, reverse=True)
-        left = len(seeds[k + 1]) if k + 1 < len(seeds) else 0
-        while grown and len(grown[0]) >= left:
-            yield grown.pop(0)
+            grown.append((_n_squares(whole), whole))
+            grown.sort(key=itemgetter(0), reverse=True)
+        left = seeds[k + 1][0] if k + 1 < len(seeds) else 0
+        while grown and grown[0][0] >= left:
+            yield grown.pop(0)[1]
 
 
-def _linked(crossings: Crossings) -> list[Lattice]:
-    """The largest lattices of crossings that are each other's neighbours, the largest first."""
+def _n_squares(lattice: Lattice, links: list[list[int]] | None = None) -> int:
+    """How many squares have a crossing at each corner, and the links given along each side.
+
+    Behind a board, ribs and baskets are linked by chance to trees of more crossings than it has,
+    which hardly ever close.
+    """
+    n_squares = 0
+    for (a, b), first in lattice.items():
+        ring = [lattice.get(cell, -1) for cell in ((a + 1, b), (a + 1, b + 1), (a, b + 1))]
+        sides = zip([first, *ring], [*ring, first], strict=True)
+        is_linked = links is None or all(end in links[start] for start, end in sides)
+        n_squares += min(ring) >= 0 and is_linked
+    return n_squares
+
+
+def _linked(crossings: Crossings) -> list[tuple[int, Lattice]]:
+    """How many squares lattices of crossings have that are each other's neighbours, most first."""
     if len(crossings) < _MIN_CELLS:
         return []
     links = _links(crossings)
-    lattices: list[Lattice] = []
+    neighbours: list[list[int]] = links.tolist()
+    lattices: list[tuple[int, Lattice]] = []
     taken: set[int] = set()
     first, way = np.nonzero(links >= 0)
     ones, pairs = np.ones(len(way), np.int64), (first, links[first, way])
@@ -228,8 +234,8 @@ def _linked(crossings: Crossings) -> list[Lattice]:
             lattice = _connected(crossings, links, seed)
             taken.update(lattice.values())
             if len(lattice) >= _MIN_CELLS:
-                lattices.append(lattice)
-    return sorted(lattices, key=len, reverse=True)[:_MAX_LATTICES]
+                lattices.append((_n_squares(lattice, neighbours), lattice))
+    return sorted(lattices, key=itemgetter(0), reverse=True)[:_MAX_LATTICES]
 
 
 def cell_arrays(lattice: Lattice) -> tuple[IntArray, IntArray]:
@@ -318,8 +324,8 @@ def _links(crossings: Crossings) -> IntArray:
     near, distance = near[:, 1:], distance[:, 1:]
     way = np.arctan2(*np.moveaxis(points[near] - points[:, None, :], -1, 0)[::-1])
     rising, falling = crossings.rising_rad, crossings.falling_rad
-    swapped = np.abs(_half_turn(rising[near] - falling[:, None])) < _SAME_EDGE_RAD
-    swapped &= np.abs(_half_turn(falling[near] - rising[:, None])) < _SAME_EDGE_RAD
+    swapped = np.abs(half_turn(rising[near] - falling[:, None])) < _SAME_EDGE_RAD
+    swapped &= np.abs(half_turn(falling[near] - rising[:, None])) < _SAME_EDGE_RAD
     contrast = crossings.contrast
     ratio = np.abs(np.log(contrast[near] / contrast[:, None]))
     swapped &= ratio < np.log(_MAX_CONTRAST_RATIO)
@@ -346,11 +352,6 @@ def _mutual(links: IntArray) -> IntArray:
     back = links[np.maximum(links, 0)]
     shared = (back == np.arange(len(links))[:, None, None]).any(axis=2)
     return np.where((links >= 0) & shared, links, -1)
-
-
-def _half_turn(angle_rad: FloatArray) -> FloatArray:
-    """Angles modulo half a turn, within a quarter turn of 0."""
-    return np.asarray(np.mod(angle_rad + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
 
 
 def _connected(crossings: Crossings, links: IntArray, seed: int) -> Lattice:
@@ -483,8 +484,8 @@ def _is_alike(
     like_falling = np.where(parity == 0, falling[beside], rising[beside])
     contrast = np.abs(np.log(crossings.contrast[found] / crossings.contrast[beside]))
     return np.asarray(
-        (np.abs(_half_turn(rising[found] - like_rising)) < _SAME_EDGE_RAD)
-        & (np.abs(_half_turn(falling[found] - like_falling)) < _SAME_EDGE_RAD)
+        (np.abs(half_turn(rising[found] - like_rising)) < _SAME_EDGE_RAD)
+        & (np.abs(half_turn(falling[found] - like_falling)) < _SAME_EDGE_RAD)
         & (contrast < np.log(_MAX_CONTRAST_RATIO))
     )
 
@@ -496,8 +497,6 @@ _TRUSTED = 0.1
 """Least weight with which a point helps to fix the homography."""
 _POINTS_PER_TERM = 3.0
 """Fewest points per term of the polynomial; fewer let it follow a single corner."""
-
-
 _MUCH_BETTER = 0.5
 """Of what a board misses a homography by: below it, it is seen through a fisheye."""
 _ARC_CELLS = 0.25

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
@@ -78,6 +79,22 @@ def sample(grey: RawGrey | Grey32, points_px: FloatArray) -> FloatArray:
     levels = np.full(len(points_px), np.nan)
     levels[is_inside] = grey[v[is_inside].astype(np.int64), u[is_inside].astype(np.int64)]
     return levels
+
+
+def ring_levels(blurred: Grey32, points_px: FloatArray, radius_px: float, count: int) -> FloatArray:
+    """Levels (N, count) on a ring around each point."""
+    angle = 2.0 * np.pi * np.arange(count) / count
+    at_u = (points_px[:, :1] + radius_px * np.cos(angle)).astype(np.float32)
+    at_v = (points_px[:, 1:] + radius_px * np.sin(angle)).astype(np.float32)
+    if not len(points_px):
+        return np.zeros((0, count))
+    levels = cv2.remap(blurred, at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(levels, dtype=np.float64)
+
+
+def half_turn(angle_rad: FloatArray) -> FloatArray:
+    """Angles modulo half a turn, within a quarter turn of 0."""
+    return np.asarray(np.mod(angle_rad + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
 
 
 WINDOW_FRACTION = 0.42

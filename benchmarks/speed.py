@@ -5,9 +5,10 @@
 
 Parts: ``stripes``, ``placing``, ``chain``, ``fusion``, ``camera``, ``length``; all of them take a
 quarter of an hour, on Linux. Told is the least processor time of the repeats, of all threads; the
-ways to do one work take turns, so that a loaded machine slows all alike: trust the ratios. The usual way of
-each work has the ratio 1. *Gives* and *error* say what the time buys. scikit-image, ridge-detector
-and small_gicp have their rows if they are installed. Everything is drawn or simulated.
+ways to do one work take turns, so that a loaded machine slows all alike: trust the ratios. The
+usual way of each work has the ratio 1. *Gives* and *error* say what the time buys. scikit-image,
+ridge-detector and small_gicp have their rows if they are installed. Everything is drawn or
+simulated.
 """
 
 from __future__ import annotations

@@ -44,7 +44,10 @@ class Comparison:
         times = {row.by: row.ms for row in self.rows}
         lines = []
         for k, row in enumerate(self.rows):
-            faster = f"{times[self.usual] / row.ms:.2g}" if self.usual is not None else ""
+            faster = ""
+            if self.usual is not None:
+                ratio = times[self.usual] / row.ms
+                faster = f"{ratio:.2g}" if ratio < 100.0 else f"{ratio:,.0f}"
             ms = f"{row.ms:.3g}" if row.ms < 1000.0 else f"{row.ms:,.0f}"
             cells = ("" if k else self.work, row.by, row.gives, row.error, ms, faster)
             lines.append(f"| {' | '.join(cells)} |")

@@ -118,7 +118,8 @@ def square_root(covariance: FloatArray, name: str = "the covariance") -> FloatAr
     if len(values) and float(values[0]) < -1e-6 * max(largest, 1.0):
         raise InputError(f"{name} is not positive semi-definite")
     kept = values > 1e-15 * largest
-    return np.asarray(unit[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+    # not by ``unit``: of parameters that are held, rounding of the vectors would stay
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
 
 
 class Whitening:

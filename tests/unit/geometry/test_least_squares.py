@@ -12,6 +12,7 @@ import scipy.optimize
 from scipy.stats import norm
 
 from armscan.errors import InputError
+from armscan.geometry import least_squares
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.least_squares import (
     HUBER_LIMIT,
@@ -151,6 +152,22 @@ def test_square_root_of_a_covariance_without_full_rank() -> None:
     assert square_root(np.zeros((2, 2))).shape == (2, 0)
     with pytest.raises(InputError, match="semi-definite"):
         square_root(np.diag([1.0, -1.0]))
+
+
+def test_square_root_of_what_is_held_is_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever eigenvectors leave there: its inverse square was taken for a weight."""
+
+    def rounded(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+        values, vectors = np.linalg.eigh(matrix)
+        return values, vectors + 1e-17
+
+    monkeypatch.setattr(least_squares, "eigen", rounded)
+    covariance = np.zeros((5, 5))
+    free = np.ix_([0, 2, 4], [0, 2, 4])
+    covariance[free] = [[4.0, 1.0, 0.5], [1.0, 2.0, 0.3], [0.5, 0.3, 1.0]]
+    root = square_root(covariance)
+    assert (root[[1, 3]] == 0.0).all()
+    np.testing.assert_allclose(root @ root.T, covariance, atol=1e-14)
 
 
 def test_robust_constants_are_those_of_the_normal_distribution() -> None:

@@ -136,7 +136,7 @@ class LightSheet(ArrayRecord):
         root = np.sqrt(1.0 + (spread * u0) ** 2)
         for k, (shape, slope) in {
             BOW_TERMS.index((2, 0)): (2.0 * u0**2 / (1.0 + root), 2.0 * u0 / root),
-            BOW_TERMS.index((3, 0)): (u0**3, 3.0 * u0**2),
+            BOW_TERMS.index((3, 0)): (u0 * u0 * u0, 3.0 * u0**2),
         }.items():
             terms[:, k] = w * shape
             by_u[:, k] = slope

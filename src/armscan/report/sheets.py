@@ -390,7 +390,15 @@ def _residuals_along(fit: LaserFit, index: int) -> Picture:
     )
     with styled():
         figure = new_figure(PAGE_WIDTH, 1.9 * rows + 0.5)
-        grid: Any = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        # what lies where is known: to work it out takes as long as all else of such a picture
+        figure.set_layout_engine("none")
+        grid: Any = figure.subplots(
+            *(rows, columns),
+            sharex=True,
+            sharey=True,
+            squeeze=False,
+            gridspec_kw=_margins(PAGE_WIDTH, 1.9 * rows + 0.5),
+        )
         for axes, image in zip(grid.flat, images[:n], strict=False):
             chosen = _used(image, index)
             along = (image.points_mm[chosen] - sheet.origin_mm) @ sheet.axes[0]
@@ -412,6 +420,18 @@ def _residuals_along(fit: LaserFit, index: int) -> Picture:
         "A line that leans means that the board's pose is off, within its uncertainty; the same "
         "bend on every board means that the sheet itself is bent." + more,
     )
+
+
+def _margins(width: float, height: float) -> dict[str, float]:
+    """Room, of inches, for the names of axes and panels."""
+    return {
+        "left": 0.95 / width,
+        "right": 1.0 - 0.1 / width,
+        "bottom": 0.65 / height,
+        "top": 1.0 - 0.25 / height,
+        "wspace": 0.06,
+        "hspace": 0.25,
+    }
 
 
 def _residual_panel(axes: Any, along: FloatArray, residual: FloatArray) -> None:

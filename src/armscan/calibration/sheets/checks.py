@@ -120,7 +120,7 @@ class _Case:
         """
         found = np.full(len(self.observations), np.nan)
         for of in self.observations.each_stripe():
-            if rows is not None and not (of & rows).any():
+            if rows is not None and not rows[of].any():
                 continue
             image, k = self._stripe(of)
             q = image.data.profile.points_px[self.observations.row[of]]
@@ -150,10 +150,9 @@ class _Case:
             found[of] = -(ray @ normal) / np.einsum("ni,ni->n", gradient, ray) * per_px
         return found
 
-    def _stripe(self, of: BoolArray) -> tuple[BoardImage, int]:
-        first = int(np.argmax(of))
-        image = self.images[int(self.observations.image[first])]
-        return image, int(self.observations.sheet[first])
+    def _stripe(self, of: IntArray) -> tuple[BoardImage, int]:
+        image = self.images[int(self.observations.image[of[0]])]
+        return image, int(self.observations.sheet[of[0]])
 
     def without(self, board: int) -> tuple[list[LightSheet], _Claim] | None:
         """Sheets of all boards but one, by one step from those of all; None if not determined."""
@@ -189,11 +188,12 @@ class _Claim:
         solution, mm_per_px = self._case.solution, self._case.mm_per_px
         # The mean: points count with the noise of the weights.
         share = np.where(rows, mm_per_px / n, 0.0)
-        pull = solution.system.transposed(share)[None]
+        pull = np.zeros((1, solution.system.n_columns))
         noise = np.array([(share**2 / solution.weight).sum()])
         variance = np.zeros(len(rows))
         for stripe in solution.system.stripes:
             if rows[stripe.rows].any():
+                pull[0, stripe.columns] += share[stripe.rows] @ stripe.design
                 design = np.zeros((len(stripe.rows), solution.system.n_columns))
                 design[:, stripe.columns] = stripe.design
                 noise_px2 = self._case.noise_px[stripe.rows] ** 2

@@ -109,7 +109,7 @@ def scatter_by_stripe(observations: SheetObservations, residual_px: FloatArray) 
     1986, eqs. 7 to 9). Medians of points that are alike err more; such stripes keep their own. A
     stripe with no more points than its course has terms tells nothing, and takes the mean of all.
     """
-    stripes = list(observations.each_stripe())
+    stripes = observations.each_stripe()
     rest = [_off_course(observations.select(of), residual_px[of]) for of in stripes]
     own = np.array([robust_sigma(left) for left in rest])
     free = np.array([len(left) - N_SHAPE for left in rest])
@@ -236,7 +236,7 @@ def board_scatter(
     by_camera = np.einsum("ni,nij->nj", by_point, observations.dpoint_dcamera)
     moved = solution.common[len(solution.common) - errors.n_camera :]
     residual = residual + by_camera @ (errors.camera_root @ moved)
-    stripes = [of for of in observations.each_stripe() if of.sum() >= LEAST_POINTS]
+    stripes = [of for of in observations.each_stripe() if len(of) >= LEAST_POINTS]
     n, n_boards = BOARD_SHAPES * len(stripes), len(errors.pose_roots)
     lost = np.sqrt(n / max(n - solution.n_parameters, 1.0))
     of_shapes = np.zeros((n_boards, len(FORMS_PX), len(FACTORS)))

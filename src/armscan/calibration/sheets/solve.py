@@ -15,7 +15,7 @@ sheet of moved cameras makes wrong points with the unmoved ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -29,7 +29,7 @@ from armscan.geometry.least_squares import eigen, huber_weights, robust_sigma, s
 from armscan.models.light_sheet import LightSheet
 
 ITERATIONS = 12
-STEP_TOLERANCE_MM = 1e-9
+STEP_TOLERANCE_MM = 1e-7
 CONVERGED_SIGMA = 0.01
 """A last step below this part of every parameter's own sigma does not matter any more."""
 MAX_TILT_STEP = 1.0
@@ -80,10 +80,11 @@ class SheetObservations(RowRecord):
         """Return the same points as points of sheet 0, for a fit of one sheet alone."""
         return replace(self, sheet=np.zeros(len(self), dtype=np.int64))
 
-    def each_stripe(self) -> Iterator[BoolArray]:
-        """(N,) the points of each stripe."""
-        for stripe in np.unique(self.stripe):
-            yield self.stripe == stripe
+    def each_stripe(self) -> list[IntArray]:
+        """Rows (K,) of the points of each stripe, by its number."""
+        order = np.argsort(self.stripe, kind="stable")
+        starts = np.flatnonzero(np.diff(self.stripe[order]))
+        return np.split(order, starts + 1) if len(order) else []
 
     def residuals_px(
         self, sheets: Sequence[LightSheet]
@@ -305,7 +306,7 @@ def solve_sheets(
         if is_robust:
             scale = max(1.0, robust_sigma(remaining / sigma))
             robust = huber_weights(remaining / sigma, HUBER_SIGMA * scale)
-        elif float(np.abs(full).max()) < STEP_TOLERANCE_MM:
+        if float(np.abs(full).max()) < STEP_TOLERANCE_MM:
             break
     common = normal.step[n_active:]
     system = _linearised(observations, sheets, errors, active, precision)
@@ -361,10 +362,8 @@ def _linearised(
     n_active, n_boards = int(active.sum()), len(errors.pose_roots)
     n_columns = n_active + 6 * n_boards + errors.n_camera
     column = np.cumsum(active) - 1
-    order = np.argsort(observations.stripe, kind="stable")
-    starts = np.flatnonzero(np.diff(observations.stripe[order], prepend=-1))
     stripes = []
-    for rows in np.split(order, starts[1:]):
+    for rows in observations.each_stripe():
         sheet, board = int(observations.sheet[rows[0]]), int(observations.board[rows[0]])
         free = np.flatnonzero(active[N_SHEET * sheet : N_SHEET * (sheet + 1)])
         columns = np.concatenate(
@@ -448,13 +447,6 @@ class StripeSystem:
         for stripe in self.stripes:
             change[stripe.rows] = stripe.design @ unknowns[stripe.columns]
         return change
-
-    def transposed(self, values: FloatArray) -> FloatArray:
-        """(n_columns,) the design's transpose times values (N,)."""
-        result = np.zeros(self.n_columns)
-        for stripe in self.stripes:
-            result[stripe.columns] += values[stripe.rows] @ stripe.design
-        return result
 
     def solve(
         self,

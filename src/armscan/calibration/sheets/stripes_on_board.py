@@ -503,12 +503,13 @@ def _best_line(
     first, step, length = first[usable], step[usable], length[usable]
     direction = step / length[:, None]
     scored = points[:: max(1, n // MAX_SCORED)]
-    offset = scored[None, :, :] - points[first][:, None, :]
-    distance = np.abs(
-        direction[:, None, 0] * offset[:, :, 1] - direction[:, None, 1] * offset[:, :, 0]
-    )
+    across = np.stack([-direction[:, 1], direction[:, 0]], axis=1) / tolerance_mm
+    distance = across @ scored.T
+    distance -= (across * points[first]).sum(axis=1)[:, None]
     # Truncated squares rather than counts: of two lines in one band the centred one wins.
-    score = np.maximum(1.0 - (distance / tolerance_mm) ** 2, 0.0).sum(axis=1)
+    np.square(distance, out=distance)
+    np.minimum(distance, 1.0, out=distance)
+    score = -distance.sum(axis=1)
     best = int(np.argmax(score))
     line = Line(points[first[best]], direction[best])
     for _ in range(3):

@@ -199,7 +199,8 @@ class LineLaser:
         """Elevation of the sheet's centre over the fan plane."""
         if self.cubic_rad == 0.0:
             return self.skew_rad
-        return np.asarray(self.skew_rad + self.cubic_rad * fan_angle_rad**3)
+        cube = fan_angle_rad * fan_angle_rad * fan_angle_rad
+        return np.asarray(self.skew_rad + self.cubic_rad * cube)
 
     def _local(self, points_mm: FloatArray) -> tuple[FloatArray, ...]:
         """Coordinates along forward, across and normal, and the distance from the source."""

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, uniform_filter
+from scipy.ndimage import maximum_filter
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
@@ -157,7 +157,7 @@ def shift_between(lit: FloatImage, dark: FloatImage) -> FloatArray | None:
         for image in (lit, dark)
     )
     every = max(1, math.isqrt(dark.size // EDGE_SAMPLE))
-    v, u = _steepest(np.hypot(cv2.Scharr(dark, -1, 1, 0), cv2.Scharr(dark, -1, 0, 1)), every)
+    v, u = _steepest(dark, every)
     if not len(u):
         return None
     level, shift, unmoved = lit[v, u].astype(np.float64), np.zeros(2), np.inf
@@ -199,10 +199,12 @@ def _moved(image: ImageArray | FloatImage, shift: FloatArray) -> FloatImage:
     return np.asarray(moved, np.float32)
 
 
-def _steepest(slope: FloatImage, every: int) -> tuple[IntArray, IntArray]:
+def _steepest(image: FloatImage, every: int) -> tuple[IntArray, IntArray]:
     """Rows and columns of the steepest of ``every`` so many pixels, none of them at the border."""
     border = MOVE_REACH_PX + 1
-    sample = slope[border:-border:every, border:-border:every]
+    inside = slice(border, -border, every)
+    slopes = (cv2.Scharr(image, -1, *along)[inside, inside] for along in ((1, 0), (0, 1)))
+    sample = np.hypot(*slopes)
     count = min(int(EDGE_SHARE * sample.size), MOST_EDGES)
     if count < LEAST_EDGES:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -316,6 +318,8 @@ PEAK_QUANTILE = 0.999
 LOST_SIGMAS = 3.0
 GROUND_PX = 5
 """Within such squares noise of the view without laser is told from the print."""
+TELLING_PX = 2
+"""Of every second pixel of every second row, quantiles of an image are told."""
 WHITE_QUANTILE = 0.95
 FLATTEST = 0.1
 FLATTEST_VARIANCE = 0.65
@@ -328,8 +332,13 @@ DARKEST = 0.02
 
 def local_moments(image: FloatImage) -> tuple[FloatImage, FloatImage]:
     """Mean and variance (H, W) of an image in the square of `GROUND_PX` around each pixel."""
-    mean = uniform_filter(image, GROUND_PX)
-    return mean, np.maximum(uniform_filter(image * image, GROUND_PX) - mean * mean, 1e-3)
+    mean, square = (
+        np.asarray(
+            cv2.blur(power, (GROUND_PX, GROUND_PX), borderType=cv2.BORDER_REFLECT), np.float32
+        )
+        for power in (image, image * image)
+    )
+    return mean, np.maximum(square - mean * mean, np.float32(1e-3))
 
 
 def less_noise(
@@ -358,11 +367,12 @@ def relative_reflectance(background: Exposure, colour: str) -> FloatImage:
         levels = [_level(background, None, k) for k in own]
         dark = np.asarray(sum(levels) / np.float32(len(levels)), dtype=np.float32)
     mean, variance = local_moments(dark)
-    white = float(np.quantile(mean, WHITE_QUANTILE))
+    means, variances = (moment[::TELLING_PX, ::TELLING_PX] for moment in (mean, variance))
+    white = float(np.quantile(means, WHITE_QUANTILE))
     if not white > 0.0:
         return EVEN
-    is_light = mean > 0.5 * white
-    flattest = np.quantile(variance[is_light] / np.maximum(mean[is_light], 1e-3), FLATTEST)
+    is_light = means > 0.5 * white
+    flattest = np.quantile(variances[is_light] / np.maximum(means[is_light], 1e-3), FLATTEST)
     per_level = float(flattest) / FLATTEST_VARIANCE
     if white < LEAST_WHITE_SIGMAS**2 * per_level:
         return EVEN
@@ -402,7 +412,7 @@ class StripePlane:
         """
         if self.reflectance.size == 1:
             return image
-        peak = max(float(np.quantile(image, PEAK_QUANTILE)), noise)
+        peak = max(float(np.quantile(image[::TELLING_PX, ::TELLING_PX], PEAK_QUANTILE)), noise)
         least = np.float32((LOST_SIGMAS * noise / peak) ** 2)
         return np.asarray(image * self.reflectance / (self.reflectance**2 + least))
 

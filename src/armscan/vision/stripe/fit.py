@@ -197,6 +197,8 @@ CERTAIN_SIGMAS = 2.0
 
 NOISE_SAMPLE = 1500
 """Points that noise and section are told from; three quarters to one and a half times as many."""
+FIRST_SAMPLE = 500
+"""As many of them, at least, for all rounds but the last."""
 NOISE_ROUNDS = 2
 SECTION_ROUNDS = 2
 """More of them where the section is no Gaussian."""
@@ -247,7 +249,7 @@ def fit_ridge(
     """Fit the line's section with weights from the noise model at every ridge point.
 
     The noise model and the section's departure from a Gaussian are estimated from a sample of the
-    points first. Chains shorter than
+    points first, in rounds of which only the last looks at all of it. Chains shorter than
     `SHORTEST_PX` are fitted, but do not count as lines beside others.
     """
     table = ridge.table
@@ -257,11 +259,15 @@ def fit_ridge(
     guess = noise = start_noise(background_noise)
     bare, black = plane, 0.0
     section = np.zeros(4)
-    pick = np.arange(0, len(table), max(round(len(table) / NOISE_SAMPLE), 1))
-    sample = np.zeros((len(pick), FIT_COLUMNS))
-    for round_ in range(NOISE_ROUNDS + SECTION_ROUNDS):
-        if round_ >= NOISE_ROUNDS and not section.any():
-            break
+    few, many = _samples(len(table))
+    values = np.zeros((len(table), FIT_COLUMNS))
+    last = NOISE_ROUNDS + SECTION_ROUNDS - 1
+    for round_ in range(last + 1):
+        pick = few if round_ < last else many
+        is_gaussian = round_ >= NOISE_ROUNDS and not section.any()
+        if is_gaussian and (round_ < last or len(few) == len(many)):
+            continue
+        sample = values[pick]
         fit_profiles(
             plane.image,
             plane.clipped,
@@ -274,6 +280,7 @@ def fit_ridge(
             reach[pick],
             sample,
         )
+        values[pick] = sample
         good = sample[:, VARIANCE] > 0.0
         if good.sum() < LEAST_PER_BIN:
             continue
@@ -290,8 +297,6 @@ def fit_ridge(
             black += estimate_black(fitted.said(noise, section))
             plane = bare.with_black(black)
             sides, side_sigma = _sides(plane, table, start)
-    values = np.zeros((len(table), FIT_COLUMNS))
-    values[pick] = sample
     ground = plane.reflectance
     fit_profiles(
         plane.image, plane.clipped, ground, table, sigma, sides, noise, section, reach, values
@@ -313,6 +318,13 @@ def fit_ridge(
         is_noise_assumed=noise is guess,
         ground=_ground(plane, ridge.table, values),
     )
+
+
+def _samples(n: int) -> tuple[IntArray, IntArray]:
+    """Rows of the few of n points for the first rounds, in stretches, and of all for the last."""
+    many = np.arange(0, n, max(round(n / NOISE_SAMPLE), 1))
+    every = max(len(many) // FIRST_SAMPLE, 1)
+    return many[np.arange(len(many)) // BLOCK % every == 0], many
 
 
 NARROW, HALF_AS_WIDE, WIDE = 0.7, 0.5, 1.4

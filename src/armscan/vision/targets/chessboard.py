@@ -161,10 +161,13 @@ def _sides(
 
 
 def _with_one_row_around(cells: IntArray, points: FloatArray, size: IntArray) -> FloatArray:
-    """Image points (b + 2, a + 2, 2) of the rectangle and of one row around it."""
-    b, a = np.mgrid[-1 : size[1] + 1, -1 : size[0] + 1]
-    every = np.stack([a.ravel(), b.ravel()], axis=-1)
-    grid = predict_cells(cells, points, every).reshape(*a.shape, 2)
+    """Image points (b + 2, a + 2, 2) of the rectangle and of one row around it, near its sides."""
+    grid = np.full((size[1] + 2, size[0] + 2, 2), np.nan)
+    is_wanted = np.ones(grid.shape[:2], dtype=np.bool_)
+    is_wanted[3:-3, 3:-3] = False
+    is_wanted[cells[:, 1] + 1, cells[:, 0] + 1] = False
+    b, a = np.nonzero(is_wanted)
+    grid[b, a] = predict_cells(cells, points, np.stack([a - 1, b - 1], axis=-1))
     grid[cells[:, 1] + 1, cells[:, 0] + 1] = points
     return grid
 

@@ -37,6 +37,9 @@ SWAPPED_RATIO = 3.0
 """The pair is swapped if the partner's brightest `THIN_SHARE` of the pixels stands this many times
 further above the image than the image's above the partner."""
 ENOUGH_PX = 500_000
+LARGEST_STEP_PX = 3
+"""Of a larger image every second or third pixel of as many rows tells enough; at more a line that
+lies along rows could fall between them."""
 CLIPPED_SHARE = 0.99
 SAME_VIEW = 0.3
 MISORDERED = 0.6
@@ -237,10 +240,10 @@ def _check_scene(exposure: Exposure, partner: Exposure) -> None:
 def _check_laser_side(exposure: Exposure, partner: Exposure) -> None:
     """Raise `InputError` if thin bright parts are in the image that should be without laser.
 
-    The brightness of the two is matched first: the partner may be exposed longer. Of a large image
-    every second or third pixel of as many rows tells enough.
+    The brightness of the two is matched first: the partner may be exposed longer.
     """
-    step = max(1, math.isqrt(exposure.image.size // ENOUGH_PX))
+    n_pixels = exposure.width_px * exposure.height_px
+    step = min(max(1, math.isqrt(n_pixels // ENOUGH_PX)), LARGEST_STEP_PX)
     lit, dark = (
         one.image[::step, ::step].astype(np.float32).ravel() for one in (exposure, partner)
     )

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import matplotlib as mpl
@@ -97,10 +97,17 @@ class Labels:
     size: float = 14.0
 
 
-def new_figure(width: float = 6.0, height: float = 4.0) -> Figure:
-    """Return an empty figure in the house's style; sizes in inches."""
+def new_figure(
+    width: float = 6.0,
+    height: float = 4.0,
+    layout: Literal["constrained", "none"] = "constrained",
+) -> Figure:
+    """Return an empty figure in the house's style; sizes in inches.
+
+    To lay out many panels takes as long as all else: ``none`` where it is known what lies where.
+    """
     with mpl.rc_context(STYLE):
-        return Figure(figsize=(width, height), layout="constrained")
+        return Figure(figsize=(width, height), layout=layout)
 
 
 def styled() -> Any:

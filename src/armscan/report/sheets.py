@@ -389,15 +389,11 @@ def _residuals_along(fit: LaserFit, index: int) -> Picture:
         int((np.abs(image.residual_mm[_used(image, index)]) > reach).sum()) for image in images[:n]
     )
     with styled():
-        figure = new_figure(PAGE_WIDTH, 1.9 * rows + 0.5)
-        # what lies where is known: to work it out takes as long as all else of such a picture
-        figure.set_layout_engine("none")
+        height = 1.9 * rows + 0.5
+        figure = new_figure(PAGE_WIDTH, height, layout="none")
+        margins = _margins(PAGE_WIDTH, height)
         grid: Any = figure.subplots(
-            *(rows, columns),
-            sharex=True,
-            sharey=True,
-            squeeze=False,
-            gridspec_kw=_margins(PAGE_WIDTH, 1.9 * rows + 0.5),
+            rows, columns, sharex=True, sharey=True, squeeze=False, gridspec_kw=margins
         )
         for axes, image in zip(grid.flat, images[:n], strict=False):
             chosen = _used(image, index)
@@ -423,7 +419,7 @@ def _residuals_along(fit: LaserFit, index: int) -> Picture:
 
 
 def _margins(width: float, height: float) -> dict[str, float]:
-    """Room, of inches, for the names of axes and panels."""
+    """Room for the names of axes and panels, in parts of a figure of such inches."""
     return {
         "left": 0.95 / width,
         "right": 1.0 - 0.1 / width,

@@ -176,3 +176,35 @@ def test_too_few_steps_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     hasty = solve_sheets(points, [start], EXACT, [False])
     assert isinstance(hasty, SheetSolution)
     assert not hasty.has_converged
+
+
+def test_a_robust_fit_does_not_stay_where_least_squares_end() -> None:
+    """The first step from there is none, and only then are points weighed."""
+    rng = np.random.default_rng(5)
+    points = replace(observations(rng), sigma_px=np.full(N_IMAGES * N_STRIPE, 1e-4))
+    off = rng.random(len(points)) < 0.1
+    moved = replace(points, points_mm=points.points_mm + 2e-3 * off[:, None] * FLAT.axes[2])
+    exact = CommonErrors([np.zeros((6, 6))] * N_IMAGES, np.zeros((9, 9)))
+    plain = solve_sheets(moved, [FLAT], exact, [False])
+    assert isinstance(plain, SheetSolution)
+    robust = [
+        solve_sheets(moved, [start], exact, [False], is_robust=True)
+        for start in (FLAT, plain.sheets[0])
+    ]
+    assert all(isinstance(one, SheetSolution) for one in robust)
+    from_flat, from_plain, least_squares = (
+        one.sheets[0].height_with_jacobian(points.points_mm)[0]
+        for one in (*robust, plain)
+        if isinstance(one, SheetSolution)
+    )
+    assert np.abs(least_squares - from_flat).max() > 1e-4, "the case must have something to find"
+    np.testing.assert_allclose(from_plain, from_flat, atol=1e-6)
+
+
+def test_stripes_are_told_by_their_numbers_in_any_order() -> None:
+    points = observations(np.random.default_rng(1))
+    numbers = np.array([7, 2, 4, 7, 2, 2, 9])
+    few = replace(points.select(np.arange(7)), stripe=numbers)
+    assert [rows.tolist() for rows in few.each_stripe()] == [[1, 4, 5], [2], [0, 3], [6]]
+    assert [len(rows) for rows in few.select(np.arange(1)).each_stripe()] == [1]
+    assert few.select(np.arange(0)).each_stripe() == []

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.pipeline.instants import check_sizes, pair_exposures
+from armscan.pipeline.instants import _reduced, check_sizes, pair_exposures
 from armscan.records.exposure import Exposure, SensorWindow
 from rigs.plain_scanner import plain_camera
 
@@ -95,6 +95,28 @@ def test_a_swapped_pair_is_noticed_also_when_it_is_the_only_one() -> None:
     assert pair_exposures([lit], [dark]) == [(lit, dark)]
     with pytest.raises(InputError, match=r"dark\.png.*wrong image.*swap"):
         pair_exposures([dark], [lit])
+
+
+def test_a_swapped_pair_is_noticed_in_a_large_photograph_of_a_line_along_its_rows() -> None:
+    picture = np.full((3000, 4000, 3), 30, np.uint8)
+    picture[:, :, 0] += np.random.default_rng(1).integers(0, 4, picture.shape[:2], np.uint8)
+    line = picture.copy()
+    line[1497:1504] = 200
+    lit, dark = Exposure(line, "lit.png"), Exposure(picture, "dark.png")
+    assert pair_exposures([lit], [dark]) == [(lit, dark)]
+    with pytest.raises(InputError, match=r"dark\.png.*wrong image.*swap"):
+        pair_exposures([dark], [lit])
+
+
+@pytest.mark.parametrize("shape", [(30, 40), (7, 9), (487, 655), (487, 655, 3)])
+def test_scenes_are_compared_by_means_of_square_blocks(shape: tuple[int, ...]) -> None:
+    levels = np.random.default_rng(1).integers(0, 4096, shape).astype(np.uint16)
+    grey = levels.mean(axis=2) if levels.ndim == 3 else levels.astype(np.float64)
+    step = max(1, min(shape[:2]) // 120)
+    rows, columns = shape[0] // step, shape[1] // step
+    blocks = grey[: rows * step, : columns * step].reshape(rows, step, columns, step)
+    found = _reduced(Exposure(levels, "levels.png", bits_used=12))
+    np.testing.assert_allclose(found, blocks.mean(axis=(1, 3)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("gain", [0.5, 2.0, 4.0])

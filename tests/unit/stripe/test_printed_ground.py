@@ -5,13 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 
 from armscan.calibration.sheets.stripes_on_board import TargetEdges, runs_along_edge
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import StripeOptions, relative_reflectance
+from armscan.vision.stripe.image import (
+    GROUND_PX,
+    StripeOptions,
+    local_moments,
+    relative_reflectance,
+)
 
 SQUARE_PX = 34.0
 INK = 0.08
@@ -107,6 +112,17 @@ def test_reflectance_is_that_of_the_ink_and_less_noisy_than_the_photograph() -> 
     assert ratio == pytest.approx(INK, rel=0.05)
     edge = (truth > 0.3) & (truth < 0.7)
     assert np.abs(ground - level)[edge].mean() < 0.06, "edges are not smoothed away"
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 40), (60, 80)])
+def test_local_moments_are_those_of_a_square_mirrored_at_the_border(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(1).uniform(0.0, 255.0, shape).astype(np.float32)
+    mean, variance = local_moments(image)
+    exact = image.astype(np.float64)
+    expected = uniform_filter(exact, GROUND_PX)
+    np.testing.assert_allclose(mean, expected, rtol=1e-5)
+    spread = uniform_filter(exact**2, GROUND_PX) - expected**2
+    np.testing.assert_allclose(variance, np.maximum(spread, 1e-3), rtol=1e-4, atol=0.05)
 
 
 def test_a_view_in_the_dark_tells_nothing_of_the_print() -> None:

@@ -9,6 +9,8 @@ from scipy.special import erf
 from armscan.geometry.arrays import apply_homography
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
+from armscan.vision.targets.chessboard import _with_one_row_around
+from armscan.vision.targets.crossings import predict_cells
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.saddle import fit_saddles
 from armscan.vision.targets.target import Charuco, Chessboard, OtherCountSeen, TargetView
@@ -263,3 +265,18 @@ def test_a_large_image_as_blurred_as_a_window_is_wide_is_measured_reduced(
         squares.append(nees(error, view.covariance_px2))
     # of some 140 corners: its standard deviation is 0.085
     assert 0.75 < np.concatenate(squares).mean() / 2.0 < 1.6
+
+
+@pytest.mark.parametrize("size", [(3, 4), (9, 12)])
+def test_rows_at_the_sides_of_a_lattice_are_seen_or_predicted(size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(1)
+    cells = np.argwhere(np.ones(size, dtype=np.bool_))
+    points = 30.0 * cells + rng.normal(0.0, 0.1, cells.shape)
+    is_seen = ~np.isin(np.arange(len(cells)), [1, size[1] + 1, len(cells) - 2])
+    around = np.argwhere(np.ones((size[1] + 2, size[0] + 2), dtype=np.bool_))[:, ::-1] - 1
+    whole = predict_cells(cells[is_seen], points[is_seen], around)
+    whole = whole.reshape(size[1] + 2, size[0] + 2, 2)
+    whole[cells[is_seen, 1] + 1, cells[is_seen, 0] + 1] = points[is_seen]
+    found = _with_one_row_around(cells[is_seen], points[is_seen], np.array(size))
+    for side in (np.s_[:3], np.s_[-3:], np.s_[:, :3], np.s_[:, -3:]):
+        np.testing.assert_array_equal(found[side], whole[side])

@@ -285,7 +285,7 @@ def compare_planes(
     points = observations.points_mm
     crossings = []
     for of in observations.each_stripe():
-        image = images[int(observations.image[of][0])]
+        image = images[int(observations.image[of[0]])]
         stripe_px = image.data.profile.points_px[observations.row[of]]
         camera = cameras.model(image.data.camera)
         on_board = cross_ratio_points(image.data.view, stripe_px, camera)

@@ -29,7 +29,8 @@ from armscan.geometry.least_squares import eigen, huber_weights, robust_sigma, s
 from armscan.models.light_sheet import LightSheet
 
 ITERATIONS = 12
-STEP_TOLERANCE_MM = 1e-7
+SETTLED_SIGMA = 1e-4
+"""Steps end at a largest one of this part of a parameter's own sigma."""
 CONVERGED_SIGMA = 0.01
 """A last step below this part of every parameter's own sigma does not matter any more."""
 MAX_TILT_STEP = 1.0
@@ -289,7 +290,7 @@ def solve_sheets(
     sigma = observations.sigma_px * sigma_factor
     robust = np.ones(len(observations))
     n_held = errors.n_camera if are_cameras_held else 0
-    for _ in range(ITERATIONS):
+    for k in range(ITERATIONS):
         system = _linearised(observations, sheets, errors, active, precision)
         solved = system.solve(robust / sigma**2, n_held)
         if solved is None:
@@ -306,12 +307,12 @@ def solve_sheets(
         if is_robust:
             scale = max(1.0, robust_sigma(remaining / sigma))
             robust = huber_weights(remaining / sigma, HUBER_SIGMA * scale)
-        if float(np.abs(full).max()) < STEP_TOLERANCE_MM:
+        last_step_sigma = _in_sigmas(normal, n_active)
+        if last_step_sigma < SETTLED_SIGMA and (k > 0 or not is_robust):
             break
     common = normal.step[n_active:]
     system = _linearised(observations, sheets, errors, active, precision)
     remaining = system.residual_px + system.times(np.concatenate([np.zeros(n_active), common]))
-    sigmas = np.sqrt(np.diag(normal.covariance))
     return SheetSolution(
         sheets=tuple(sheets),
         covariance=_joint_covariance(normal, active, errors),
@@ -322,12 +323,17 @@ def solve_sheets(
             + common @ common
             + system.precision @ system.bow_mm**2
         ),
-        last_step_sigma=float((np.abs(normal.step[:n_active]) / sigmas).max()),
+        last_step_sigma=last_step_sigma,
         active=active,
         weight=robust / sigma**2,
         system=system,
         normal=normal,
     )
+
+
+def _in_sigmas(normal: NormalSolution, n_active: int) -> float:
+    """Largest step of a sheet's parameter, in its own sigma."""
+    return float((np.abs(normal.step[:n_active]) / np.sqrt(np.diag(normal.covariance))).max())
 
 
 def _likely_bows_mm(sheets: Sequence[LightSheet]) -> FloatArray:

@@ -198,7 +198,7 @@ CERTAIN_SIGMAS = 2.0
 NOISE_SAMPLE = 1500
 """Points that noise and section are told from; three quarters to one and a half times as many."""
 FIRST_SAMPLE = 500
-"""As many of them, at least, for all rounds but the last."""
+"""As many of them, at least, for the first rounds."""
 NOISE_ROUNDS = 2
 SECTION_ROUNDS = 2
 """More of them where the section is no Gaussian."""
@@ -249,7 +249,7 @@ def fit_ridge(
     """Fit the line's section with weights from the noise model at every ridge point.
 
     The noise model and the section's departure from a Gaussian are estimated from a sample of the
-    points first, in rounds of which only the last looks at all of it. Chains shorter than
+    points first, in rounds of which the first ones look at a part of it. Chains shorter than
     `SHORTEST_PX` are fitted, but do not count as lines beside others.
     """
     table = ridge.table
@@ -259,14 +259,12 @@ def fit_ridge(
     guess = noise = start_noise(background_noise)
     bare, black = plane, 0.0
     section = np.zeros(4)
-    few, many = _samples(len(table))
+    few, many = _samples(ridge.chain)
     values = np.zeros((len(table), FIT_COLUMNS))
-    last = NOISE_ROUNDS + SECTION_ROUNDS - 1
-    for round_ in range(last + 1):
-        pick = few if round_ < last else many
-        is_gaussian = round_ >= NOISE_ROUNDS and not section.any()
-        if is_gaussian and (round_ < last or len(few) == len(many)):
-            continue
+    for round_ in range(NOISE_ROUNDS + SECTION_ROUNDS):
+        pick = few if round_ < NOISE_ROUNDS else many
+        if not section.any() and round_ >= NOISE_ROUNDS + (len(few) < len(many)):
+            break
         sample = values[pick]
         fit_profiles(
             plane.image,
@@ -320,11 +318,19 @@ def fit_ridge(
     )
 
 
-def _samples(n: int) -> tuple[IntArray, IntArray]:
-    """Rows of the few of n points for the first rounds, in stretches, and of all for the last."""
+def _samples(chain: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows of the part of a sample that the first rounds look at, and of the sample.
+
+    The part is made of whole stretches, from which `estimate_section` tells what comes and goes
+    along a line. Where there are few of them, it is the sample itself. ``chain``: (N,) increasing.
+    """
+    n = len(chain)
     many = np.arange(0, n, max(round(n / NOISE_SAMPLE), 1))
-    every = max(len(many) // FIRST_SAMPLE, 1)
-    return many[np.arange(len(many)) // BLOCK % every == 0], many
+    _, first, count = np.unique(chain[many], return_index=True, return_counts=True)
+    place = np.arange(len(many)) - np.repeat(first, count)
+    whole = many[place < np.repeat(count // BLOCK * BLOCK, count)]
+    every = len(whole) // FIRST_SAMPLE
+    return (whole[np.arange(len(whole)) // BLOCK % every == 0] if every > 1 else many), many
 
 
 NARROW, HALF_AS_WIDE, WIDE = 0.7, 0.5, 1.4

@@ -203,13 +203,12 @@ def _steepest(image: FloatImage, every: int) -> tuple[IntArray, IntArray]:
     """Rows and columns of the steepest of ``every`` so many pixels, none of them at the border."""
     border = MOVE_REACH_PX + 1
     inside = slice(border, -border, every)
-    slopes = (cv2.Scharr(image, -1, *along)[inside, inside] for along in ((1, 0), (0, 1)))
-    sample = np.hypot(*slopes)
-    count = min(int(EDGE_SHARE * sample.size), MOST_EDGES)
+    slope = np.hypot(*(cv2.Scharr(image, -1, *along)[inside, inside] for along in ((1, 0), (0, 1))))
+    count = min(int(EDGE_SHARE * slope.size), MOST_EDGES)
     if count < LEAST_EDGES:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    chosen = np.argpartition(sample, -count, axis=None)[-count:]
-    v, u = np.divmod(np.sort(chosen), sample.shape[1])
+    chosen = np.argpartition(slope, -count, axis=None)[-count:]
+    v, u = np.divmod(np.sort(chosen), slope.shape[1])
     return np.asarray(border + every * v), np.asarray(border + every * u)
 
 

@@ -161,7 +161,10 @@ def _sides(
 
 
 def _with_one_row_around(cells: IntArray, points: FloatArray, size: IntArray) -> FloatArray:
-    """Image points (b + 2, a + 2, 2) of the rectangle and of one row around it, near its sides."""
+    """Image points (b + 2, a + 2, 2) of the rectangle and of one row around it.
+
+    What is not seen is predicted in the three outermost rows; elsewhere it is NaN.
+    """
     grid = np.full((size[1] + 2, size[0] + 2, 2), np.nan)
     is_wanted = np.ones(grid.shape[:2], dtype=np.bool_)
     is_wanted[3:-3, 3:-3] = False

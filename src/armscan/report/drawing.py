@@ -100,11 +100,11 @@ class Labels:
 def new_figure(
     width: float = 6.0,
     height: float = 4.0,
-    layout: Literal["constrained", "none"] = "constrained",
+    layout: Literal["constrained"] | None = "constrained",
 ) -> Figure:
     """Return an empty figure in the house's style; sizes in inches.
 
-    To lay out many panels takes as long as all else: ``none`` where it is known what lies where.
+    To lay out many panels takes as long as all else: None where it is known what lies where.
     """
     with mpl.rc_context(STYLE):
         return Figure(figsize=(width, height), layout=layout)

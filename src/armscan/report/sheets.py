@@ -390,7 +390,7 @@ def _residuals_along(fit: LaserFit, index: int) -> Picture:
     )
     with styled():
         height = 1.9 * rows + 0.5
-        figure = new_figure(PAGE_WIDTH, height, layout="none")
+        figure = new_figure(PAGE_WIDTH, height, layout=None)
         margins = _margins(PAGE_WIDTH, height)
         grid: Any = figure.subplots(
             rows, columns, sharex=True, sharey=True, squeeze=False, gridspec_kw=margins

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The noise model of a line's pixels, from residuals as fits leave them."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,8 @@ import armscan.vision.stripe.fit
 from armscan.geometry.arrays import FloatArray
 from armscan.kernels.stripe.section import weigh_section
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.fit import BLOCK, FIRST_SAMPLE, _samples, estimate_noise, start_noise
-from rigs.stripe_image import SimulatedStripe, StripeNoise, StripeScene, WaveCurve
+from armscan.vision.stripe.fit import estimate_noise, start_noise
+from rigs.stripe_image import StripeNoise, StripeScene
 from rigs.stripe_scenes import line
 
 PEAK = 75.0
@@ -92,39 +91,3 @@ def test_residuals_are_widened_by_what_the_fit_took_of_each_pixel(line_sigma: fl
     assert (left < 0.2).any() == (line_sigma < 1.0)
     is_line = pixels[0, :n] > 100.0 * np.exp(-0.5 * 2.7**2)
     assert pixels[2, :n][is_line] == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize("piece", [20, 150, 700, 20_000])
-def test_the_first_rounds_look_at_whole_stretches_of_the_sample(piece: int) -> None:
-    chain = np.arange(20_000) // piece
-    few, many = _samples(chain)
-    assert np.isin(few, many).all()
-    if len(few) == len(many):
-        assert len(many) // BLOCK * BLOCK < 2 * FIRST_SAMPLE or piece < BLOCK * 13
-        return
-    assert FIRST_SAMPLE <= len(few) < 2 * FIRST_SAMPLE
-    stretches = few[: len(few) // BLOCK * BLOCK].reshape(-1, BLOCK)
-    assert (np.diff(stretches) == many[1]).all()
-    assert (chain[stretches] == chain[stretches[:, :1]]).all()
-
-
-def test_pieces_of_skewed_lines_are_fitted_as_if_the_first_rounds_looked_at_all(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    lines = tuple(
-        SimulatedStripe(WaveCurve(0.0, 80.0 * (k + 1), 0.3, 10.0, 700.0), sigma_px=3.0, skew=0.4)
-        for k in range(11)
-    )
-    exposure = StripeScene(lines, 1280, 1024, noise=StripeNoise(speckle=0.08)).expose(1)
-    image = exposure.image.copy()
-    for left in range(0, 1280, 160):
-        image[:, left : left + 10] = 4
-    cut = replace(exposure, image=image)
-    found = extract_stripes(cut)
-    monkeypatch.setattr(armscan.vision.stripe.fit, "FIRST_SAMPLE", 10**9)
-    whole = extract_stripes(cut)
-    assert len(found) == len(whole)
-    good = found.is_accepted & whole.is_accepted
-    shift = (found.points_px - whole.points_px)[good]
-    assert np.sqrt((shift**2).sum(axis=1).mean()) < 0.003
-    np.testing.assert_allclose(found.sigma_px[good], whole.sigma_px[good], rtol=0.05)

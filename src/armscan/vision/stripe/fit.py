@@ -197,8 +197,6 @@ CERTAIN_SIGMAS = 2.0
 
 NOISE_SAMPLE = 1500
 """Points that noise and section are told from; three quarters to one and a half times as many."""
-FIRST_SAMPLE = 500
-"""As many of them, at least, for the first rounds."""
 NOISE_ROUNDS = 2
 SECTION_ROUNDS = 2
 """More of them where the section is no Gaussian."""
@@ -249,7 +247,7 @@ def fit_ridge(
     """Fit the line's section with weights from the noise model at every ridge point.
 
     The noise model and the section's departure from a Gaussian are estimated from a sample of the
-    points first, in rounds of which the first ones look at a part of it. Chains shorter than
+    points first. Chains shorter than
     `SHORTEST_PX` are fitted, but do not count as lines beside others.
     """
     table = ridge.table
@@ -259,13 +257,11 @@ def fit_ridge(
     guess = noise = start_noise(background_noise)
     bare, black = plane, 0.0
     section = np.zeros(4)
-    few, many = _samples(ridge.chain)
-    values = np.zeros((len(table), FIT_COLUMNS))
+    pick = np.arange(0, len(table), max(round(len(table) / NOISE_SAMPLE), 1))
+    sample = np.zeros((len(pick), FIT_COLUMNS))
     for round_ in range(NOISE_ROUNDS + SECTION_ROUNDS):
-        pick = few if round_ < NOISE_ROUNDS else many
-        if not section.any() and round_ >= NOISE_ROUNDS + (len(few) < len(many)):
+        if round_ >= NOISE_ROUNDS and not section.any():
             break
-        sample = values[pick]
         fit_profiles(
             plane.image,
             plane.clipped,
@@ -278,7 +274,6 @@ def fit_ridge(
             reach[pick],
             sample,
         )
-        values[pick] = sample
         good = sample[:, VARIANCE] > 0.0
         if good.sum() < LEAST_PER_BIN:
             continue
@@ -295,6 +290,8 @@ def fit_ridge(
             black += estimate_black(fitted.said(noise, section))
             plane = bare.with_black(black)
             sides, side_sigma = _sides(plane, table, start)
+    values = np.zeros((len(table), FIT_COLUMNS))
+    values[pick] = sample
     ground = plane.reflectance
     fit_profiles(
         plane.image, plane.clipped, ground, table, sigma, sides, noise, section, reach, values
@@ -316,21 +313,6 @@ def fit_ridge(
         is_noise_assumed=noise is guess,
         ground=_ground(plane, ridge.table, values),
     )
-
-
-def _samples(chain: IntArray) -> tuple[IntArray, IntArray]:
-    """Rows of the part of a sample that the first rounds look at, and of the sample.
-
-    The part is made of whole stretches, from which `estimate_section` tells what comes and goes
-    along a line. Where there are few of them, it is the sample itself. ``chain``: (N,) increasing.
-    """
-    n = len(chain)
-    many = np.arange(0, n, max(round(n / NOISE_SAMPLE), 1))
-    _, first, count = np.unique(chain[many], return_index=True, return_counts=True)
-    place = np.arange(len(many)) - np.repeat(first, count)
-    whole = many[place < np.repeat(count // BLOCK * BLOCK, count)]
-    every = len(whole) // FIRST_SAMPLE
-    return (whole[np.arange(len(whole)) // BLOCK % every == 0] if every > 1 else many), many
 
 
 NARROW, HALF_AS_WIDE, WIDE = 0.7, 0.5, 1.4

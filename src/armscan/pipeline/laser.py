@@ -41,8 +41,8 @@ from armscan.models.calibration import CameraCalibration, LaserColour, SensorCal
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, check_sizes
 from armscan.pipeline.measure import cached_profile
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.targets import cached_target, wrong_count
+from armscan.pipeline.progress import Progress, ProgressEvent, in_order, silent
+from armscan.pipeline.targets import DETECTION_THREADS, cached_target, wrong_count
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.storage.detection_cache import DetectionCache
@@ -211,14 +211,18 @@ class _LitBoards:
         less_print, about_print = choose_print(len(bare), tried, cameras, sheets)
         if bare:
             self.progress(ProgressEvent(PRINT_STAGE, 2 * len(bare), 2 * len(bare)))
+
+        def stripes(pair: ExposurePair) -> BoardStripes | FitFailure:
+            seen = known.get((id(pair[0]), less_print))
+            if seen is not None:
+                return seen
+            return self.stripes_of(pair, colour, less_print=less_print)
+
         found: list[BoardStripes | FitFailure] = []
-        for done, pair in enumerate(self.pairs):
-            self.progress(ProgressEvent(STRIPES_STAGE, done, len(self.pairs), pair[0].source))
-            stripes = known.get((id(pair[0]), less_print))
-            if stripes is None:
-                stripes = self.stripes_of(pair, colour, less_print=less_print)
-            found.append(stripes)
-        self.progress(ProgressEvent(STRIPES_STAGE, len(self.pairs), len(self.pairs)))
+        for (exposure, _), shown in in_order(stripes, self.pairs, DETECTION_THREADS):
+            found.append(shown)
+            event = ProgressEvent(STRIPES_STAGE, len(found), len(self.pairs), exposure.source)
+            self.progress(event)
         if self.options.stripes.line_sigma_px is None:
             for k, sigma_px in _poor_images(found, cameras, sheets):
                 again = self.stripes_of(self.pairs[k], colour, sigma_px, less_print=less_print)
@@ -490,7 +494,7 @@ def find_placements(
     cameras: HeadCameras,
     cache: DetectionCache | None = None,
 ) -> Iterator[BoardPlacement]:
-    """Look for the board in each placement, one after the other; ``cache`` knows earlier finds.
+    """Look for the board in each placement, given back in order; ``cache`` knows earlier finds.
 
     The images without laser are tried first.
     """
@@ -516,14 +520,17 @@ def find_placements(
             failures.append(found)
         return failures[0]
 
-    for name, by_camera in groups.items():
+    def placement(group: tuple[str, dict[int, list[Exposure]]]) -> BoardPlacement:
+        name, by_camera = group
         seen = {camera: first_seen(camera, images) for camera, images in sorted(by_camera.items())}
         found = [item for item in seen.values() if not isinstance(item, FitFailure)]
         if len(found) == 2:
             right = _same_placement(found[0], found[1], target, cameras)
             seen[1] = right
             found = found[:1] if isinstance(right, FitFailure) else [found[0], right]
-        yield BoardPlacement(name, seen, place_board(found, cameras) if found else None)
+        return BoardPlacement(name, seen, place_board(found, cameras) if found else None)
+
+    yield from (placed for _, placed in in_order(placement, groups.items(), DETECTION_THREADS))
 
 
 def _posed(

@@ -7,10 +7,8 @@ Still images, hand-eye calibration, scans and scans that choose their lasers mea
 
 from __future__ import annotations
 
-import os
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import cast
@@ -28,7 +26,14 @@ from armscan.pipeline.instants import (
     check_sizes,
     pair_exposures,
 )
-from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
+from armscan.pipeline.progress import (
+    Progress,
+    ProgressEvent,
+    StageClock,
+    count_cores,
+    in_order,
+    silent,
+)
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.label_stereo import StereoLabeller
 from armscan.reconstruction.labels import (
@@ -231,9 +236,8 @@ def measure_instants(
         is_shared = not reads_ahead and len(cameras) > 1 and count_cores() > 1
         pool = stack.enter_context(ThreadPoolExecutor(len(cameras))) if is_shared else None
         each_camera = map if pool is None else pool.map
-        for n, (images, profiles) in enumerate(
-            _in_order(instants, extract, reads_ahead=reads_ahead)
-        ):
+        n_ahead = MOST_THREADS if reads_ahead else 1
+        for n, (images, profiles) in enumerate(in_order(extract, instants, n_ahead)):
             if not is_pass:
                 labeller.reset()
             if cache is not None and n % TRIMMED_AFTER == 0:
@@ -245,39 +249,6 @@ def measure_instants(
             with clock.stage(PLACING):
                 measured = MeasuredInstant(images, measure_points(labelled, sensor, depths))
             yield measured
-
-
-def _in_order(
-    instants: Iterable[InstantImages],
-    extract: Callable[[InstantImages], list[Profile]],
-    *,
-    reads_ahead: bool,
-) -> Iterator[tuple[InstantImages, list[Profile]]]:
-    """Profiles of each instant, in order, with few instants in memory; ends at the first error."""
-    n_threads = min(count_cores(), MOST_THREADS)
-    if not reads_ahead or n_threads == 1:
-        yield from ((images, extract(images)) for images in instants)
-        return
-    pending: deque[tuple[InstantImages, Future[list[Profile]]]] = deque()
-    with ThreadPoolExecutor(n_threads) as pool:
-        try:
-            for images in instants:
-                pending.append((images, pool.submit(extract, images)))
-                if len(pending) > n_threads:
-                    first, found = pending.popleft()
-                    yield first, found.result()
-            while pending:
-                first, found = pending.popleft()
-                yield first, found.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-def count_cores() -> int:
-    """Cores that this process may use, where the system tells."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def stripes_for(sensor: SensorCalibration, options: StripeOptions) -> StripeOptions:

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of long work, as events that any front end can show, and what its stages cost."""
+"""Long work: its progress, as events that any front end can show, what its stages cost, and its
+items in a few threads.
+"""
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 try:
     import resource
@@ -30,10 +35,47 @@ class ProgressEvent:
 
 
 Progress: TypeAlias = Callable[[ProgressEvent], None]
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def silent(event: ProgressEvent) -> None:
     """Show nothing."""
+
+
+def count_cores() -> int:
+    """Cores that this process may use, where the system tells."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def in_order(
+    work: Callable[[Item], Result], items: Iterable[Item], most_threads: int
+) -> Generator[tuple[Item, Result]]:
+    """Each item with what ``work`` makes of it, in the order of the items.
+
+    Works ahead on as many items as there are cores for, ``most_threads`` at most, and takes only a
+    few more from ``items`` than were given back. Ends at the first error, of the work or of the
+    items, and drops what waits when it is closed.
+    """
+    n_threads = min(count_cores(), most_threads)
+    if n_threads == 1:
+        yield from ((item, work(item)) for item in items)
+        return
+    pending: deque[tuple[Item, Future[Result]]] = deque()
+    with ThreadPoolExecutor(n_threads) as pool:
+        try:
+            for item in items:
+                pending.append((item, pool.submit(work, item)))
+                if len(pending) > n_threads:
+                    first, future = pending.popleft()
+                    yield first, future.result()
+            while pending:
+                first, future = pending.popleft()
+                yield first, future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 @dataclass(frozen=True, slots=True)

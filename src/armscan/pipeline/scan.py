@@ -32,7 +32,6 @@ from armscan.pipeline.measure import (
     MeasureOptions,
     SheetDepths,
     cameras_of,
-    count_cores,
     labeller_for,
     measure_instants,
     measurement_warnings,
@@ -41,7 +40,13 @@ from armscan.pipeline.measure import (
     summarised,
     unknown_lasers,
 )
-from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
+from armscan.pipeline.progress import (
+    Progress,
+    ProgressEvent,
+    StageClock,
+    count_cores,
+    silent,
+)
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan, doubt_times
 from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeCounts
 from armscan.reconstruction.place import (

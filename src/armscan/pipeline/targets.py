@@ -5,15 +5,13 @@ progress.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Iterator, Sequence, Sized
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armscan.geometry.estimate import FitFailure
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.progress import Progress, ProgressEvent, in_order, silent
 from armscan.records.exposure import Exposure
 from armscan.storage.detection_cache import DetectionCache, detection_key
 from armscan.vision.targets.detect import detect_target, settle_target
@@ -167,8 +165,12 @@ def find_targets(
     not_found: list[tuple[str, str]] = []
     answers: list[TargetView | FitFailure] = []
     wrong: FitFailure | None = None
-    detections = _detect_in_order(exposures, target, cache)
-    for done, (source, found) in enumerate(detections, 1):
+
+    def look(exposure: Exposure) -> TargetView | FitFailure:
+        return cached_target(exposure, target, cache)
+
+    for done, (exposure, found) in enumerate(in_order(look, exposures, DETECTION_THREADS), 1):
+        source = exposure.source
         if isinstance(found, FitFailure):
             not_found.append((source, found.reason))
         else:
@@ -181,21 +183,3 @@ def find_targets(
     if cache is not None:
         cache.trim()
     return FoundTargets(tuple(views), tuple(not_found), wrong)
-
-
-def _detect_in_order(
-    exposures: Iterable[Exposure],
-    target: Target,
-    cache: DetectionCache | None,
-) -> Iterator[tuple[str, TargetView | FitFailure]]:
-    """Detect in a few threads, in order, without holding more exposures than threads."""
-    waiting: deque[tuple[str, Future[TargetView | FitFailure]]] = deque()
-    with ThreadPoolExecutor(DETECTION_THREADS) as pool:
-        for exposure in exposures:
-            looking = pool.submit(cached_target, exposure, target, cache)
-            waiting.append((exposure.source, looking))
-            if len(waiting) == DETECTION_THREADS:
-                source, future = waiting.popleft()
-                yield source, future.result()
-        for source, future in waiting:
-            yield source, future.result()

@@ -14,7 +14,7 @@ from armscan.errors import EstimationError, InputError
 from armscan.fusion import point_spool
 from armscan.geometry.arrays import Box
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline import measure
+from armscan.pipeline import measure, progress
 from armscan.pipeline import scan as scan_module
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent, StageClock
@@ -79,7 +79,7 @@ def test_reading_ahead_and_volume_change_nothing_but_speed_and_extent(
     monkeypatch.setattr(measure, "MOST_THREADS", 1)
     one = measure_scan(as_source(fake_scan()), device, ScanOptions(has_normals=False))
     monkeypatch.setattr(measure, "MOST_THREADS", 3)
-    monkeypatch.setattr(measure, "count_cores", lambda: 3)
+    monkeypatch.setattr(progress, "count_cores", lambda: 3)
     two = measure_scan(as_source(fake_scan()), device, ScanOptions(has_normals=False))
     np.testing.assert_array_equal(one.cloud.points_mm, two.cloud.points_mm)
     assert one.cloud.normals is None

@@ -87,7 +87,7 @@ def examine_installation(*, warm: bool = False) -> Summary:
     facts.append(("compiler", _compiler_fact(problems)))
     # they bring the compiler with them, for which a look at a file does not wait
     from armscan.kernels.arrays import COMPILED, kernel_folder
-    from armscan.pipeline.measure import count_cores
+    from armscan.pipeline.progress import count_cores
 
     facts.append(("cores", f"{count_cores()} for this process, of {os.cpu_count() or 1}"))
     facts.append(("compiled kernels", kernel_folder()))

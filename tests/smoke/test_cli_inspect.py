@@ -102,6 +102,33 @@ def test_a_cloud_without_sheets_is_said_to_have_none(
         assert "one exposure" not in out
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("plane", "block"),
+        ("step", "block", "--height", "20"),
+        ("relation", "block", "plane:seed=0,0,0", "plane:seed=15,20,20"),
+        ("sphere", "ball", "--diameter", "34.96"),
+        ("clean", "block", "-o", "clean.ply", "--density", "1"),
+    ],
+)
+def test_what_is_to_be_known_of_the_reading_is_said(
+    words: tuple[str, ...],
+    clouds: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Only `convert` said it."""
+    monkeypatch.chdir(tmp_path)
+    points = read_ply(clouds / f"{words[1]}.ply").points_mm
+    np.savetxt("foreign.txt", points, header="east north up", comments="")
+    group = [] if words[0] == "clean" else ["inspect"]
+    assert main([*group, words[0], "foreign.txt", *words[2:]]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "'east north up' does not name x, y and z" in told
+
+
 def test_a_step_and_a_plane(clouds: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = report(capsys, "step", clouds / "block.ply", "--height", 20, "--margin", 2)
     assert found["height_error_mm"] == pytest.approx(0.0, abs=1e-9)

@@ -205,6 +205,16 @@ def test_features_alone_need_no_model(tmp_path: Path, capsys: pytest.CaptureFixt
     assert files == ["features.json", "part.html"]
 
 
+def test_what_is_to_be_known_of_the_reading_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "recipe.toml").write_text('[[feature]]\nname = "top"\nkind = "plane"\n')
+    points = np.random.default_rng(1).uniform(0.0, 20.0, (800, 3)) * [1.0, 1.0, 0.0005]
+    np.savetxt(tmp_path / "a.txt", points, header="east north up", comments="")
+    told = inspected(tmp_path, tmp_path / "results", capsys, str(tmp_path / "a.txt"), code=0)
+    assert any("does not name x, y and z" in text for text in told["warnings"])
+
+
 FEATURE = '[[feature]]\nname = "b"\nkind = "cylinder"\n'
 REFUSED = [
     ("", "neither a 'part' nor a 'feature'"),

@@ -23,7 +23,7 @@ from armscan.report.inspection.recipe import (
 )
 from armscan.report.page import Page, page_of
 from armscan.report.quantity import Summary, sentences
-from armscan.storage.clouds import CLOUD_SUFFIXES, read_cloud
+from armscan.storage.clouds import CLOUD_SUFFIXES, read_cloud_file
 from armscan.storage.documents import fingerprint
 from armscan.storage.files import Content, is_folder, make_folder, path_text, write_files
 from armscan.storage.image_paths import are_simulated, natural_key
@@ -94,7 +94,8 @@ class _Run:
         return (*names, PART_PDF) if self.file.has_pdf else names
 
     def _inspected(self, name: str, path: Path, cloud_hash: str) -> PartRow:
-        cloud = read_cloud(path)
+        source = read_cloud_file(path)
+        cloud = source.cloud
         recipe = solved(self.file.for_part(path, cloud.frame), path)
         found = solved(follow_recipe(recipe, cloud), path)
         simulated = cloud.is_simulated or are_simulated((path, *self.file.inputs))
@@ -107,7 +108,9 @@ class _Run:
             name=name,
             cloud=path_text(path),
             quantities=found.quantities,
-            notes=sentences((*delivery.warnings, *found.notes, *cleaned, *model, *warned)),
+            notes=sentences(
+                (*delivery.warnings, *source.remarks, *found.notes, *cleaned, *model, *warned)
+            ),
             is_simulated=simulated,
             forced=cloud.forced,
         )

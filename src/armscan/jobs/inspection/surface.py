@@ -24,7 +24,6 @@ from armscan.storage.clouds import (
     CLOUD_SUFFIXES,
     cloud_bytes,
     cloud_losses,
-    read_cloud,
     read_cloud_file,
 )
 from armscan.storage.files import path_text
@@ -52,7 +51,8 @@ def draw_mesh(
     if n_triangles is not None and n_triangles < LEAST_TRIANGLES:
         raise OptionError(f"--triangles is {n_triangles}", remedy="give 4 or more")
     job.places(*SURFACE_SUFFIXES, reads=(path,))
-    cloud = read_cloud(path)
+    source = read_cloud_file(path)
+    cloud = source.cloud
     try:
         full = draw_surface(cloud, options)
     except EstimationError as error:
@@ -74,7 +74,7 @@ def draw_mesh(
     return Summary(
         title="Mesh" + (" (simulated data)." if is_simulated else "."),
         quantities=quantities,
-        warnings=sentences(_warnings(full)),
+        warnings=sentences((*source.remarks, *_warnings(full))),
         written=written,
         next_step=f"open {job.output} in any program for meshes" if written else "",
         forced=cloud.forced,
@@ -142,7 +142,7 @@ def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
     found = clean_cloud(cloud, options)
     losses = cloud_losses(found.cloud, job.output, source.dropped)
     lost = (f"the new file does not hold: {', '.join(losses)}",) if losses else ()
-    warnings = (*found.warnings, *lost)
+    warnings = (*source.remarks, *found.warnings, *lost)
     provenance = job.provenance((path,), (options,), warnings=warnings, forced=cloud.forced)
     page = cleaning_page(found, cloud.points_mm, provenance, is_simulated=cloud.is_simulated)
     written = job.write({places[0]: cloud_bytes(found.cloud, job.output), places[1]: page})

@@ -168,8 +168,8 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
     """Inspect parts by a recipe.
 
     ``job``: its output is the folder of the results, made if need be. A part that is in it, done
-    with the same recipe, model and cloud, is not done again. ``places``: clouds, and folders of
-    clouds, in the order of the trend.
+    with the same recipe, model, scanner and cloud, is not done again. ``places``: clouds, and
+    folders of clouds, in the order of the trend.
     """
     if job.output is None:
         raise OptionError("no folder is named", where="-o", remedy="name a folder for the results")
@@ -180,7 +180,9 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
     if file.has_pdf:
         require_pdf()
     own = replace(job, is_overwriting=True, title_block=file.title_block)
-    recipe_hash = " ".join((hashes[0], *hashes[2:]))
+    # a scanner that was calibrated anew changes what the pages say of the cloud's calibration
+    scanner = [] if file.scanner_path is None else [fingerprint(file.scanner_path).sha256]
+    recipe_hash = " ".join((hashes[0], *hashes[2:], *scanner))
     run = _Run(own, job.output, file, (recipe_hash, hashes[1] if len(hashes) > 1 else ""))
     rows: list[PartRow] = []
     make_folder(job.output)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from armscan.errors import EstimationError, OptionError
+from armscan.geometry.arrays import FloatArray
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import part_of
 from armscan.inspection.cleaning import CleaningOptions, clean_cloud
@@ -35,6 +36,8 @@ FINE = 0.6
 """Cells below this part of the lines' distance are said to be too small."""
 MANY_WITHOUT = 0.2
 """Part of the points without a normal from which it is said."""
+COARSE_STL_MM = 0.001
+"""Spacing of an STL file's numbers from which it is said: far from the origin they are coarse."""
 
 
 def draw_mesh(
@@ -65,7 +68,10 @@ def draw_mesh(
     quantities = (*_quantities(surface), *extra)
     is_simulated = cloud.is_simulated or are_simulated((path,))
     written: tuple[Path, ...] = ()
+    rounded: tuple[str, ...] = ()
     if job.output is not None:
+        if job.output.suffix.lower() == ".stl":
+            rounded = _rounded(surface.vertices_mm)
         title = f"armscan mesh of {path.name}, mm" + (", simulated data" if is_simulated else "")
         content = encoded_surface(
             job.output.suffix.lower(), surface.vertices_mm, surface.triangles, title
@@ -74,7 +80,7 @@ def draw_mesh(
     return Summary(
         title="Mesh" + (" (simulated data)." if is_simulated else "."),
         quantities=quantities,
-        warnings=sentences((*source.remarks, *_warnings(full))),
+        warnings=sentences((*source.remarks, *_warnings(full), *rounded)),
         written=written,
         next_step=f"open {job.output} in any program for meshes" if written else "",
         forced=cloud.forced,
@@ -130,6 +136,18 @@ def _warnings(surface: ScannedSurface) -> tuple[str, ...]:
             "apart: the surface falls into strips; leave --cell out, or scan more densely"
         )
     return tuple(texts)
+
+
+def _rounded(vertices_mm: FloatArray) -> tuple[str, ...]:
+    """What STL's single precision takes from corners far from the origin."""
+    far_mm = float(np.abs(vertices_mm).max(initial=0.0))
+    step_mm = float(np.spacing(np.float32(far_mm)))
+    if step_mm <= COARSE_STL_MM:
+        return ()
+    return (
+        f"STL holds coordinates of {far_mm:,.0f} mm as multiples of {step_mm:.2g} mm: write .ply, "
+        "which holds all digits, or move the cloud nearer to the origin",
+    )
 
 
 def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:

@@ -20,6 +20,7 @@ from armscan.cli import main
 from armscan.errors import DeviceError, OutputError
 from armscan.jobs.live.record import RecordRequest, _Recording, record_scan
 from armscan.pipeline.live.acquire import BEHIND, JUMPED, MATCHING, LiveEvent
+from armscan.storage.files import set_aside
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.storage.recordings.write_mcap import RecordingWriter
@@ -32,6 +33,7 @@ rate_hz = 25.0
 is_common_trigger = true
 windows = [[1500, 900, 64, 32]]
 """
+EARLIER = b"an hour of scanning"
 
 
 @pytest.fixture
@@ -134,11 +136,103 @@ def test_without_an_image_there_is_no_file(
 def test_what_is_to_be_replaced_stays_where_no_image_comes(tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(RIG.replace(f'lasers = "{TWIN}"\n', ""))
     output = tmp_path / "scan.mcap"
-    output.write_bytes(b"an hour of scanning")
+    output.write_bytes(EARLIER)
     words = ["record", str(tmp_path / "rig.toml"), "--seconds", "0.3", "--force", "-o", str(output)]
     assert main(words) == 2
-    assert output.read_bytes() == b"an hour of scanning"
+    assert output.read_bytes() == EARLIER
     assert sorted(one.name for one in tmp_path.iterdir()) == ["rig.toml", "scan.mcap"]
+
+
+@pytest.mark.parametrize("ending", [KeyboardInterrupt(), DeviceError("the arm is gone")])
+def test_what_is_to_be_replaced_stays_where_it_ends_before_it_begins(
+    ending: BaseException, rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(_: _Recording) -> None:
+        raise ending
+
+    monkeypatch.setattr(_Recording, "_wait_for_clocks", ended)
+    output = rig.parent / "scan.mcap"
+    output.write_bytes(EARLIER)
+    with pytest.raises(type(ending)):
+        record_scan(RecordRequest(str(rig)), output, print, is_overwriting=True)
+    assert output.read_bytes() == EARLIER
+    assert sorted(one.name for one in rig.parent.iterdir()) == ["rig.toml", "scan.mcap"]
+
+
+@pytest.mark.parametrize("step", ["_wait_for_clocks", "_put_aside"])
+def test_what_another_run_makes_meanwhile_is_not_touched(
+    step: str, rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output, real = rig.parent / "scan.mcap", getattr(_Recording, step)
+
+    def meanwhile(run: _Recording) -> None:
+        real(run)
+        output.write_bytes(EARLIER)
+
+    monkeypatch.setattr(_Recording, step, meanwhile)
+    with pytest.raises(OutputError, match="exists"):
+        record_scan(RecordRequest(str(rig), n_exposures=2), output, print)
+    assert output.read_bytes() == EARLIER
+    assert sorted(one.name for one in rig.parent.iterdir()) == ["rig.toml", "scan.mcap"]
+
+
+def test_what_cannot_be_brought_back_is_kept_and_said(
+    rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output, real = rig.parent / "scan.mcap", _Recording._put_aside
+    output.write_bytes(EARLIER)
+
+    def meanwhile(run: _Recording) -> None:
+        real(run)
+        output.write_bytes(b"of another run")
+
+    monkeypatch.setattr(_Recording, "_put_aside", meanwhile)
+    told: list[str] = []
+    with pytest.raises(OutputError, match="exists"):
+        record_scan(RecordRequest(str(rig)), output, told.append, is_overwriting=True)
+    assert output.read_bytes() == b"of another run"
+    assert output.with_name(".scan.mcap.before").read_bytes() == EARLIER
+    assert "what was there lies in .scan.mcap.before until the recording ends" in told
+    assert any("what was there before lies in .scan.mcap.before" in line for line in told)
+
+
+def test_what_a_killed_run_left_is_named_and_not_replaced(
+    rig: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, left = rig.parent / "scan.mcap", rig.parent / ".scan.mcap.before"
+    output.write_bytes(b"a second of scanning")
+    left.write_bytes(EARLIER)
+    words = ["record", str(rig), "--exposures", "2", "--force", "-o", str(output)]
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert "an earlier file of this name lies in .scan.mcap.before" in told
+    assert "opening the devices" not in told
+    assert left.read_bytes() == EARLIER and output.read_bytes() == b"a second of scanning"
+    left.unlink()
+    assert main(words) == 0
+    assert len(read_recording(output).rows) >= 2 and not left.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks files")
+def test_a_recording_that_still_grows_is_not_replaced(
+    rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output, refused = rig.parent / "scan.mcap", []
+    real = _Recording._watch
+
+    def watched(run: _Recording, request: RecordRequest, start: float) -> None:
+        try:
+            set_aside(output, is_overwriting=True)
+        except OutputError as error:
+            refused.append(error.what)
+        real(run, request, start)
+
+    monkeypatch.setattr(_Recording, "_watch", watched)
+    record_scan(RecordRequest(str(rig), n_exposures=2), output, print)
+    assert refused == ["another run writes this file"]
+    assert set_aside(output, is_overwriting=True) == rig.parent / ".scan.mcap.before"
+    with pytest.raises(OutputError, match=r"lies in \.scan\.mcap\.before"):
+        set_aside(output, is_overwriting=True)
 
 
 def test_what_arrives_and_cannot_be_matched_is_no_success(

@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
 from armscan.pipeline.simulate import TwinName
 from armscan.report.quantity import Quantity, Summary, plural
 from armscan.storage.documents import read_scanner_calibration
-from armscan.storage.files import check_outputs
+from armscan.storage.files import bring_back, check_aside, check_outputs, locked, set_aside
 from armscan.storage.recordings.write_mcap import WriterOptions, WriterStatus
 
 TOLD_EVERY_S = 1.0
@@ -138,7 +138,8 @@ def record_scan(
         If a device does not answer at the start, no image came at all, what arrived could not be
         kept to the end, or none of it can be used; what was written stays.
     OutputError
-        If the file exists, or the disk is full; what was written stays.
+        If the file exists, a killed run left what it was to replace, or the disk is full; what was
+        written stays.
     """
     description = request.description()
     if output.suffix.lower() != SUFFIX:
@@ -147,13 +148,15 @@ def record_scan(
             remedy=f"end it in {SUFFIX}",
         )  # fmt: skip
     check_outputs((output,), is_overwriting=is_overwriting)
+    check_aside(output)
     place = request.scanner or (Path(description.scanner) if description.scanner else None)
     scanner = None if place is None else read_scanner_calibration(place)
     tell("opening the devices ...")
     with Rig.open(description, open_device) as rig:
         rig.set_windows()
         options = WriterOptions(is_stripe_band=request.is_stripe_band)
-        run = _Recording(rig, scanner, output, options, (tell, show_rate or tell))
+        told = tell, show_rate or tell
+        run = _Recording(rig, scanner, output, options, told, is_overwriting=is_overwriting)
         run.until_the_end(request)
     return run.summary(place)
 
@@ -181,7 +184,10 @@ class _Recording:
         output: Path,
         writer_options: WriterOptions,
         tell: tuple[Callable[[str], None], Callable[[str], None]],
+        *,
+        is_overwriting: bool = False,
     ) -> None:
+        self._is_overwriting = is_overwriting
         self._output, (self._tell, self._show_rate) = output, tell
         self._recorder = LiveRecorder(output, rig, options=writer_options)
         options = LiveOptions.of(rig.description)
@@ -195,6 +201,7 @@ class _Recording:
         self._before = replace(self._end), 0.0
         self._is_interrupted = False
         self._before_it: Path | None = None
+        self._held = ExitStack()
         self._why_ended = ""
         self._is_triggered = rig.description.is_common_trigger
 
@@ -205,6 +212,7 @@ class _Recording:
             self._wait_for_clocks()
             self._put_aside()
             self._recorder.begin()
+            self._held.enter_context(locked(self._output))
             self._session.add_listener(self._recorder.hear)
             start = time.monotonic()
             self._session.start()
@@ -248,23 +256,33 @@ class _Recording:
             )
 
     def _put_aside(self) -> None:
-        """What is to be replaced, until the first image is there."""
-        if self._output.exists():
-            place = self._output.with_name(f".{self._output.name}.before")
-            self._output.replace(place)
-            self._before_it = place
+        """What is to be replaced, until this recording has ended with an image."""
+        self._before_it = set_aside(self._output, is_overwriting=self._is_overwriting)
+        if self._before_it is not None:
+            self._tell(f"what was there lies in {self._before_it.name} until the recording ends")
 
     def _close(self) -> None:
         """The new file where it holds an image; else what was there before."""
+        is_new = False
         try:
             self._end = self._recorder.close()
         finally:
-            if not self._recorder.status().n_written:
-                self._output.unlink(missing_ok=True)
-                if self._before_it is not None:
-                    self._before_it.replace(self._output)
-            elif self._before_it is not None:
+            if self._recorder.is_begun:
+                # what another run made there meanwhile is not ours to remove
+                is_new = self._recorder.status().n_written > 0
+                if not is_new:
+                    self._output.unlink(missing_ok=True)
+            self._held.close()
+            if self._before_it is not None and is_new:
                 self._before_it.unlink()
+            elif self._before_it is not None:
+                self._bring_back(self._before_it)
+
+    def _bring_back(self, before: Path) -> None:
+        try:
+            bring_back(before, self._output)
+        except OutputError as error:
+            self._tell(f"warning: {error}")
 
     def _wait_for_clocks(self) -> None:
         """Without an arm nothing is placed by time, so that nobody waits for clocks."""

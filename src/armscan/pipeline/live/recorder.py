@@ -87,6 +87,11 @@ class LiveRecorder:
         documents = {} if model is None else {ARM_MODEL_FILE: arm_model_toml(model)}
         self._writer.begin(self._session, documents)
 
+    @property
+    def is_begun(self) -> bool:
+        """Whether the file at the path is its own."""
+        return self._writer.is_begun
+
     def status(self) -> WriterStatus:
         """How far the file is."""
         return self._writer.status()

@@ -11,15 +11,18 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from armscan.cli import main
+from armscan.devices.protocols import ArmFlag, ArmSample
 from armscan.errors import DeviceError, OutputError
 from armscan.jobs.live.record import RecordRequest, _Recording, record_scan
 from armscan.pipeline.live.acquire import BEHIND, JUMPED, MATCHING, LiveEvent
+from armscan.simulation.live import TwinArm
 from armscan.storage.files import set_aside
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import extract_recording
@@ -304,6 +307,23 @@ def test_a_stripe_band_is_recorded_and_said(rig: Path, capsys: pytest.CaptureFix
     words = ["record", str(rig), "--exposures", "4", "--stripe-band", "-o", str(output)]
     assert main(words) == 0
     assert read_recording(output).session.is_stripe_band
+
+
+def test_an_arm_without_a_pose_is_said(
+    rig: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = TwinArm.read
+
+    def unreferenced(arm: TwinArm, timeout_s: float) -> tuple[ArmSample, ...]:
+        found = real(arm, timeout_s)
+        return tuple(replace(one, pose=None, flags=ArmFlag.NONE) for one in found)
+
+    monkeypatch.setattr(TwinArm, "read", unreferenced)
+    monkeypatch.setattr("armscan.jobs.live.record.TOLD_EVERY_S", 0.0)
+    assert main(["record", str(rig), "--exposures", "20", "-o", str(rig.parent / "x.mcap")]) == 0
+    told = capsys.readouterr()
+    assert re.search("none of [0-9]+ samples of the arm has a pose", told.out + told.err)
+    assert "the arm gives no pose" in told.err
 
 
 def test_faults_of_this_program_are_no_device_s() -> None:

@@ -328,6 +328,8 @@ class _Recording:
             f"lost {n_lost}, late {n_late}, not to be used {self._recorder.n_aside}",
             f"{speed / 1e6:.0f} MB/s, {free / 1e9:,.0f} GB left{lasts}",
         ]
+        if self._recorder.n_samples and not self._recorder.n_posed:
+            words.append("the arm gives no pose")
         if status.fill > 0.5:
             words.append(f"the disk is behind ({100.0 * status.fill:.0f} % of the buffer)")
         shown = self._session.snapshot()
@@ -380,6 +382,12 @@ class _Recording:
                 0,
                 f"{self._recorder.n_aside} of {self._end.n_written} exposures are kept and not to "
                 "be used: parts of them were lost, or their clock was not known",
+            )
+        if self._recorder.n_samples and not self._recorder.n_posed:
+            warnings.insert(
+                0,
+                f"none of {self._recorder.n_samples} samples of the arm has a pose: reference the "
+                "arm, let it send poses, or name its arm_model in rig.toml, and record again",
             )
         if self._recorder.n_untriggered:
             warnings.insert(

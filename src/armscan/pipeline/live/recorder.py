@@ -15,7 +15,7 @@ import numpy as np
 
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample
-from armscan.devices.protocols import Frame, LaserEvent
+from armscan.devices.protocols import ArmFlag, Frame, LaserEvent
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray
 from armscan.pipeline.live.acquire import LiveEvent
@@ -54,10 +54,13 @@ class LiveRecorder:
     n_untriggered
         Frames without a trigger's id where ids decide, as before the first trigger: they are
         listed, and get no pose.
+    n_samples, n_posed
+        Samples of the arm, and those of them that tell where it was.
     """
 
     def __init__(self, path: Path, rig: Rig, *, options: WriterOptions | None = None) -> None:
         self.n_aside = self.n_untriggered = 0
+        self.n_samples = self.n_posed = 0
         self._writer = RecordingWriter(path, options)
         self._rig, self._is_triggered = rig, rig.description.is_common_trigger
         by_joints = rig.arm is not None and rig.arm.pose_form == "joints"
@@ -211,6 +214,8 @@ class LiveRecorder:
         if not samples:
             return
         own = [one.sample for one in samples]
+        self.n_samples += len(own)
+        self.n_posed += sum(map(self._is_posed, samples))
         facts: dict[str, Any] = {
             "number": [one.number for one in own],
             "t_device_ns": [one.t_device_ns for one in own],
@@ -267,15 +272,21 @@ class LiveRecorder:
         self._last_device_ns = t_device_ns
         return max(t_ns, self._last_sample_ns + 1)
 
-    def _joints(self, samples: Sequence[TimedSample]) -> FloatArray | None:
-        """(N, J) angles of an arm that gives those alone; NaN where they are not valid."""
+    def _is_posed(self, one: TimedSample) -> bool:
+        """Whether the table tells where the arm was, to whoever has its document."""
         if self._form != "joints":
-            return None
+            return one.pose is not None
+        return one.sample.joints_rad is not None and ArmFlag.REFERENCED in one.sample.flags
+
+    def _joints(self, samples: Sequence[TimedSample]) -> FloatArray | None:
+        """(N, J) angles as delivered, NaN where they are not valid; None where none are given."""
         given = [one.sample.joints_rad for one in samples]
-        n_joints = max((len(one) for one in given if one is not None), default=1)
+        is_form = self._form == "joints"
+        n_joints = max((len(one) for one in given if one is not None), default=int(is_form))
+        if not n_joints:
+            return None
         angles = np.full((len(samples), n_joints), np.nan)
         for k, (one, own) in enumerate(zip(samples, given, strict=True)):
-            is_known = one.pose is not None or self._rig.arm_model is None
-            if own is not None and is_known:
-                angles[k] = own
+            if own is not None and ArmFlag.REFERENCED in one.sample.flags:
+                angles[k, : len(own)] = own
         return angles

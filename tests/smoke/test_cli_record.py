@@ -18,11 +18,11 @@ from typing import Any
 import pytest
 
 from armscan.cli import main
-from armscan.devices.protocols import ArmFlag, ArmSample
-from armscan.errors import DeviceError, OutputError
+from armscan.devices.protocols import ArmFlag, ArmSample, LaserEvent
+from armscan.errors import DeviceError, DeviceStoppedError, OutputError
 from armscan.jobs.live.record import RecordRequest, _Recording, record_scan
 from armscan.pipeline.live.acquire import BEHIND, JUMPED, MATCHING, LiveEvent
-from armscan.simulation.live import TwinArm
+from armscan.simulation.live import TwinArm, TwinLasers
 from armscan.storage.files import set_aside
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import extract_recording
@@ -326,9 +326,37 @@ def test_an_arm_without_a_pose_is_said(
     assert "the arm gives no pose" in told.err
 
 
+def test_lasers_that_went_off_by_themselves_end_the_recording(
+    rig: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing lights them but a person; what came before is kept."""
+    real, output = TwinLasers.read, rig.parent / "scan.mcap"
+    recorders: list[RecordingWriter] = []
+    begun = RecordingWriter.begin
+
+    def begin(self: RecordingWriter, *given: Any) -> None:
+        begun(self, *given)
+        recorders.append(self)
+
+    def read(lasers: TwinLasers, timeout_s: float) -> tuple[LaserEvent, ...]:
+        if recorders and recorders[0].status().n_accepted > 3:
+            raise DeviceStoppedError("it switched the lasers off")
+        return real(lasers, timeout_s)
+
+    monkeypatch.setattr(RecordingWriter, "begin", begin)
+    monkeypatch.setattr(TwinLasers, "read", read)
+    words = ["record", str(rig), "--exposures", "300", "-o", str(output)]
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert re.search(r"after [0-9.]+ s twin .*lasers: it switched the lasers off", told)
+    assert "what came before is whole" in told
+    assert 3 < len(read_recording(output).rows) < 300
+
+
 def test_faults_of_this_program_are_no_device_s() -> None:
     run: Any = _Recording.__new__(_Recording)
     run._n_faults, run._why_ended, run._tell = 0, "", lambda _: None
+    run._is_over = False
     run._hear(LiveEvent("fault", "the images are no longer matched", MATCHING))
     assert run._n_faults == 0 and "no longer matched" in run._why_ended
     run._hear(LiveEvent("fault", "unplugged", "camera 0"))

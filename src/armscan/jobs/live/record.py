@@ -203,6 +203,7 @@ class _Recording:
         self._before_it: Path | None = None
         self._held = ExitStack()
         self._why_ended = ""
+        self._is_over = False
         self._is_triggered = rig.description.is_common_trigger
 
     def until_the_end(self, request: RecordRequest) -> None:
@@ -227,7 +228,7 @@ class _Recording:
                 with suppress(OutputError):
                     self._close()
             raise
-        is_kept = self._session.is_recording
+        is_kept = self._session.is_recording and not self._is_over
         with _deaf():
             self._session.stop()
             self._close()
@@ -237,7 +238,8 @@ class _Recording:
         """An error where there is nothing to go on with, or not all."""
         if not self._end.n_written:
             raise DeviceError(
-                f"no image came in {self._seconds:.1f} s",
+                f"no image came in {self._seconds:.1f} s"
+                + (f"; {self._why_ended}" if self._why_ended else ""),
                 remedy="check camera and trigger; `armscan devices` lists what answers",
             )
         if self._recorder.n_aside == self._end.n_written:
@@ -305,7 +307,7 @@ class _Recording:
             wanted = request.n_exposures
             if is_over or (wanted is not None and status.n_accepted >= wanted):
                 return
-            if not self._session.is_recording:
+            if self._is_over or not self._session.is_recording:
                 return
             if now - told >= TOLD_EVERY_S:
                 told = now
@@ -348,8 +350,10 @@ class _Recording:
         if event.kind in ("fault", "recovered", "warning"):
             self._n_faults += event.kind == "fault" and event.device not in OWN_PARTS
             self._tell(f"{event.kind}: {event.words}")
-        if event.device in (MATCHING, RECORDER) and not self._why_ended:
-            self._why_ended = event.text
+        # lasers that went off for safety are lit by a person alone, and nothing is seen without
+        self._is_over |= event.is_final
+        if (event.is_final or event.device in (MATCHING, RECORDER)) and not self._why_ended:
+            self._why_ended = event.words
 
     def summary(self, scanner: Path | None) -> Summary:
         """What was written."""

@@ -369,7 +369,7 @@ def test_faults_of_this_program_are_no_device_s() -> None:
         "windows = [[1, 2, 3]]", "windows = [[1, 2, 3, 0]]", "windows = []\nrate_hz = nan",
         'schedule = ["A"]\nchooses_lasers = true', '[exposure]\nmode = "auto"',
         "[exposure]\ntarget = 3.0", "[stripes]\nthreshold = -1.0", 'arm_model = "none.toml"',
-        "rate_hz = 0.0", "colour = 3",
+        "rate_hz = 0.0", "colour = 3", 'lasers = "x:"\nschedule = ["A+"]',
     ],
 )  # fmt: skip
 def test_a_wrong_description_is_refused(
@@ -381,3 +381,22 @@ def test_a_wrong_description_is_refused(
     err = capsys.readouterr().err
     assert str(tmp_path) in err and "Traceback" not in err
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('schedule = ["A", "B"]', "schedule says which lasers are on, and there is no laser contr"),
+        ("chooses_lasers = true", "chooses_lasers says which lasers are on, and there is no laser"),
+        ('lasers = "x:"\nschedule = ["A+A"]', "the step 'A+A' of schedule names a laser twice"),
+        ('lasers = "x:"\nchooses_lasers = true', "no scanner is given; give --scanner"),
+    ],
+)
+def test_lasers_that_nothing_would_choose_are_refused_before_a_device_is_opened(
+    line: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(f'cameras = ["webcam:0"]\n{line}\n')
+    assert main(["record", str(path), "-o", str(tmp_path / "x.mcap")]) == 2
+    err = capsys.readouterr().err
+    assert words in err and "opening the devices" not in err

@@ -150,6 +150,12 @@ def record_scan(
     check_outputs((output,), is_overwriting=is_overwriting)
     check_aside(output)
     place = request.scanner or (Path(description.scanner) if description.scanner else None)
+    if description.chooses_lasers and place is None:
+        raise OptionError(
+            "chooses_lasers asks the scanner which lasers come next, and no scanner is given",
+            where=request.rig,
+            remedy='give --scanner, or schedule = ["A", "B"] in place of chooses_lasers',
+        )
     scanner = None if place is None else read_scanner_calibration(place)
     tell("opening the devices ...")
     with Rig.open(description, open_device) as rig:

@@ -62,7 +62,7 @@ from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
-from armscan.models.calibration import CameraCalibration
+from armscan.models.calibration import CameraCalibration, independent_parameters
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import TwoViews, epipolar_distances_px
 from armscan.vision.targets.target import Target, TargetView
@@ -157,6 +157,8 @@ def joint_basis(cameras: Cameras) -> FloatArray:
 def prior_of(given: tuple[CameraCalibration, CameraCalibration]) -> Prior:
     """The given calibrations as observations of the intrinsics.
 
+    Of focal lengths that were held to each other fx is observed; fy follows it (`joint_basis`).
+
     Raises
     ------
     OptionError
@@ -165,7 +167,7 @@ def prior_of(given: tuple[CameraCalibration, CameraCalibration]) -> Prior:
     information = np.zeros((N_INTRINSICS, N_INTRINSICS))
     n_known = 0
     for side, calibration in enumerate(given):
-        known = np.flatnonzero(np.diag(calibration.covariance) > 0.0)
+        known = independent_parameters(calibration.covariance)
         if not calibration.has_covariance or not len(known):
             raise OptionError(
                 f"the {('left', 'right')[side]} camera's calibration brings no covariance",

@@ -22,7 +22,11 @@ from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.models.calibration import CameraCalibration
+from armscan.models.calibration import (
+    CameraCalibration,
+    independent_parameters,
+    is_aspect_held,
+)
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.models.two_views import IntrinsicsUse
 from armscan.vision.targets.detect import Numbering, renumbered
@@ -285,10 +289,10 @@ def _given(
     fit: CameraFit | None,
     options: StereoOptions,
 ) -> SingleCamera:
-    known = np.diag(given.covariance) > 0.0
     is_prior = options.intrinsics == "prior"
-    names = tuple(name for name, is_free in zip(PARAMETER_NAMES, known, strict=True) if is_free)
-    free = names if is_prior else ()
+    known = independent_parameters(given.covariance)
+    free = tuple(PARAMETER_NAMES[k] for k in known) if is_prior else ()
+    is_held = is_prior and is_aspect_held(given.covariance)
     outliers: dict[str, BoolArray] = {}
     left_out: dict[str, str] = {}
     found = {view.source: view for view in fit.used_views} if fit is not None else {}
@@ -307,7 +311,7 @@ def _given(
     return SingleCamera(
         given.camera,
         free,
-        basis_of(free, is_aspect_fixed=False)[: len(PARAMETER_NAMES)],
+        basis_of(free, is_aspect_fixed=is_held)[: len(PARAMETER_NAMES)],
         outliers,
         left_out,
         fit,
@@ -366,9 +370,10 @@ def _level(own: CameraFit, given: CameraCalibration) -> float:
     a, b = own.camera, given.camera
     if (a.width_px, a.height_px) != (b.width_px, b.height_px):
         return float("inf")
-    free = np.flatnonzero(own.sigma > 0.0)
+    both = own.covariance + given.covariance
+    free = np.intersect1d(np.flatnonzero(own.sigma > 0.0), independent_parameters(both))
     apart = (a.parameters - b.parameters)[free]
-    covariance = (own.covariance + given.covariance)[np.ix_(free, free)]
+    covariance = both[np.ix_(free, free)]
     sigma = np.sqrt(np.diag(covariance))
     white = np.linalg.solve(covariance / np.outer(sigma, sigma), apart / sigma)
     return float(white @ (apart / sigma)) / len(free)

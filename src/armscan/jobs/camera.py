@@ -160,11 +160,13 @@ def calibrate_camera_from_file(
     places = job.places(".json", beside=(".npz", ".html"))
     observations_file = observations_of(camera_file)
     before, found = read_camera_calibration(camera_file), read_observations(observations_file)
-    options = CameraOptions(
-        **{**recorded_options(before.provenance, CameraOptions), **(changes or {})}
-    )
     sources = [view.source for view in found.views]
-    options = replace(options, leave_out=named_by(options.leave_out, sources))
+    changed = recorded_options(before.provenance, CameraOptions)
+    # a view that was left out and has no pose is not among the observations
+    changed["leave_out"] = tuple(one for one in changed.get("leave_out", ()) if one in sources)
+    changed.update(changes or {})
+    changed["leave_out"] = named_by(changed["leave_out"], sources)
+    options = CameraOptions(**changed)
     kinds: tuple[type[Target], ...] = (Chessboard, Charuco, CircleGrid, AprilGrid)
     recorded = {kind: recorded_options(before.provenance, kind) for kind in kinds}
     targets = [kind(**values) for kind, values in recorded.items() if values]

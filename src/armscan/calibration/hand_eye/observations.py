@@ -187,6 +187,17 @@ class PlateReference(ArrayRecord):
     n_points: int = 0
     tip_diameter_mm: float = 0.0
 
+    @property
+    def touch_sigma_mm(self) -> float | None:
+        """Standard deviation of one touch on which the covariance rests; None where not known.
+
+        Of few touches it is mostly what was expected of one: their residuals say little of it, and
+        those of three nothing.
+        """
+        if self.covariance is None or not self.n_points:
+            return None
+        return float(np.sqrt(self.n_points * self.covariance[2, 2]))
+
 
 def check_postures(stripes: Sequence[PosedStripe], options: HandEyeOptions) -> None:
     """Refuse a posture's name that stands for different poses of the arm.

@@ -245,6 +245,11 @@ class CameraCalibration(ArrayRecord):
         return replace(self, camera=moved, covariance=covariance)
 
 
+def without_covariance(figures: str, camera: str = "the camera") -> str:
+    """The warning that ``figures`` do not hold what a camera errs by."""
+    return f"{camera} came without covariance: {figures} leave its errors out"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetCalibration:
     """One light sheet and what it rests on.
@@ -342,6 +347,13 @@ class SensorCalibration(ArrayRecord):
         """Columns of ``covariance`` that belong to sheet number ``index``."""
         start = len(CAMERA_PARAMETER_NAMES) + index * len(SHEET_PARAMETER_NAMES)
         return slice(start, start + len(SHEET_PARAMETER_NAMES))
+
+    @property
+    def has_camera_covariance(self) -> bool:
+        """False if a camera came without covariance."""
+        return self.camera.has_covariance and (
+            self.second is None or self.second.camera.has_covariance
+        )
 
     @property
     def second_parameter_slice(self) -> slice:

@@ -122,3 +122,21 @@ def test_a_camera_of_square_pixels_is_compared_with_another_and_with_the_truth()
     error = camera.camera.parameters - SQUARE.views.left.parameters
     assert told.normalised**2 == pytest.approx(squared_over_own(error, camera.covariance, [1]))
     assert low < told.normalised**2 < high
+
+
+def test_a_held_camera_without_covariance_is_named() -> None:
+    """What is stated of the pair does not hold its errors; the other camera's are in it."""
+    known = np.diag([1.0, 1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-6, 1e-6, 1e-4]) ** 2
+    options = StereoOptions(CameraOptions("k1k2", n_folds=0), intrinsics="fixed", n_folds=0)
+    for given, named in (
+        ((held(SQUARE.views.left, known), held(SQUARE.views.right)), ["right"]),
+        ((held(SQUARE.views.left), held(SQUARE.views.right)), ["left", "right"]),
+        ((held(SQUARE.views.left, known), held(SQUARE.views.right, known)), []),
+    ):
+        fit = calibrate_stereo(make_pairs(SQUARE, 1)[0], SQUARE.target, options, given)
+        assert isinstance(fit, StereoFit), fit
+        told = [text for text in fit.warnings if "came without covariance" in text]
+        assert told == [
+            f"the {side} camera came without covariance: the pair's sigmas leave its errors out"
+            for side in named
+        ]

@@ -175,6 +175,8 @@ class SingleCamera:
         Reason for each other view, by source.
     fit
         The camera by itself; None if its views do not determine one and it was given.
+    has_covariance
+        False if it is held as a calibration without uncertainty gives it.
     given_level
         Squared distance of given intrinsics from what the images say by themselves, over both
         covariances and the degrees of freedom; NaN where there is none.
@@ -188,6 +190,7 @@ class SingleCamera:
     fit: CameraFit | None
     reason: str
     given_level: float = float("nan")
+    has_covariance: bool = True
 
     def kept(self, view: TargetView | None) -> TargetView | None:
         """The view if it can be used."""
@@ -317,6 +320,7 @@ def _given(
         fit,
         f"the given calibration is {word}",
         float("nan") if fit is None else _level(fit, given),
+        given.has_covariance,
     )
 
 

@@ -75,6 +75,7 @@ from armscan.models.calibration import (
     CameraCalibration,
     HandEyeCalibration,
     HandEyeDiagnostics,
+    without_covariance,
 )
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Target
@@ -126,10 +127,7 @@ def calibrate_on_board(
         if better is not None:
             return better
     if not camera.has_covariance:
-        notes += (
-            "the camera's calibration came without uncertainty and is taken as exact: the "
-            "hand-eye's sigmas do not hold what it errs by",
-        )
+        notes += (without_covariance("the hand-eye's sigmas"),)
     return replace(found, warnings=(*notes, *found.warnings))
 
 

@@ -220,7 +220,8 @@ def test_what_a_killed_run_left_is_named_and_not_replaced(
 def test_a_recording_that_still_grows_is_not_replaced(
     rig: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    output, refused = rig.parent / "scan.mcap", []
+    output = rig.parent / "scan.mcap"
+    refused: list[str] = []
     real = _Recording._watch
 
     def watched(run: _Recording, request: RecordRequest, start: float) -> None:

@@ -170,6 +170,7 @@ def test_three_postures_are_too_few_however_often_they_are_looked_at_from(
         (["IMAGES", "--camera", "CAMERA"], "photographs and poses belong together"),
         (["IMAGES", "--poses", "POSES"], "need one calibration of the camera"),
         (["--camera", "CAMERA"], "nothing to calibrate from"),
+        (["--scan", "SCAN", "--camera", "CAMERA", "--bits-used", "12"], "a recording says itself"),
         (["IMAGES", "--poses", "POSES", "--scan", "SCAN", "--camera", "CAMERA"], "do not mix"),
         (["IMAGES/[0-5].png", "--poses", "POSES", "--camera", "CAMERA"], "6 photographs but 8"),
         (

@@ -148,6 +148,7 @@ def calibrate_hand_eye_on_board(
     if source.scan is None:
         views = _photographs(source, image_options)
     else:
+        image_options.check_unused()
         views = _scan_views(source)
     check_same_size(views.exposures)
     plate = settle_target(views.exposures, plate)

@@ -96,6 +96,21 @@ def test_what_cameras_are_given_for_is_checked_without_them(tmp_path: Path, fail
     assert "give --left and --right" in fixed
 
 
+def test_what_would_do_nothing_beside_given_cameras_is_refused(
+    tmp_path: Path, fails: Fails
+) -> None:
+    """Free intrinsics take no calibrations, and calibrations say themselves what is solved."""
+    camera = tmp_path / "camera.json"
+    camera.write_bytes(camera_document(held(LEFT)))
+    words = ["calibrate", "stereo", "left", "right", *TARGET, "--left", camera, "--right", camera]
+    words += ["-o", tmp_path / "stereo.json"]
+    free = fails(*words, "--intrinsics", "free", writes=tmp_path)
+    assert "free intrinsics take none; leave --left and --right out" in free
+    for use in ("prior", "fixed"):
+        said = fails(*words, "--intrinsics", use, "--distortion", "k1", writes=tmp_path)
+        assert "leave out --distortion" in said
+
+
 @pytest.mark.parametrize("command", ["camera", "stereo", "laser"])
 def test_the_page_of_a_refusal_tells_what_is_odd_in_the_recording(
     command: str, tmp_path: Path, fails: Fails

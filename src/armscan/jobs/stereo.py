@@ -75,12 +75,14 @@ def calibrate_stereo(
 
     ``left``, ``right``: image file, folder or pattern of each camera; empty if a recording is
     given. ``scan``: folder recording of a head with two cameras, instead of images. ``cameras``:
-    calibrations of the single cameras, left and right, or None.
+    calibrations of the single cameras, left and right, or None; for ``options.intrinsics`` that
+    take them.
     """
     options, image_options = options or StereoOptions(), image_options or ImageOptions()
     plate = parse_target(target)
     places = job.places(".json", beside=(".npz", ".html"))
     given = _given(*cameras)
+    options.check_given(is_given=given is not None)
     read = _stereo_images(left, right, scan, image_options, options.leave_out)
     hashes = {source: fingerprint(path).sha256 for source, path in read.paths.items()}
     if given is not None and options.intrinsics == "prior":

@@ -136,7 +136,7 @@ def test_calibrations_of_the_cameras_from_the_same_images_do_not_count_twice(
         camera = tmp_path / f"{side}.json"
         assert main(["calibrate", "camera", pattern, *TARGET, *SMALL, "-o", str(camera)]) == 0
         words += [f"--{side}", str(camera)]
-    both = (*sides("0[1-4]"), *TARGET, *SMALL, *words, "-o", str(tmp_path / "s.json"))
+    both = (*sides("0[1-4]"), *TARGET, *words, "-o", str(tmp_path / "s.json"))
     capsys.readouterr()
     assert calibrate(*both) == 2
     assert "count twice" in capsys.readouterr().err

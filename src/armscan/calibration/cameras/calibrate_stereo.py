@@ -375,24 +375,18 @@ def calibrate_stereo(
     that all pairs agree. Pairs that contradict the others are named and taken apart. A bow of the
     board that a camera by itself cannot do without is taken over from there.
 
-    ``given`` are calibrations of the left and of the right camera, unless the intrinsics are
-    ``free``.
+    ``given`` are calibrations of the left and of the right camera; none for ``free`` intrinsics.
 
     Raises
     ------
     InputError
         If the images of one camera differ in size or name, or not in name.
     OptionError
-        If a pair to leave out does not exist, or given calibrations are missing or without
-        covariance where one is needed.
+        If a pair to leave out does not exist, or calibrations are given for ``free`` intrinsics,
+        or are missing or without covariance where one is needed.
     """
     options = options or StereoOptions()
-    if options.intrinsics != "free" and given is None:
-        raise OptionError(
-            f"intrinsics '{options.intrinsics}' need calibrations of both cameras",
-            remedy="give them, or let the intrinsics be free",
-        )
-    given = None if options.intrinsics == "free" else given
+    options.check_given(is_given=given is not None)
     chosen = check_pairs(pairs, options.leave_out)
     n_both = sum(pair.is_seen_by_both for pair in chosen)
     if n_both < MIN_PAIRS:

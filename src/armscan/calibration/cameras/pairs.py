@@ -45,8 +45,9 @@ class StereoOptions:
     Parameters
     ----------
     camera
-        Of each camera: distortion model, what is held, most steps. What it
-        says of views to leave out and of folds does not count here.
+        Of each camera: distortion model, what is held, most steps. Where calibrations are given,
+        these say what is solved: the model is then that of the solutions which they are compared
+        with. What it says of views to leave out and of folds does not count here.
     intrinsics
         What given calibrations of the cameras are for: ``free`` takes none, ``prior`` takes their
         values with their covariance as observations beside the images, ``fixed`` holds them (their
@@ -74,6 +75,20 @@ class StereoOptions:
             )
         if self.n_folds < 0 or self.n_folds == 1:
             raise OptionError(f"n_folds is {self.n_folds}", remedy="give 0 (off) or at least 2")
+
+    def check_given(self, *, is_given: bool) -> None:
+        """Raise `OptionError` if calibrations are given for nothing, or missing."""
+        if is_given and self.intrinsics == "free":
+            raise OptionError(
+                "calibrations of the cameras are given, and free intrinsics take none",
+                where="--intrinsics free",
+                remedy="leave --left and --right out, or count them (prior) or hold them (fixed)",
+            )
+        if not is_given and self.intrinsics != "free":
+            raise OptionError(
+                f"intrinsics '{self.intrinsics}' need calibrations of both cameras",
+                remedy="give them, or let the intrinsics be free",
+            )
 
 
 SIDES = ("left", "right")

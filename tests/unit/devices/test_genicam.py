@@ -18,7 +18,8 @@ import pytest
 from armscan.devices.contract import check_camera
 from armscan.devices.protocols import Camera, CameraSettings, Frame
 from armscan.devices.registry import open_device, survey_drivers
-from armscan.drivers.genicam import GenICamCamera, RawFrame, image_of
+from armscan.drivers.genicam import GenICamCamera
+from armscan.drivers.genicam_libraries import RawFrame, image_of
 from armscan.errors import DeviceError, DeviceTakenError
 from armscan.records.exposure import SensorWindow
 

@@ -358,8 +358,15 @@ class StreamMonitor:
         """Whether the newest element has a time by this computer's clock."""
         return not self.clock.missing(self._t_device_ns)
 
-    def check(self, number: int, t_device_ns: int, t_host_ns: int) -> ElementStatus:
-        """Take one element by its count and its times by the device's and this computer's clock."""
+    def check(
+        self, number: int, t_device_ns: int, t_host_ns: int, *, is_timed: bool = True
+    ) -> ElementStatus:
+        """Take one element by its count and its times by the device's and this computer's clock.
+
+        ``t_device_ns`` is a moment that arrivals follow by a constant least delay: of a frame the
+        end of its exposure. An element that is not ``is_timed`` counts, and tells nothing of the
+        clock.
+        """
         self.counts.n_elements += 1
         last = self._number
         if last is not None and number <= last:
@@ -380,6 +387,8 @@ class StreamMonitor:
         uneven = has_time and self._is_uneven(step, t_device_ns)
         self._seen.append((number, t_device_ns))
         self._number, self._t_device_ns = number, t_device_ns
+        if not is_timed and not back:
+            return ElementStatus.USABLE
         if back:
             self.clock.restart()
             self.clock.n_jumps += 1

@@ -61,6 +61,12 @@ class Frame:
         The part of the sensor that the image shows.
     is_complete
         False where parts of the image were lost on the way.
+    exposure_ns
+        How long this frame was exposed: it arrives after the END of the exposure. 0 where the
+        driver cannot tell; then its arrivals tell the clock only while the time stays the same.
+    is_timed
+        False where the middle is not certain, as of a frame that was under way while the exposure
+        time was changed.
     """
 
     image: ImageArray
@@ -71,6 +77,8 @@ class Frame:
     lasers: tuple[str, ...] | None = None
     window: SensorWindow = field(default_factory=SensorWindow)
     is_complete: bool = True
+    exposure_ns: int = 0
+    is_timed: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from armscan.devices.inbox import Inbox
@@ -38,6 +39,12 @@ from armscan.records.recording import CameraSetup
 _EXPOSURE = ("ExposureTime", "ExposureTimeAbs")
 _GAIN = ("Gain", "GainRaw")
 _RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+_CHUNKS = (("ChunkModeActive", True), ("ChunkSelector", "ExposureTime"), ("ChunkEnable", True))
+"""Has each frame tell its own exposure time."""
+_UNDER_WAY, _UNDER_WAY_NS = 3, 100_000_000
+"""So many frames, and all that came so soon, may still have been exposed as before a change."""
+_SMALL_CHANGE_NS = 50_000
+"""A change by less moves no middle by more than 25 us."""
 _MOST_FRAMES = 32
 _SHORT_IDS = 65_535
 """GigE Vision 1 counts frames from 1 to this and then begins again at 1."""
@@ -76,6 +83,8 @@ class GenICamCamera:
         self._thread: threading.Thread | None = None
         self._numbers = _Count()
         self._last_camera_ns: int | None = None
+        self._exposure = _ExposureInUse()
+        self._is_auto = False
         self._lock = threading.RLock()
         try:
             self._setup = self._read_setup()
@@ -83,6 +92,7 @@ class GenICamCamera:
         except DeviceError:
             self.close()
             raise
+        self._exposure.settle(self._settings.exposure_us)
 
     @property
     def setup(self) -> CameraSetup:
@@ -102,9 +112,15 @@ class GenICamCamera:
             is_resized = settings.window is not None or settings.size_px is not None
             if running is not None and is_resized:
                 self._halt()
-            self._call(lambda: self._apply(settings))
-            self._setup = self._read_setup()
-            self._settings = self._read_settings()
+            if settings.exposure_us is not None:
+                self._exposure.begin_change(settings.exposure_us)
+            try:
+                self._call(lambda: self._apply(settings))
+                self._setup = self._read_setup()
+                self._settings = self._read_settings()
+            finally:
+                self._exposure.settle(self._settings.exposure_us)
+            self._is_auto = self._has_own_control()
             if running is not None and is_resized:
                 self._begin(running)
         return self._settings
@@ -160,6 +176,7 @@ class GenICamCamera:
 
     def _begin(self, trigger: TriggerMode) -> None:
         self._call(lambda: self._set_trigger(trigger))
+        self._know_exposures()
         self._numbers.begin_anew(self._camera.has_short_ids)
         self._call(self._camera.begin)
         self._trigger = trigger
@@ -174,6 +191,31 @@ class GenICamCamera:
 
     def _first_of(self, names: tuple[str, ...]) -> str | None:
         return next((name for name in names if self._camera.has(name)), None)
+
+    def _know_exposures(self) -> None:
+        """Have frames tell their exposure; else the camera must not change it by itself."""
+        try:
+            for name, value in _CHUNKS:
+                self._camera.set(name, value)
+        except Exception:
+            # libraries raise whatever they like where a feature or its value is missing
+            with suppress(Exception):
+                self._camera.set("ChunkModeActive", False)
+            if self._has_own_control():
+                self._call(lambda: self._camera.set("ExposureAuto", "Off"))
+            self._settings = self._read_settings()
+        # none that is under way outlives a stop
+        self._exposure.settle(self._settings.exposure_us)
+        self._is_auto = self._has_own_control()
+
+    def _has_own_control(self) -> bool:
+        """Whether the camera changes its exposure time by itself."""
+
+        def ask() -> bool:
+            camera = self._camera
+            return camera.has("ExposureAuto") and str(camera.get("ExposureAuto")) != "Off"
+
+        return bool(self._call(ask))
 
     def _set_trigger(self, trigger: TriggerMode) -> None:
         if self._camera.has("TriggerSelector"):
@@ -281,11 +323,17 @@ class GenICamCamera:
             return None
         self._last_camera_ns = t_camera_ns
         number = self._numbers.of(raw.number)
-        half_ns = round(500.0 * (self._settings.exposure_us or 0.0))
-        t_ns = t_host_ns if raw.t_camera_ns is None else raw.t_camera_ns + half_ns
+        if t_camera_ns is None:
+            t_ns, exposure_ns, is_timed = t_host_ns, 0, True
+        else:
+            exposure_ns, is_sure = self._exposure.of_frame(t_host_ns)
+            if raw.exposure_us is not None:
+                exposure_ns, is_sure = round(1e3 * raw.exposure_us), True
+            is_timed = is_sure and not (self._is_auto and raw.exposure_us is None)
+            t_ns = t_camera_ns + exposure_ns // 2
         return Frame(
             raw.image, number, t_ns, t_host_ns, window=self._setup.window,
-            is_complete=raw.is_complete,
+            is_complete=raw.is_complete, exposure_ns=exposure_ns, is_timed=is_timed,
         )  # fmt: skip
 
 
@@ -297,6 +345,48 @@ _SWITCHES = {
     "AcquisitionFrameRate": (("AcquisitionFrameRateEnable", True),),
     "AcquisitionFrameRateAbs": (("AcquisitionFrameRateEnable", True),),
 }
+
+
+class _ExposureInUse:
+    """The exposure time of frames that do not tell their own; any thread may ask.
+
+    After a change nobody tells which frame is the first of the new time. Until all that were under
+    way must have come, the shorter one is told, with which no arrival is too early, as not sure.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._possible_ns: tuple[int, ...] = (0,)
+        self._is_changing = False
+        self._settled_ns = self._n_since = 0
+
+    def begin_change(self, wished_us: float) -> None:
+        """Another time is about to be set."""
+        with self._lock:
+            self._possible_ns = (*self._possible_ns, round(1e3 * wished_us))
+            self._is_changing = True
+
+    def settle(self, exposure_us: float | None) -> None:
+        """This one is set now."""
+        with self._lock:
+            set_ns = round(1e3 * (exposure_us or 0.0))
+            if self._is_changing:
+                self._settled_ns, self._n_since = time.monotonic_ns(), 0
+                self._possible_ns = (min(self._possible_ns), max(self._possible_ns), set_ns)
+            else:
+                self._possible_ns = (set_ns,)
+            self._is_changing = False
+
+    def of_frame(self, t_host_ns: int) -> tuple[int, bool]:
+        """Exposure time in ns of a frame that arrives, and whether it is sure."""
+        with self._lock:
+            self._n_since += 1
+            is_late = t_host_ns > self._settled_ns + _UNDER_WAY_NS
+            if not self._is_changing and is_late and self._n_since > _UNDER_WAY:
+                self._possible_ns = self._possible_ns[-1:]
+            least, most = min(self._possible_ns), max(self._possible_ns)
+            is_sure = most - least <= _SMALL_CHANGE_NS
+            return (self._possible_ns[-1] if is_sure else least), is_sure
 
 
 class _Count:

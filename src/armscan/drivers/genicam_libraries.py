@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -27,6 +29,8 @@ FORMATS: dict[str, tuple[int, PixelColour]] = {
 }
 _N_BUFFERS = 16
 FETCH_S = 0.1
+_CHUNKS = ("ChunkExposureTime", "ChunkExposureTimeAbs")
+"""Where a frame bears its own exposure time in us, if the camera sends it along."""
 PYLON_INSTALL = "pip install 'armscan[pylon]'"
 
 
@@ -42,12 +46,15 @@ class RawFrame:
         Its time at the start of the exposure; None for a camera without clock.
     is_complete
         False where packets were lost.
+    exposure_us
+        As the frame itself tells; None where it does not.
     """
 
     image: ImageArray
     number: int
     t_camera_ns: int | None
     is_complete: bool
+    exposure_us: float | None = None
 
 
 class GenICamLibrary(Protocol):
@@ -93,6 +100,15 @@ def image_of(data: bytes, width: int, height: int, form: str) -> ImageArray:
     return np.asarray(flat.reshape(shape))
 
 
+def _first_told(read: Callable[[str], Any]) -> float | None:
+    """The exposure time that a frame bears; None where it bears none."""
+    for name in _CHUNKS:
+        # libraries raise whatever they like where a frame has no such part
+        with suppress(Exception):
+            return float(read(name))
+    return None
+
+
 class AravisLibrary:
     """A camera by Aravis; see `GenICamLibrary`."""
 
@@ -113,6 +129,7 @@ class AravisLibrary:
             ) from error
         self._device = self._camera.get_device()
         self._stream: Any = None
+        self._chunks: Any = None
         self._shape = 0, 0, "Mono8"
         self._is_lost = False
         self._device.connect("control-lost", self._lose)
@@ -156,6 +173,7 @@ class AravisLibrary:
     def begin(self) -> None:
         """Start the acquisition."""
         self._stream = self._camera.create_stream(None, None)
+        self._chunks = self._camera.create_chunk_parser()
         payload = self._camera.get_payload()
         size = int(self.get("Width")), int(self.get("Height"))
         self._shape = *size, str(self.get("PixelFormat"))
@@ -183,7 +201,8 @@ class AravisLibrary:
             image = image_of(buffer.get_data(), *self._shape)
             stamp = int(buffer.get_timestamp())
             is_whole = state == status.SUCCESS
-            return RawFrame(image, int(buffer.get_frame_id()), stamp or None, is_whole)
+            told = _first_told(lambda name: self._chunks.get_float_value(buffer, name))
+            return RawFrame(image, int(buffer.get_frame_id()), stamp or None, is_whole, told)
         finally:
             self._stream.push_buffer(buffer)
 
@@ -195,7 +214,7 @@ class AravisLibrary:
 
     def close(self) -> None:
         """Give the camera back: Aravis does so when nothing holds it, so what does is swept up."""
-        self._stream = self._device = self._camera = None
+        self._stream = self._chunks = self._device = self._camera = None
         gc.collect()
 
 
@@ -272,7 +291,8 @@ class PylonLibrary:
             number = int(result.BlockID)
             if number in _NO_BLOCK:
                 return None
-            return RawFrame(image, number, t_ns, is_whole)
+            told = _first_told(lambda name: result.ChunkDataNodeMap.GetNode(name).GetValue())
+            return RawFrame(image, number, t_ns, is_whole, told)
         finally:
             result.Release()
 

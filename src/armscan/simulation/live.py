@@ -405,7 +405,9 @@ class TwinRig:
             window = self.setup(camera).window
             told = trigger_id if self.plan.is_wired else None
             seen = None if self.lines["lasers"].is_open else lasers
-            self.lines[f"camera{camera}"].send(t_ns, Frame(image, 0, 0, 0, told, seen, window))
+            exposure_ns = round(1e3 * (self.settings[camera].exposure_us or 0.0))
+            frame = Frame(image, 0, 0, 0, told, seen, window, exposure_ns=exposure_ns)
+            self.lines[f"camera{camera}"].send(t_ns, frame)
         if self.are_lasers_started:
             self.lines["lasers"].send(t_ns, LaserEvent(trigger_id, 0, 0, lasers))
         is_travel = stage.way.is_travel(k)

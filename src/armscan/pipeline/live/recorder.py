@@ -132,6 +132,7 @@ class LiveRecorder:
             "number": frame.number,
             "t_device_ns": frame.t_device_ns,
             "t_host_ns": frame.t_host_ns,
+            "exposure_ns": frame.exposure_ns,
             "status": status.label,
             "trigger_id": frame.trigger_id,
         }

@@ -284,12 +284,13 @@ class TwinRig:
     def setup(self, camera: int) -> CameraSetup:
         """How a camera delivers its images now."""
         row = self._stage.instants[self._k % len(self._stage.instants)][camera]
-        window = self.scan_by(camera, self._stage).shots[row].settings.window
+        scan = self.scan_by(camera, self._stage)
+        window = scan.shots[row].settings.window
         return replace(
             self._stage.scan.session.cameras[camera],
             width_px=window.width_px,
             height_px=window.height_px,
-            window=SensorWindow(window.x_px, window.y_px),
+            window=scan.sensor_window(window, camera),
         )
 
     def samples(self, after_ns: int, start_ns: int) -> int:

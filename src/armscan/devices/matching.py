@@ -253,6 +253,8 @@ class InstantMatcher:
         pose = self._valid_pose(sample)
         if status in _SEEN_BEFORE:
             return TimedSample(sample, None, status, pose)
+        self.arm.counts.n_inaccurate += ArmFlag.INACCURATE in sample.flags
+        self.arm.counts.n_end_stop += ArmFlag.END_STOP in sample.flags
         self._forget_apart(status)
         t_ns = None
         if status == ElementStatus.USABLE:
@@ -272,7 +274,7 @@ class InstantMatcher:
         return TimedSample(sample, t_ns, status, pose)
 
     def _valid_pose(self, sample: ArmSample) -> Pose[Base, Tool] | None:
-        if ArmFlag.REFERENCED not in sample.flags:
+        if not sample.is_valid:
             return None
         if sample.pose is not None or sample.joints_rad is None or self._model is None:
             return sample.pose

@@ -15,7 +15,7 @@ from typing import Literal, Protocol
 
 from armscan.geometry.arrays import FloatArray, ImageArray
 from armscan.geometry.poses import Base, Pose, Tool
-from armscan.records.exposure import SensorWindow
+from armscan.records.exposure import SensorWindow, unstated_window
 from armscan.records.recording import CameraSetup, PoseForm
 
 DeviceKind = Literal["camera", "arm", "lasers"]
@@ -75,7 +75,7 @@ class Frame:
     t_host_ns: int
     trigger_id: int | None = None
     lasers: tuple[str, ...] | None = None
-    window: SensorWindow = field(default_factory=SensorWindow)
+    window: SensorWindow = field(default_factory=unstated_window)
     is_complete: bool = True
     exposure_ns: int = 0
     is_timed: bool = True
@@ -165,7 +165,7 @@ class ArmSample:
     buttons
         Bit k is set while button k is down.
     flags
-        State of the arm; a sample that is not `ArmFlag.REFERENCED` has no valid pose.
+        State of the arm.
     trigger_id
         Number of the trigger that it was taken at, or None.
     """
@@ -178,6 +178,14 @@ class ArmSample:
     buttons: int = 0
     flags: ArmFlag = ArmFlag.REFERENCED
     trigger_id: int | None = None
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether pose and angles may be used: not of an arm that says that they are not right.
+
+        At an end stop they are: whether that strains the arm, its own `ArmFlag.INACCURATE` says.
+        """
+        return ArmFlag.REFERENCED in self.flags and ArmFlag.INACCURATE not in self.flags
 
 
 class Arm(Protocol):

@@ -7,12 +7,17 @@ cameras still bear (EMVA, SFNC 2.7).
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
+import numpy as np
+
+from armscan.devices.clocks import ContinuedCount, ExposureInUse
 from armscan.devices.inbox import Inbox
 from armscan.devices.protocols import (
     Camera,
@@ -23,35 +28,89 @@ from armscan.devices.protocols import (
     TriggerMode,
 )
 from armscan.devices.registry import needed_package, split_place
-from armscan.drivers.genicam_libraries import (
-    FETCH_S,
-    FORMATS,
-    PYLON_INSTALL,
-    AravisLibrary,
-    GenICamLibrary,
-    PylonLibrary,
-    RawFrame,
-)
 from armscan.errors import ArmscanError, DeviceError, DeviceTakenError
-from armscan.records.exposure import SensorWindow
-from armscan.records.recording import CameraSetup
+from armscan.geometry.arrays import ImageArray
+from armscan.records.exposure import SensorWindow, window_of_sensor
+from armscan.records.recording import CameraSetup, PixelColour
 
 _EXPOSURE = ("ExposureTime", "ExposureTimeAbs")
 _GAIN = ("Gain", "GainRaw")
 _RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
-_CHUNKS = (("ChunkModeActive", True), ("ChunkSelector", "ExposureTime"), ("ChunkEnable", True))
+_TELLING = {"ChunkModeActive": True, "ChunkSelector": "ExposureTime", "ChunkEnable": True}
 """Has each frame tell its own exposure time."""
-_UNDER_WAY, _UNDER_WAY_NS = 3, 100_000_000
-"""So many frames, and all that came so soon, may still have been exposed as before a change."""
-_SMALL_CHANGE_NS = 50_000
-"""A change by less moves no middle by more than 25 us."""
+_FORMATS: dict[str, tuple[int, PixelColour]] = {
+    "Mono8": (8, "mono"),
+    "Mono10": (10, "mono"),
+    "Mono12": (12, "mono"),
+    "Mono16": (16, "mono"),
+    "BayerRG8": (8, "bayer_rggb"),
+    "BayerRG10": (10, "bayer_rggb"),
+    "BayerRG12": (12, "bayer_rggb"),
+    "RGB8": (8, "rgb"),
+    "RGB8Packed": (8, "rgb"),
+}
+_N_BUFFERS = 16
+_FETCH_S = 0.1
+_CHUNKS = ("ChunkExposureTime", "ChunkExposureTimeAbs")
+"""Where a frame bears its own exposure time in us, if the camera sends it along."""
+PYLON_INSTALL = "pip install 'armscan[pylon]'"
 _MOST_FRAMES = 32
-_SHORT_IDS = 65_535
-"""GigE Vision 1 counts frames from 1 to this and then begins again at 1."""
 ARAVIS_INSTALL = (
     "install your system's packages, on Debian: apt install gir1.2-aravis-0.8 python3-gi; "
     "and in a virtual environment: pip install 'pygobject<3.51'"
 )
+
+
+@dataclass(frozen=True, slots=True)
+class RawFrame:
+    """What a library delivers.
+
+    Parameters
+    ----------
+    number
+        The camera's own count.
+    t_camera_ns
+        Its time at the start of the exposure; None for a camera without clock.
+    is_complete
+        False where packets were lost.
+    exposure_us
+        As the frame itself tells; None where it does not.
+    """
+
+    image: ImageArray
+    number: int
+    t_camera_ns: int | None
+    is_complete: bool
+    exposure_us: float | None = None
+
+
+class GenICamLibrary(Protocol):
+    """One opened camera, by one of the libraries; any of its calls may raise anything."""
+
+    has_short_ids: bool
+
+    def has(self, feature: str) -> bool:
+        """Whether the camera has a feature now."""
+
+    def get(self, feature: str) -> Any:
+        """Value of a feature."""
+
+    def set(self, feature: str, value: Any) -> None:
+        """Set a feature, within its bounds and to its increment."""
+
+    def begin(self) -> None:
+        """Start the acquisition."""
+
+    def fetch(self) -> RawFrame | None:
+        """The next frame, waiting `_FETCH_S` at most."""
+
+    def end(self) -> None:
+        """Stop the acquisition."""
+
+    def close(self) -> None:
+        """Give the camera back."""
+
+
 _OPEN: set[str] = set()
 
 
@@ -81,9 +140,9 @@ class GenICamCamera:
         self._is_closed = False
         self._trigger: TriggerMode | None = None
         self._thread: threading.Thread | None = None
-        self._numbers = _Count()
+        self._numbers = ContinuedCount()
         self._last_camera_ns: int | None = None
-        self._exposure = _ExposureInUse()
+        self._exposure = ExposureInUse()
         self._is_auto = False
         self._lock = threading.RLock()
         try:
@@ -195,7 +254,7 @@ class GenICamCamera:
     def _know_exposures(self) -> None:
         """Have frames tell their exposure; else the camera must not change it by itself."""
         try:
-            for name, value in _CHUNKS:
+            for name, value in _TELLING.items():
                 self._camera.set(name, value)
         except Exception:
             # libraries raise whatever they like where a feature or its value is missing
@@ -204,18 +263,13 @@ class GenICamCamera:
             if self._has_own_control():
                 self._call(lambda: self._camera.set("ExposureAuto", "Off"))
             self._settings = self._read_settings()
-        # none that is under way outlives a stop
         self._exposure.settle(self._settings.exposure_us)
         self._is_auto = self._has_own_control()
 
     def _has_own_control(self) -> bool:
         """Whether the camera changes its exposure time by itself."""
-
-        def ask() -> bool:
-            camera = self._camera
-            return camera.has("ExposureAuto") and str(camera.get("ExposureAuto")) != "Off"
-
-        return bool(self._call(ask))
+        has = self._camera.has("ExposureAuto")
+        return has and str(self._call(lambda: self._camera.get("ExposureAuto"))) != "Off"
 
     def _set_trigger(self, trigger: TriggerMode) -> None:
         if self._camera.has("TriggerSelector"):
@@ -257,18 +311,22 @@ class GenICamCamera:
     def _read_setup(self) -> CameraSetup:
         def read() -> CameraSetup:
             camera = self._camera
-            if str(camera.get("PixelFormat")) not in FORMATS:
+            if str(camera.get("PixelFormat")) not in _FORMATS:
                 camera.set("PixelFormat", "Mono8")
-            bits, colour = FORMATS[str(camera.get("PixelFormat"))]
+            bits, colour = _FORMATS[str(camera.get("PixelFormat"))]
             step = int(camera.get("BinningHorizontal")) if camera.has("BinningHorizontal") else 1
             x, y = (
                 int(camera.get(name)) * step if camera.has(name) else 0
                 for name in ("OffsetX", "OffsetY")
             )
+            size_px = int(camera.get("Width")), int(camera.get("Height"))
+            place = SensorWindow(x, y, step)
+            if camera.has("SensorWidth") and camera.has("SensorHeight"):
+                sensor_px = int(camera.get("SensorWidth")), int(camera.get("SensorHeight"))
+                place = window_of_sensor(place, size_px, sensor_px)
             return CameraSetup(
-                int(camera.get("Width")),
-                int(camera.get("Height")),
-                SensorWindow(x, y, step),
+                *size_px,
+                place,
                 bits,
                 colour=colour,
             )
@@ -301,7 +359,7 @@ class GenICamCamera:
                 is_gone = True
                 fact = f"it does not answer ({type(error).__name__}: {error})"
                 self._inbox.fail(DeviceError(fact, where=self.name))
-                time.sleep(FETCH_S)
+                time.sleep(_FETCH_S)
                 continue
             if raw is None:
                 continue
@@ -326,10 +384,8 @@ class GenICamCamera:
         if t_camera_ns is None:
             t_ns, exposure_ns, is_timed = t_host_ns, 0, True
         else:
-            exposure_ns, is_sure = self._exposure.of_frame(t_host_ns)
-            if raw.exposure_us is not None:
-                exposure_ns, is_sure = round(1e3 * raw.exposure_us), True
-            is_timed = is_sure and not (self._is_auto and raw.exposure_us is None)
+            exposure_ns, is_timed = self._exposure.of_frame(t_host_ns, raw.exposure_us)
+            is_timed = is_timed and not (self._is_auto and raw.exposure_us is None)
             t_ns = t_camera_ns + exposure_ns // 2
         return Frame(
             raw.image, number, t_ns, t_host_ns, window=self._setup.window,
@@ -347,69 +403,230 @@ _SWITCHES = {
 }
 
 
-class _ExposureInUse:
-    """The exposure time of frames that do not tell their own; any thread may ask.
+def image_of(data: bytes, width: int, height: int, form: str) -> ImageArray:
+    """An array of its own of (H, W) or (H, W, 3) pixels; missing bytes at the end are black."""
+    if form not in _FORMATS:
+        raise DeviceError(
+            f"pixels of the format {form} are not read",
+            remedy=f"set PixelFormat to one of {', '.join(_FORMATS)}",
+        )
+    bits, colour = _FORMATS[form]
+    dtype: Any = np.uint8 if bits == 8 else np.uint16
+    shape = (height, width, 3) if colour == "rgb" else (height, width)
+    flat = np.zeros(int(np.prod(shape)), dtype)
+    came = np.frombuffer(data, dtype, count=min(len(data) // flat.itemsize, len(flat)))
+    flat[: len(came)] = came
+    return np.asarray(flat.reshape(shape))
 
-    After a change nobody tells which frame is the first of the new time. Until all that were under
-    way must have come, the shorter one is told, with which no arrival is too early, as not sure.
-    """
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._possible_ns: tuple[int, ...] = (0,)
-        self._is_changing = False
-        self._settled_ns = self._n_since = 0
+def _first_told(read: Callable[[str], Any]) -> float | None:
+    """The exposure time that a frame bears; None where it bears none."""
+    for name in _CHUNKS:
+        # libraries raise whatever they like where a frame has no such part
+        with suppress(Exception):
+            return float(read(name))
+    return None
 
-    def begin_change(self, wished_us: float) -> None:
-        """Another time is about to be set."""
-        with self._lock:
-            self._possible_ns = (*self._possible_ns, round(1e3 * wished_us))
-            self._is_changing = True
 
-    def settle(self, exposure_us: float | None) -> None:
-        """This one is set now."""
-        with self._lock:
-            set_ns = round(1e3 * (exposure_us or 0.0))
-            if self._is_changing:
-                self._settled_ns, self._n_since = time.monotonic_ns(), 0
-                self._possible_ns = (min(self._possible_ns), max(self._possible_ns), set_ns)
+class AravisLibrary:
+    """A camera by Aravis; see `GenICamLibrary`."""
+
+    def __init__(self, aravis: Any, camera_id: str | None) -> None:
+        self._aravis = aravis
+        try:
+            # without it the camera's interface is not known, and no frame finds the way here
+            aravis.update_device_list()
+            self._camera = aravis.Camera.new(camera_id)
+        except Exception as error:
+            where = f"aravis:{camera_id or ''}"
+            if "access" in str(error).lower() or "busy" in str(error).lower():
+                raise DeviceTakenError(f"{error}", where=where) from error
+            raise DeviceError(
+                f"no such camera ({error})",
+                where=where,
+                remedy="'armscan devices --kind camera' lists those that answer",
+            ) from error
+        self._device = self._camera.get_device()
+        self._stream: Any = None
+        self._chunks: Any = None
+        self._shape = 0, 0, "Mono8"
+        self._is_lost = False
+        self._device.connect("control-lost", self._lose)
+        self.has_short_ids = aravis.Camera.is_gv_device(self._camera)
+
+    def has(self, feature: str) -> bool:
+        """Whether the camera has a feature now."""
+        return bool(self._device.is_feature_available(feature))
+
+    def get(self, feature: str) -> Any:
+        """Value of a feature, by its own type."""
+        for read in (
+            self._device.get_integer_feature_value,
+            self._device.get_float_feature_value,
+            self._device.get_string_feature_value,
+        ):
+            if feature == "PixelFormat":
+                return self._device.get_string_feature_value(feature)
+            try:
+                return read(feature)
+            except Exception as error:
+                last = error
+        raise last
+
+    def set(self, feature: str, value: Any) -> None:
+        """Set a feature within its bounds."""
+        device = self._device
+        if isinstance(value, bool):
+            device.set_boolean_feature_value(feature, value)
+        elif isinstance(value, str):
+            device.set_string_feature_value(feature, value)
+        elif isinstance(value, int) or feature == "GainRaw":
+            low, high = device.get_integer_feature_bounds(feature)
+            step = max(device.get_integer_feature_increment(feature), 1)
+            near = int(np.clip(round(value), low, high))
+            device.set_integer_feature_value(feature, low + (near - low) // step * step)
+        else:
+            low, high = device.get_float_feature_bounds(feature)
+            device.set_float_feature_value(feature, float(np.clip(value, low, high)))
+
+    def begin(self) -> None:
+        """Start the acquisition."""
+        self._stream = self._camera.create_stream(None, None)
+        self._chunks = self._camera.create_chunk_parser()
+        payload = self._camera.get_payload()
+        size = int(self.get("Width")), int(self.get("Height"))
+        self._shape = *size, str(self.get("PixelFormat"))
+        for _ in range(_N_BUFFERS):
+            self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))
+        self._camera.start_acquisition()
+
+    def _lose(self, _: object) -> None:
+        """The camera did not answer its heartbeat; every further call would wait for seconds."""
+        self._is_lost = True
+
+    def fetch(self) -> RawFrame | None:
+        """The next frame; one with lost packets says so."""
+        if self._is_lost:
+            raise ConnectionError("it was unplugged, or lost its power")
+        buffer = self._stream.timeout_pop_buffer(round(1e6 * _FETCH_S))
+        if buffer is None:
+            return None
+        try:
+            status = self._aravis.BufferStatus
+            state = buffer.get_status()
+            if state in (status.CLEARED, status.ABORTED):
+                return None
+            # of a frame that lost packets even the size may be missing
+            image = image_of(buffer.get_data(), *self._shape)
+            stamp = int(buffer.get_timestamp())
+            is_whole = state == status.SUCCESS
+            told = _first_told(lambda name: self._chunks.get_float_value(buffer, name))
+            return RawFrame(image, int(buffer.get_frame_id()), stamp or None, is_whole, told)
+        finally:
+            self._stream.push_buffer(buffer)
+
+    def end(self) -> None:
+        """Stop the acquisition."""
+        if not self._is_lost:
+            self._camera.stop_acquisition()
+        self._stream = None
+
+    def close(self) -> None:
+        """Give the camera back: Aravis does so when nothing holds it, so what does is swept up."""
+        self._stream = self._chunks = self._device = self._camera = None
+        gc.collect()
+
+
+class PylonLibrary:
+    """A camera by Basler's pylon; see `GenICamLibrary`."""
+
+    def __init__(self, pylon: Any, serial: str | None) -> None:
+        self._pylon = pylon
+        self._genicam = needed_package("pypylon.genicam", PYLON_INSTALL)
+        where = f"pylon:{serial or ''}"
+        factory = pylon.TlFactory.GetInstance()
+        found = [one for one in factory.EnumerateDevices()
+                 if serial is None or one.GetSerialNumber() == serial]  # fmt: skip
+        if not found:
+            raise DeviceError(
+                "no such camera", where=where, remedy="'armscan devices --kind camera' lists them"
+            )
+        try:
+            self._camera = pylon.InstantCamera(factory.CreateDevice(found[0]))
+            self._camera.Open()
+        except Exception as error:
+            if "exclusive" in str(error).lower() or "use" in str(error).lower():
+                raise DeviceTakenError(f"it cannot be opened ({error})", where=where) from error
+            raise DeviceError(f"it cannot be opened ({error})", where=where) from error
+        self._camera.MaxNumBuffer.SetValue(_N_BUFFERS)
+        self._nodes = self._camera.GetNodeMap()
+        self.has_short_ids = "gige" in found[0].GetDeviceClass().lower()
+        tick_hz = "GevTimestampTickFrequency"
+        self._tick_ns = 1e9 / self.get(tick_hz) if self.has(tick_hz) else 1.0
+
+    def has(self, feature: str) -> bool:
+        """Whether the camera has a feature now."""
+        node = self._nodes.GetNode(feature)
+        return node is not None and bool(self._genicam.IsAvailable(node))
+
+    def get(self, feature: str) -> Any:
+        """Value of a feature."""
+        return self._nodes.GetNode(feature).GetValue()
+
+    def set(self, feature: str, value: Any) -> None:
+        """Set a feature within its bounds."""
+        node = self._nodes.GetNode(feature)
+        if isinstance(value, bool | str):
+            node.SetValue(value)
+            return
+        near = min(max(value, node.GetMin()), node.GetMax())
+        if isinstance(node.GetValue(), int):
+            step, low = max(node.GetInc(), 1), node.GetMin()
+            near = low + (round(near) - low) // step * step
+        node.SetValue(near)
+
+    def begin(self) -> None:
+        """Start the acquisition."""
+        self._camera.StartGrabbing(self._pylon.GrabStrategy_OneByOne)
+
+    def fetch(self) -> RawFrame | None:
+        """The next frame; one with lost packets says so."""
+        waited = round(1e3 * _FETCH_S)
+        result = self._camera.RetrieveResult(waited, self._pylon.TimeoutHandling_Return)
+        if result is None or not result.IsValid():
+            if self._camera.IsCameraDeviceRemoved():
+                raise ConnectionError("it was unplugged")
+            return None
+        try:
+            is_whole = bool(result.GrabSucceeded())
+            if is_whole:
+                image = np.array(result.GetArray())
             else:
-                self._possible_ns = (set_ns,)
-            self._is_changing = False
+                # pylon hands out no pixels of a damaged frame: its place is kept, in black
+                size = int(self.get("Width")), int(self.get("Height"))
+                image = image_of(b"", *size, str(self.get("PixelFormat")))
+            stamp = int(result.TimeStamp)
+            t_ns = round(self._tick_ns * stamp) if stamp else None
+            number = int(result.BlockID)
+            if number in _NO_BLOCK:
+                return None
+            told = _first_told(lambda name: result.ChunkDataNodeMap.GetNode(name).GetValue())
+            return RawFrame(image, number, t_ns, is_whole, told)
+        finally:
+            result.Release()
 
-    def of_frame(self, t_host_ns: int) -> tuple[int, bool]:
-        """Exposure time in ns of a frame that arrives, and whether it is sure."""
-        with self._lock:
-            self._n_since += 1
-            is_late = t_host_ns > self._settled_ns + _UNDER_WAY_NS
-            if not self._is_changing and is_late and self._n_since > _UNDER_WAY:
-                self._possible_ns = self._possible_ns[-1:]
-            least, most = min(self._possible_ns), max(self._possible_ns)
-            is_sure = most - least <= _SMALL_CHANGE_NS
-            return (self._possible_ns[-1] if is_sure else least), is_sure
+    def end(self) -> None:
+        """Stop the acquisition."""
+        self._camera.StopGrabbing()
+
+    def close(self) -> None:
+        """Give the camera back."""
+        self._camera.Close()
+        self._camera.DestroyDevice()
 
 
-class _Count:
-    """A count that goes on where the camera's begins anew."""
-
-    def __init__(self) -> None:
-        self._last = -1
-        self._base: int | None = 0
-        self._turn = 0
-
-    def begin_anew(self, has_short_ids: bool) -> None:
-        """The camera counts from its beginning again, after a start."""
-        self._turn = _SHORT_IDS if has_short_ids else 0
-        self._base = None
-
-    def of(self, number: int) -> int:
-        """The frame's number among all since the camera was opened."""
-        if self._base is None:
-            self._base = self._last + 1 - number
-        while self._turn and number + self._base < self._last - self._turn // 2:
-            self._base += self._turn
-        self._last = number + self._base
-        return self._last
+_NO_BLOCK = (2**64 - 1,)
+"""Told by pylon where a frame's number did not come."""
 
 
 def _aravis() -> Any:

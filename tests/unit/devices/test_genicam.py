@@ -19,8 +19,7 @@ import pytest
 from armscan.devices.contract import check_camera
 from armscan.devices.protocols import Camera, CameraSettings, Frame
 from armscan.devices.registry import open_device, survey_drivers
-from armscan.drivers.genicam import GenICamCamera
-from armscan.drivers.genicam_libraries import RawFrame, image_of
+from armscan.drivers.genicam import GenICamCamera, RawFrame, image_of
 from armscan.errors import DeviceError, DeviceTakenError
 from armscan.records.exposure import SensorWindow
 
@@ -337,6 +336,15 @@ def test_a_camera_that_tells_no_exposure_may_not_change_it_by_itself() -> None:
     camera.close()
     assert library.features["ExposureAuto"] == "Off" and not library.features["ChunkModeActive"]
     assert frame.is_timed and middles_us([frame]) == [1000.0]
+
+
+@pytest.mark.parametrize(("height", "is_stated"), [(2, False), (1, True)])
+def test_a_part_of_the_sensor_is_stated_as_a_window(height: int, is_stated: bool) -> None:
+    library = Library()
+    library.features |= {"SensorWidth": 4, "SensorHeight": 2, "Height": height}
+    camera = GenICamCamera("fake window", lambda: library, "Line1")
+    assert camera.setup.window.is_stated == is_stated
+    camera.close()
 
 
 def test_pixels_of_each_format() -> None:

@@ -296,13 +296,26 @@ def test_lasers_without_ids_are_told_only_where_they_did_not_change():
     assert set(found[196:202]) == {None}
 
 
-def test_an_unreferenced_arm_gives_no_pose():
+@pytest.mark.parametrize("said", [ArmFlag.NONE, ArmFlag.REFERENCED | ArmFlag.INACCURATE])
+def test_an_arm_that_says_that_its_poses_are_not_right_gives_none(said):
     matcher = InstantMatcher(has_controller=False)
     for k in range(600):
         t = k * 5_000_000
-        flags = ArmFlag.NONE if 300 <= k < 400 else ArmFlag.REFERENCED
+        flags = said if 300 <= k < 400 else ArmFlag.REFERENCED
         matcher.add_samples((ArmSample(k, t, t + 10**6, pose=true_pose(t * 1e-9), flags=flags),))
         matcher.add_frame(Frame(IMAGE, k, t, t + 10**6))
     status = [one.status for one in matcher.take(10**12)]
     assert set(status[310:390]) == {PoseStatus.UNKNOWN_SAMPLE}
     assert set(status[410:590]) == {PoseStatus.FOUND}
+    assert matcher.arm.counts.n_inaccurate == 100 * (ArmFlag.INACCURATE in said)
+
+
+def test_poses_at_an_end_stop_are_used_and_counted():
+    matcher = InstantMatcher(has_controller=False)
+    for k in range(600):
+        t = k * 5_000_000
+        flags = ArmFlag.REFERENCED | (ArmFlag.END_STOP if k >= 590 else ArmFlag.NONE)
+        matcher.add_samples((ArmSample(k, t, t + 10**6, pose=true_pose(t * 1e-9), flags=flags),))
+        matcher.add_frame(Frame(IMAGE, k, t, t + 10**6))
+    assert {one.status for one in matcher.take(10**12)[-10:]} == {PoseStatus.FOUND}
+    assert matcher.arm.counts.words == "10 at an end stop of the arm"

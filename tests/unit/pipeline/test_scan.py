@@ -147,7 +147,7 @@ def test_without_names_of_lasers_all_are_taken_as_lit(device: ScannerCalibration
 def test_an_image_whose_lasers_are_not_known_is_counted_and_not_measured(
     device: ScannerCalibration,
 ) -> None:
-    unknown = {"lasers": (), "flags": (LASER_UNKNOWN,)}
+    unknown: dict[str, object] = {"lasers": (), "flags": (LASER_UNKNOWN,)}
     scan = with_rows(fake_scan(), [{}, unknown, {}, {"lasers": ()}, unknown, {}])
     result = measure_scan(as_source(scan), device)
     states = [one.status for one in result.exposures]
@@ -161,7 +161,8 @@ def test_an_image_whose_lasers_are_not_known_is_counted_and_not_measured(
 def test_where_no_row_names_a_laser_a_row_of_unknown_lasers_makes_none_lit(
     device: ScannerCalibration,
 ) -> None:
-    dark, unknown = {"lasers": ()}, {"lasers": (), "flags": (LASER_UNKNOWN,)}
+    dark: dict[str, object] = {"lasers": ()}
+    unknown: dict[str, object] = {**dark, "flags": (LASER_UNKNOWN,)}
     scan = with_rows(fake_scan(), [unknown, dark, unknown, dark, unknown, dark])
     with pytest.raises(EstimationError, match="no exposure with a pose could be measured"):
         measure_scan(as_source(scan), device)

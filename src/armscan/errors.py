@@ -84,5 +84,9 @@ class DeviceTakenError(DeviceError):
     """Another program, or this one, has the device open already."""
 
 
+class DeviceStoppedError(DeviceError):
+    """A device stopped for safety, and does nothing until a person has it started again."""
+
+
 class EstimationError(ArmscanError):
     """The data do not determine what was asked for."""

@@ -38,6 +38,23 @@ def poses(tmp_path: Path) -> Path:
     return path
 
 
+def repeat_exposures(scan: Path, folder: Path, n_postures: int) -> None:
+    """Two looks from each of the first postures, without views; the arm's poses are 4 um apart."""
+    (folder / "images").mkdir(parents=True)
+    shutil.copy(scan / "session.toml", folder / "session.toml")
+    header, *samples = (scan / "arm.csv").read_text().splitlines()
+    exposures, track = ["index,t_ns,camera,file,lasers"], [header]
+    for row in range(2 * n_postures):
+        k, t_ns = row // 2, 10**9 * (row + 1)
+        shutil.copy(scan / "images" / f"{k}.png", folder / "images" / f"{row}.png")
+        exposures.append(f"{row},{t_ns},0,images/{row}.png,")
+        _, x, *others = samples[2 * k].split(",")
+        told = ",".join([repr(float(x) + 0.002 * (-1) ** row), *others])
+        track += [f"{t_ns + shift},{told}" for shift in (-(10**7), 10**7)]
+    (folder / "exposures.csv").write_text("\n".join(exposures) + "\n")
+    (folder / "arm.csv").write_text("\n".join(track) + "\n")
+
+
 def words_of(*words: object) -> list[str]:
     return ["calibrate", "hand-eye-target", "--target", TARGET, *map(str, words)]
 
@@ -116,12 +133,44 @@ def test_of_a_recording_what_shows_the_target_best_is_taken(
     assert "black" not in str(told)
 
 
+def test_looks_from_one_pose_are_one_posture(
+    calibrated: Bench, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They share the arm's error: in a recording without views, and under one pose of a table."""
+    folder, table = tmp_path / "scan", tmp_path / "poses.csv"
+    repeat_exposures(scan, folder, 5)
+    lines = (folder / "arm.csv").read_text().splitlines()[1::2]
+    rows = np.array([line.split(",")[1:] for line in lines], dtype=float)
+    poses = np.concatenate([rows[:, 3:].reshape(-1, 3, 3), rows[:, :3, None]], axis=2)
+    np.savetxt(table, poses.reshape(-1, 12))
+    sources = (["--scan", folder], [folder / "images", "--poses", table])
+    notes = ("5 exposures were taken where the one before", "5 photographs with the pose of one")
+    for source, note in zip(sources, notes, strict=True):
+        words = words_of(*source, "--camera", calibrated.camera, "-o", tmp_path / "out.json")
+        assert main([*words, "--json", "--force"]) == 0, capsys.readouterr().err
+        told = json.loads(capsys.readouterr().out)
+        assert told["n_postures"] == 5
+        assert len(told["postures"]) == 10
+        assert len({look["name"] for look in told["postures"]}) == 5
+        assert note in str(told["warnings"])
+
+
+def test_three_postures_are_too_few_however_often_they_are_looked_at_from(
+    calibrated: Bench, scan: Path, tmp_path: Path, fails: Fails
+) -> None:
+    folder = tmp_path / "scan"
+    repeat_exposures(scan, folder, 3)
+    words = words_of("--scan", folder, "--camera", calibrated.camera)
+    assert "3 postures with the target" in fails(*words, "-o", tmp_path / "no.json")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["IMAGES", "--camera", "CAMERA"], "photographs and poses belong together"),
         (["IMAGES", "--poses", "POSES"], "need one calibration of the camera"),
         (["--camera", "CAMERA"], "nothing to calibrate from"),
+        (["--scan", "SCAN", "--camera", "CAMERA", "--bits-used", "12"], "a recording says itself"),
         (["IMAGES", "--poses", "POSES", "--scan", "SCAN", "--camera", "CAMERA"], "do not mix"),
         (["IMAGES/[0-5].png", "--poses", "POSES", "--camera", "CAMERA"], "6 photographs but 8"),
         (
@@ -158,15 +207,19 @@ def test_inverse_poses_are_refused_by_name(
     assert not output.exists()
 
 
+@pytest.mark.parametrize("n_each", [1, 2])
 def test_a_table_in_the_order_of_a_plain_sort_is_told(
-    calibrated: Bench, scan: Path, poses: Path, tmp_path: Path, fails: Fails
+    calibrated: Bench, scan: Path, poses: Path, tmp_path: Path, fails: Fails, n_each: int
 ) -> None:
     images = tmp_path / "images"
     images.mkdir()
-    names = [f"view{k}.png" for k in range(5, 5 + len(POSTURES))]
-    for file, name in zip(sorted((scan / "images").iterdir()), names, strict=True):
+    n = len(POSTURES)
+    names = [f"view{k}.png" for k in range(5, 5 + n)]
+    files = [scan / "images" / f"{k // n_each}.png" for k in range(n)]
+    for file, name in zip(files, names, strict=True):
         shutil.copy(file, images / name)
-    lines = dict(zip(names, poses.read_text().split("\n"), strict=True))
+    rows = poses.read_text().split("\n")
+    lines = {name: rows[k // n_each] for k, name in enumerate(names)}
     poses.write_text("\n".join(lines[name] for name in sorted(names)))
     words = words_of(images, "--poses", poses, "--camera", calibrated.camera)
     message = fails(*words, "-o", tmp_path / "no.json")

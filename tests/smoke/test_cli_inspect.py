@@ -102,6 +102,33 @@ def test_a_cloud_without_sheets_is_said_to_have_none(
         assert "one exposure" not in out
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("plane", "block"),
+        ("step", "block", "--height", "20"),
+        ("relation", "block", "plane:seed=0,0,0", "plane:seed=15,20,20"),
+        ("sphere", "ball", "--diameter", "34.96"),
+        ("clean", "block", "-o", "clean.ply", "--density", "1"),
+    ],
+)
+def test_what_is_to_be_known_of_the_reading_is_said(
+    words: tuple[str, ...],
+    clouds: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Only `convert` said it."""
+    monkeypatch.chdir(tmp_path)
+    points = read_ply(clouds / f"{words[1]}.ply").points_mm
+    np.savetxt("foreign.txt", points, header="east north up", comments="")
+    group = [] if words[0] == "clean" else ["inspect"]
+    assert main([*group, words[0], "foreign.txt", *words[2:]]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "'east north up' does not name x, y and z" in told
+
+
 def test_a_step_and_a_plane(clouds: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = report(capsys, "step", clouds / "block.ply", "--height", 20, "--margin", 2)
     assert found["height_error_mm"] == pytest.approx(0.0, abs=1e-9)
@@ -313,3 +340,25 @@ def test_a_mesh_and_what_stands_in_its_way(
     assert "--cell is -1.0 mm" in fails("mesh", whole, "-o", tmp_path / "n.stl", "--cell", "-1")
     assert "give 4 or more" in fails("mesh", whole, "-o", tmp_path / "n.stl", "--triangles", "2")
     assert not (tmp_path / "n.stl").exists()
+
+
+@pytest.mark.parametrize("far_mm", [1e3, 1e6])
+def test_a_mesh_far_from_the_origin_is_said_to_be_rounded_in_stl(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], far_mm: float
+) -> None:
+    """Single precision holds multiples of 0.06 mm at a kilometre; nothing said so."""
+    outward = ball_stripes(60, 60)
+    points = outward * RADIUS_MM + [far_mm, 0.0, 0.0]
+    path = tmp_path / "far.ply"
+    names = "".join(f"property double {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{names}element face 1\n"
+    header += "property list uchar int vertex_indices\nend_header"
+    rows = np.column_stack([points, outward])
+    np.savetxt(path, rows, header=header, comments="", footer="3 0 1 2")
+    for suffix in (".stl", ".ply"):
+        words = ["mesh", str(path), "-o", str(tmp_path / f"ball{suffix}"), "--cell", "2"]
+        assert main([*words, "--json"]) == 0
+        said = json.loads(capsys.readouterr().out)["warnings"]
+        is_told = any("as multiples of 0.062 mm: write .ply" in text for text in said)
+        assert is_told == (suffix == ".stl" and far_mm == 1e6)
+        assert any("a mesh of 1 faces" in text for text in said)

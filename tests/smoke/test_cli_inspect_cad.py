@@ -13,7 +13,7 @@ import scipy.stats
 import trimesh
 
 from armscan.cli import main
-from armscan.storage.clouds import parse_ply, ply_bytes
+from armscan.storage.clouds import parse_ply, ply_bytes, read_cloud
 from rigs.inspection_clouds import cloud_of
 from rigs.parts import wedge_part
 
@@ -178,6 +178,14 @@ def test_metres_are_noticed_and_cured(files: Path, capsys: pytest.CaptureFixture
     assert inspect(files, "--align", "none", part="metres.stl") == 2
     assert "--unit m" in capsys.readouterr().err
     assert inspect(files, "--align", "none", "--unit", "m", part="metres.stl") == 0
+
+
+def test_a_heading_of_other_names_is_told(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = read_cloud(files / "good.ply").points_mm[::8]
+    np.savetxt(files / "foreign.txt", points, header="east north up", comments="")
+    assert inspect(files, "--align", "none", cloud="foreign.txt") == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "'east north up' does not name x, y and z" in told
 
 
 @pytest.mark.parametrize("kind", ["own", "constant", "random", "zero"])

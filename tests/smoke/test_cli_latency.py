@@ -81,6 +81,31 @@ def test_info_tells_the_latency(
     assert '"latency_sigma_ns"' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("change", "is_told"), [("missing", False), ("changed", True)])
+def test_observations_that_are_not_the_documents_own_are_left_out_and_told(
+    scanner: Path,
+    moved: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    change: str,
+    is_told: bool,
+) -> None:
+    """None at all is what many documents have; others than it was solved from are odd."""
+    (tmp_path / "scanner.json").write_bytes(scanner.read_bytes())
+    if change == "changed":
+        (tmp_path / "scanner.npz").write_bytes(b"other" + observations_of(scanner).read_bytes())
+    output = tmp_path / "timed.json"
+    assert main([*words_of(moved, tmp_path / "scanner.json", output), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    said = "are not the observations that scanner.json was solved from"
+    assert any(said in text for text in data["warnings"]) is is_told
+    assert (said in output.with_suffix(".html").read_text()) is is_told
+    noted = read_scanner_calibration(output).provenance.warnings
+    assert any(said in text for text in noted) is is_told
+    assert not output.with_suffix(".npz").exists()
+
+
 def test_separate_clocks_are_told_and_nothing_is_written(
     scanner: Path, moved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from armscan.geometry.arrays import FloatArray
 from armscan.inspection.cad.part import part_of
 from armscan.inspection.recipe import follow_recipe
 from armscan.storage.clouds import ply_bytes
+from armscan.storage.documents import scanner_document
+from rigs.calibration_documents import scanner_calibration
 from rigs.inspection_clouds import cloud_of, random_motion
 from rigs.parts import box_corners, extruded
 
@@ -203,6 +206,45 @@ def test_features_alone_need_no_model(tmp_path: Path, capsys: pytest.CaptureFixt
     assert boss["value"] == pytest.approx(16.0, abs=0.008)
     files = sorted(path.name for path in (tmp_path / "results" / "a").iterdir())
     assert files == ["features.json", "part.html"]
+
+
+def test_a_scanner_that_was_calibrated_anew_is_told_of_on_pages_of_before(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They were kept: their warning, or its absence, was of the older document."""
+    (tmp_path / "recipe.toml").write_text(
+        '[title_block]\nscanner = "scanner.json"\n'
+        '[[feature]]\nname = "boss"\nkind = "cylinder"\ndiameter_mm = 16\n'
+    )
+    scanner = scanner_calibration()
+    (tmp_path / "scanner.json").write_bytes(scanner_document(scanner))
+    points, normals = (values[::4] for values in scan(8))
+    measured = replace(cloud_of(points, normals=normals), calibrations=(scanner.provenance.mark,))
+    (tmp_path / "a.ply").write_bytes(ply_bytes(measured))
+    result = tmp_path / "results" / "a" / "features.json"
+
+    def notes() -> str:
+        told = inspected(tmp_path, tmp_path / "results", capsys, str(tmp_path / "a.ply"), code=0)
+        return " ".join(told["warnings"])
+
+    assert "was not measured with the calibration of scanner.json" not in notes()
+    before = result.stat().st_mtime_ns
+    notes()
+    assert result.stat().st_mtime_ns == before
+    anew = replace(scanner.provenance, document_id="anew", created_utc="2026-02-03T04:05:06+00:00")
+    (tmp_path / "scanner.json").write_bytes(scanner_document(replace(scanner, provenance=anew)))
+    assert "was not measured with the calibration of scanner.json" in notes()
+    assert result.stat().st_mtime_ns != before
+
+
+def test_what_is_to_be_known_of_the_reading_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "recipe.toml").write_text('[[feature]]\nname = "top"\nkind = "plane"\n')
+    points = np.random.default_rng(1).uniform(0.0, 20.0, (800, 3)) * [1.0, 1.0, 0.0005]
+    np.savetxt(tmp_path / "a.txt", points, header="east north up", comments="")
+    told = inspected(tmp_path, tmp_path / "results", capsys, str(tmp_path / "a.txt"), code=0)
+    assert any("does not name x, y and z" in text for text in told["warnings"])
 
 
 FEATURE = '[[feature]]\nname = "b"\nkind = "cylinder"\n'

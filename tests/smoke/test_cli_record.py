@@ -11,15 +11,19 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from armscan.cli import main
-from armscan.errors import DeviceError, OutputError
+from armscan.devices.protocols import ArmFlag, ArmSample, LaserEvent
+from armscan.errors import DeviceError, DeviceStoppedError, OutputError
 from armscan.jobs.live.record import RecordRequest, _Recording, record_scan
 from armscan.pipeline.live.acquire import BEHIND, JUMPED, MATCHING, LiveEvent
+from armscan.simulation.live import TwinArm, TwinLasers
+from armscan.storage.files import set_aside
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.storage.recordings.write_mcap import RecordingWriter
@@ -32,6 +36,7 @@ rate_hz = 25.0
 is_common_trigger = true
 windows = [[1500, 900, 64, 32]]
 """
+EARLIER = b"an hour of scanning"
 
 
 @pytest.fixture
@@ -134,11 +139,104 @@ def test_without_an_image_there_is_no_file(
 def test_what_is_to_be_replaced_stays_where_no_image_comes(tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(RIG.replace(f'lasers = "{TWIN}"\n', ""))
     output = tmp_path / "scan.mcap"
-    output.write_bytes(b"an hour of scanning")
+    output.write_bytes(EARLIER)
     words = ["record", str(tmp_path / "rig.toml"), "--seconds", "0.3", "--force", "-o", str(output)]
     assert main(words) == 2
-    assert output.read_bytes() == b"an hour of scanning"
+    assert output.read_bytes() == EARLIER
     assert sorted(one.name for one in tmp_path.iterdir()) == ["rig.toml", "scan.mcap"]
+
+
+@pytest.mark.parametrize("ending", [KeyboardInterrupt(), DeviceError("the arm is gone")])
+def test_what_is_to_be_replaced_stays_where_it_ends_before_it_begins(
+    ending: BaseException, rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(_: _Recording) -> None:
+        raise ending
+
+    monkeypatch.setattr(_Recording, "_wait_for_clocks", ended)
+    output = rig.parent / "scan.mcap"
+    output.write_bytes(EARLIER)
+    with pytest.raises(type(ending)):
+        record_scan(RecordRequest(str(rig)), output, print, is_overwriting=True)
+    assert output.read_bytes() == EARLIER
+    assert sorted(one.name for one in rig.parent.iterdir()) == ["rig.toml", "scan.mcap"]
+
+
+@pytest.mark.parametrize("step", ["_wait_for_clocks", "_put_aside"])
+def test_what_another_run_makes_meanwhile_is_not_touched(
+    step: str, rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output, real = rig.parent / "scan.mcap", getattr(_Recording, step)
+
+    def meanwhile(run: _Recording) -> None:
+        real(run)
+        output.write_bytes(EARLIER)
+
+    monkeypatch.setattr(_Recording, step, meanwhile)
+    with pytest.raises(OutputError, match="exists"):
+        record_scan(RecordRequest(str(rig), n_exposures=2), output, print)
+    assert output.read_bytes() == EARLIER
+    assert sorted(one.name for one in rig.parent.iterdir()) == ["rig.toml", "scan.mcap"]
+
+
+def test_what_cannot_be_brought_back_is_kept_and_said(
+    rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output, real = rig.parent / "scan.mcap", _Recording._put_aside
+    output.write_bytes(EARLIER)
+
+    def meanwhile(run: _Recording) -> None:
+        real(run)
+        output.write_bytes(b"of another run")
+
+    monkeypatch.setattr(_Recording, "_put_aside", meanwhile)
+    told: list[str] = []
+    with pytest.raises(OutputError, match="exists"):
+        record_scan(RecordRequest(str(rig)), output, told.append, is_overwriting=True)
+    assert output.read_bytes() == b"of another run"
+    assert output.with_name(".scan.mcap.before").read_bytes() == EARLIER
+    assert "what was there lies in .scan.mcap.before until the recording ends" in told
+    assert any("what was there before lies in .scan.mcap.before" in line for line in told)
+
+
+def test_what_a_killed_run_left_is_named_and_not_replaced(
+    rig: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, left = rig.parent / "scan.mcap", rig.parent / ".scan.mcap.before"
+    output.write_bytes(b"a second of scanning")
+    left.write_bytes(EARLIER)
+    words = ["record", str(rig), "--exposures", "2", "--force", "-o", str(output)]
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert "an earlier file of this name lies in .scan.mcap.before" in told
+    assert "opening the devices" not in told
+    assert left.read_bytes() == EARLIER and output.read_bytes() == b"a second of scanning"
+    left.unlink()
+    assert main(words) == 0
+    assert len(read_recording(output).rows) >= 2 and not left.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks files")
+def test_a_recording_that_still_grows_is_not_replaced(
+    rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = rig.parent / "scan.mcap"
+    refused: list[str] = []
+    real = _Recording._watch
+
+    def watched(run: _Recording, request: RecordRequest, start: float) -> None:
+        try:
+            set_aside(output, is_overwriting=True)
+        except OutputError as error:
+            refused.append(error.what)
+        real(run, request, start)
+
+    monkeypatch.setattr(_Recording, "_watch", watched)
+    record_scan(RecordRequest(str(rig), n_exposures=2), output, print)
+    assert refused == ["another run writes this file"]
+    assert set_aside(output, is_overwriting=True) == rig.parent / ".scan.mcap.before"
+    with pytest.raises(OutputError, match=r"lies in \.scan\.mcap\.before"):
+        set_aside(output, is_overwriting=True)
 
 
 def test_what_arrives_and_cannot_be_matched_is_no_success(
@@ -212,9 +310,54 @@ def test_a_stripe_band_is_recorded_and_said(rig: Path, capsys: pytest.CaptureFix
     assert read_recording(output).session.is_stripe_band
 
 
+def test_an_arm_without_a_pose_is_said(
+    rig: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = TwinArm.read
+
+    def unreferenced(arm: TwinArm, timeout_s: float) -> tuple[ArmSample, ...]:
+        found = real(arm, timeout_s)
+        return tuple(replace(one, pose=None, flags=ArmFlag.NONE) for one in found)
+
+    monkeypatch.setattr(TwinArm, "read", unreferenced)
+    monkeypatch.setattr("armscan.jobs.live.record.TOLD_EVERY_S", 0.0)
+    assert main(["record", str(rig), "--exposures", "20", "-o", str(rig.parent / "x.mcap")]) == 0
+    told = capsys.readouterr()
+    assert re.search("none of [0-9]+ samples of the arm has a pose", told.out + told.err)
+    assert "the arm gives no pose" in told.err
+
+
+def test_lasers_that_went_off_by_themselves_end_the_recording(
+    rig: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing lights them but a person; what came before is kept."""
+    real, output = TwinLasers.read, rig.parent / "scan.mcap"
+    recorders: list[RecordingWriter] = []
+    begun = RecordingWriter.begin
+
+    def begin(self: RecordingWriter, *given: Any) -> None:
+        begun(self, *given)
+        recorders.append(self)
+
+    def read(lasers: TwinLasers, timeout_s: float) -> tuple[LaserEvent, ...]:
+        if recorders and recorders[0].status().n_accepted > 3:
+            raise DeviceStoppedError("it switched the lasers off")
+        return real(lasers, timeout_s)
+
+    monkeypatch.setattr(RecordingWriter, "begin", begin)
+    monkeypatch.setattr(TwinLasers, "read", read)
+    words = ["record", str(rig), "--exposures", "300", "-o", str(output)]
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert re.search(r"after [0-9.]+ s twin .*lasers: it switched the lasers off", told)
+    assert "what came before is whole" in told
+    assert 3 < len(read_recording(output).rows) < 300
+
+
 def test_faults_of_this_program_are_no_device_s() -> None:
     run: Any = _Recording.__new__(_Recording)
     run._n_faults, run._why_ended, run._tell = 0, "", lambda _: None
+    run._is_over = False
     run._hear(LiveEvent("fault", "the images are no longer matched", MATCHING))
     assert run._n_faults == 0 and "no longer matched" in run._why_ended
     run._hear(LiveEvent("fault", "unplugged", "camera 0"))
@@ -227,7 +370,7 @@ def test_faults_of_this_program_are_no_device_s() -> None:
         "windows = [[1, 2, 3]]", "windows = [[1, 2, 3, 0]]", "windows = []\nrate_hz = nan",
         'schedule = ["A"]\nchooses_lasers = true', '[exposure]\nmode = "auto"',
         "[exposure]\ntarget = 3.0", "[stripes]\nthreshold = -1.0", 'arm_model = "none.toml"',
-        "rate_hz = 0.0", "colour = 3",
+        "rate_hz = 0.0", "colour = 3", 'lasers = "x:"\nschedule = ["A+"]',
     ],
 )  # fmt: skip
 def test_a_wrong_description_is_refused(
@@ -239,3 +382,22 @@ def test_a_wrong_description_is_refused(
     err = capsys.readouterr().err
     assert str(tmp_path) in err and "Traceback" not in err
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('schedule = ["A", "B"]', "schedule says which lasers are on, and there is no laser contr"),
+        ("chooses_lasers = true", "chooses_lasers says which lasers are on, and there is no laser"),
+        ('lasers = "x:"\nschedule = ["A+A"]', "the step 'A+A' of schedule names a laser twice"),
+        ('lasers = "x:"\nchooses_lasers = true', "no scanner is given; give --scanner"),
+    ],
+)
+def test_lasers_that_nothing_would_choose_are_refused_before_a_device_is_opened(
+    line: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(f'cameras = ["webcam:0"]\n{line}\n')
+    assert main(["record", str(path), "-o", str(tmp_path / "x.mcap")]) == 2
+    err = capsys.readouterr().err
+    assert words in err and "opening the devices" not in err

@@ -13,7 +13,8 @@ from armscan.errors import InputError
 from armscan.pipeline.cameras import pair_lists
 from armscan.records.exposure import Exposure
 from armscan.storage.documents import camera_document
-from rigs.recording_folders import EXPOSURES, SESSION, lab_folder
+from rigs.plain_scanner import plain_camera
+from rigs.recording_folders import EXPOSURES, HEIGHT_PX, SESSION, WIDTH_PX, lab_folder
 from rigs.stereo_rig import LEFT, held
 
 Fails = Callable[..., str]
@@ -93,3 +94,39 @@ def test_what_cameras_are_given_for_is_checked_without_them(tmp_path: Path, fail
     assert "intrinsics 'foo' is not known" in fails(*words, "--intrinsics", "foo", writes=tmp_path)
     fixed = fails(*words, "--intrinsics", "fixed", writes=tmp_path)
     assert "give --left and --right" in fixed
+
+
+def test_what_would_do_nothing_beside_given_cameras_is_refused(
+    tmp_path: Path, fails: Fails
+) -> None:
+    """Free intrinsics take no calibrations, and calibrations say themselves what is solved."""
+    camera = tmp_path / "camera.json"
+    camera.write_bytes(camera_document(held(LEFT)))
+    words = ["calibrate", "stereo", "left", "right", *TARGET, "--left", camera, "--right", camera]
+    words += ["-o", tmp_path / "stereo.json"]
+    free = fails(*words, "--intrinsics", "free", writes=tmp_path)
+    assert "free intrinsics take none; leave --left and --right out" in free
+    for use in ("prior", "fixed"):
+        said = fails(*words, "--intrinsics", use, "--distortion", "k1", writes=tmp_path)
+        assert "leave out --distortion" in said
+
+
+@pytest.mark.parametrize("command", ["camera", "stereo", "laser"])
+def test_the_page_of_a_refusal_tells_what_is_odd_in_the_recording(
+    command: str, tmp_path: Path, fails: Fails
+) -> None:
+    """A cause of the refusal may be among it."""
+    rows = {
+        "camera": ["0,1000,0,images/0.png,", "1,2000,0,images/1.png,"],
+        "stereo": ["0,1000,0,images/0.png,", "1,1000,1,images/1.png,"],
+        "laser": ["0,1000,0,images/0.png,A"],
+    }[command]
+    header = "index,t_ns,camera,file,lasers,weather"
+    exposures = "\n".join([header, *(f"{row},fair" for row in rows)]) + "\n"
+    session = SECOND_CAMERA if command == "stereo" else SESSION
+    scan = lab_folder(tmp_path, exposures=exposures, session=session, arm=None)
+    camera = tmp_path / "camera.json"
+    camera.write_bytes(camera_document(held(plain_camera(9.0, (3.5, 2.5), (WIDTH_PX, HEIGHT_PX)))))
+    words = ["calibrate", command, "--scan", scan, *TARGET, "-o", tmp_path / "no.json"]
+    fails(*words, *(("--camera", camera) if command == "laser" else ()))
+    assert "weather" in (tmp_path / "no.refused.html").read_text()

@@ -19,6 +19,9 @@ CAMERA = ["calibrate", "camera", "--from", DOCUMENTS / "camera.json", "-o", "no.
 LASER = ["calibrate", "laser", "--from", DOCUMENTS / "sensor.json", "-o", "no.json"]
 PROFILES = ["reconstruct", INPUTS / "profiles/p*.csv", "--scanner", DOCUMENTS / "profiles.json"]
 PLACED = [*PROFILES, "--poses", INPUTS / "profiles/poses.txt", "-o", "no.ply"]
+POINTS = ["calibrate", "hand-eye", "--profiles", INPUTS / "profiles/p*.csv", "--plane", "0,0,1,0"]
+POSED = [*POINTS, "--poses", INPUTS / "profiles/poses.txt", "-o", "no.json"]
+SCANNED = ["calibrate", "hand-eye", INPUTS / "plate-scan", "--sensor", DOCUMENTS / "sensor.json"]
 RINGS = ["markers", INPUTS / "plain/rings0.jpg", "-o", "no.html"]
 STILL = ["reconstruct", INPUTS / "plain/single.jpg", "--sensor", DOCUMENTS / "sensor.json"]
 
@@ -40,6 +43,9 @@ STILL = ["reconstruct", INPUTS / "plain/single.jpg", "--sensor", DOCUMENTS / "se
         (PLACED, "--method thesis --arm arm.toml"),
         (PLACED, "--bits-used 12 --bits-align low"),
         (STILL, "--euler intrinsic-zxz"),
+        (POSED, "--sensor no.json --arm no.toml"),
+        (POSED, "--stripe-method fit --laser-colour red"),
+        ([*SCANNED, "--plane", "0,0,1,0"], "--euler intrinsic-zxz"),
         (RINGS, "--diameter 6"),
         (RINGS, "--depth 120:200"),
     ],

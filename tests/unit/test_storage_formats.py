@@ -187,6 +187,30 @@ def test_the_grid_of_a_laz_file_is_as_fine_as_the_cloud_allows(tmp_path: Path) -
     np.testing.assert_allclose(read_cloud(path).points_mm, wide.points_mm, rtol=0, atol=0.51e-3)
 
 
+@pytest.mark.parametrize("start_mm", [0.0, 0.4, 0.5, 0.9, -1e5 + 0.3, 1e6])
+@pytest.mark.parametrize(
+    ("width_mm", "step"),
+    [
+        (4293.9, 1e-6),
+        (4294.0, 1e-5),
+        (4294.9, 1e-5),
+        (4294.967, 1e-5),
+        (42948.6, 1e-5),
+        (42949.672, 1e-4),
+    ],
+)
+def test_a_grid_reaches_to_the_ends_of_a_cloud(
+    tmp_path: Path, start_mm: float, width_mm: float, step: float
+) -> None:
+    """The rounded offset moved one end beyond the largest multiple: an overflow."""
+    ends = np.array([[start_mm, 0.0, 0.0], [start_mm + width_mm, 1.0, 2.0]])
+    wide = cloud_of(ends)
+    assert step_mm(wide) == pytest.approx(step)
+    path = tmp_path / "wide.las"
+    write_cloud(path, wide)
+    np.testing.assert_allclose(read_cloud(path).points_mm, ends, rtol=0, atol=0.51 * step)
+
+
 def test_largest_eigenvalues_are_those_of_a_general_solver() -> None:
     """Two equal eigenvalues are the hardest: 2e-8 there, rounding elsewhere."""
     rng = np.random.default_rng(5)

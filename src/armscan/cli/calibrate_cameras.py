@@ -29,6 +29,7 @@ from armscan.cli.options import (
     Target,
     given,
     refuse_given,
+    refuse_vain,
 )
 
 NOT_AGAIN = "images scan target method bits_used bits_align cache"
@@ -195,6 +196,9 @@ def stereo(
         raise OptionError(
             "there is nothing to hold", where="--intrinsics fixed", remedy="give --left and --right"
         )
+    if is_given:
+        what = "the lens and what is solved of it are those of --left and --right"
+        refuse_vain({"--distortion": distortion}, what)
     options = given(
         StereoOptions,
         camera=given(CameraOptions, distortion=distortion),

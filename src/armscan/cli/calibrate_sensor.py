@@ -27,6 +27,7 @@ from armscan.cli.options import (
     StripeMethodOption,
     given,
     refuse_given,
+    refuse_vain,
 )
 
 NOT_AGAIN = (
@@ -250,6 +251,9 @@ def hand_eye(
         poses=poses,
         euler=None if euler is None else check_convention(euler),
     )
+    if poses is not None:
+        vain = {"--stripe-method": stripe_method, "--laser-colour": laser_colour}
+        refuse_vain(vain, "profiles with --poses are points already: no image is read")
     artefact = Artefact(plate, plane, None if side is None else side.value, sphere_diameter)
     rotation_rad = None if arm_rotation_deg is None else math.radians(arm_rotation_deg)
     options = given(

@@ -147,7 +147,7 @@ EulerAngles = Annotated[
     typer.Option(
         help="Angles in --poses: intrinsic-xyz, extrinsic-xyz (FANUC), intrinsic-zyx (KUKA), "
         "intrinsic-zxz, rotation-vector (UR).",
-        show_default=DefaultOf("armscan.jobs.hand_eye:StripeSource.euler"),
+        show_default=DefaultOf("armscan.jobs.reconstruct:PoseTable.euler"),
     ),
 ]
 BackgroundImages = Annotated[

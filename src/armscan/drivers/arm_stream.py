@@ -43,6 +43,10 @@ _LARGEST_MM, _LARGEST_RAD = 1e5, 1e3
 _MOST_SAMPLES = 20_000
 _FIRST_S, _AGAIN_S, _CONNECT_S = 2.0, 0.5, 3.0
 _READ_S, _READ_BYTES = 0.05, 65_536
+KEEPALIVE = {"TCP_KEEPIDLE": 3, "TCP_KEEPALIVE": 3, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 7}
+"""After 3 s of silence the other side's system is asked once a second whether the connection is
+there, and it has ended where none of 7 questions is answered. Silence alone ends nothing: an arm
+may wait for its next trigger. Names are those of systems, which lack some."""
 _WRITE_S = 1.0
 """A device that takes no byte for so long hangs: who writes to it must not."""
 
@@ -222,12 +226,19 @@ class TcpLink:
             ) from error
         self._socket.settimeout(_READ_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in KEEPALIVE.items():
+            if hasattr(socket, name):
+                self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
     def read(self) -> bytes:
-        """What came; raises `OSError` where the other side closed."""
+        """What came; raises `OSError` where the other side closed, or is not there any more."""
         try:
             received = self._socket.recv(_READ_BYTES)
-        except TimeoutError:
+        except TimeoutError as error:
+            if error.errno is not None:
+                # of the system, for which the connection has ended; our own wait has no number
+                raise
             return b""
         if not received:
             raise ConnectionError("the other side closed the connection")
@@ -295,13 +306,14 @@ class StreamedArm:
         self._is_closed = False
         self._link: Link | None = scheme(place)
         first = self._first(self._link)
-        self._form: PoseForm = "joints" if first.pose is None else "quaternion"
+        by_joints = first.pose is None and first.joints_rad is not None
+        self._form: PoseForm = "joints" if by_joints else "quaternion"
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     @property
     def pose_form(self) -> PoseForm:
-        """``joints`` where it delivers joint angles alone."""
+        """``joints`` where joint angles alone came first, of a referenced arm if one was seen."""
         return self._form
 
     def start(self) -> None:
@@ -328,15 +340,24 @@ class StreamedArm:
             self._inbox.close()
 
     def _first(self, link: Link) -> ArmSample:
-        """Wait for one frame, so that a wrong baud rate or address shows at once."""
+        """Wait for one frame, so that a wrong baud rate or address shows at once.
+
+        It is the first that shows what the arm delivers, if one comes: an arm that is not
+        referenced yet may send nothing, or joint angles alone.
+        """
         n_bytes, end_s = 0, time.monotonic() + _FIRST_S
+        last: ArmSample | None = None
         try:
             while time.monotonic() < end_s:
                 received = link.read()
                 n_bytes += len(received)
-                found = self.decoder.feed(received, time.monotonic_ns())
-                if found:
-                    return found[-1]
+                for one in self.decoder.feed(received, time.monotonic_ns()):
+                    has_joints = one.joints_rad is not None
+                    if one.pose is not None or (has_joints and ArmFlag.REFERENCED in one.flags):
+                        return one
+                    last = one if has_joints or last is None else last
+            if last is not None:
+                return last
             fact = f"{n_bytes} bytes came within {_FIRST_S:g} s, but no frame of an arm"
             remedy = "check baud rate and address; the frames are in docs/reference/arm-stream.md"
             raise DeviceError(fact, where=self.name, remedy=remedy)

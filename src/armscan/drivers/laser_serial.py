@@ -16,7 +16,7 @@ from armscan.devices.inbox import Inbox
 from armscan.devices.protocols import DeviceInfo, DeviceKind, LaserController, LaserEvent
 from armscan.devices.registry import needed_package
 from armscan.drivers.arm_stream import SerialLink
-from armscan.errors import DeviceError, OptionError, shown
+from armscan.errors import DeviceError, DeviceStoppedError, OptionError, shown
 
 VERSION = 1
 MOST_LINE = 240
@@ -202,7 +202,7 @@ class SerialLasers:
                 if self._is_started:
                     self._inbox.fail(error)
             else:
-                if is_silent:
+                if is_silent and self._is_started:
                     self._inbox.fail(None)
                 is_silent = False
 
@@ -232,7 +232,7 @@ class SerialLasers:
         if words == ["OFF", "WATCHDOG"]:
             self._is_started = False
             self._inbox.fail(
-                DeviceError(
+                DeviceStoppedError(
                     "it heard nothing for too long and switched the lasers off",
                     where=self.name,
                     remedy="start it again",

@@ -121,7 +121,7 @@ class Playback:
                 spread_ns=0,
                 rng=np.random.default_rng(0),
             )
-            for name in (*names, "lasers")
+            for name in (*names, *(["lasers"] if self.sources else []))
         }
         self._clock = clock
         self.started: set[str] = set()
@@ -158,7 +158,11 @@ class Playback:
     def open(self, device: str) -> None:
         """Take a device; raises `DeviceError` if there is none, or it is taken."""
         if device not in self.lines:
-            raise DeviceError(f"the recording has no {device}", where=self.source.name)
+            raise DeviceError(
+                f"the recording has no {device}",
+                where=self.source.name,
+                remedy="leave this device out",
+            )
         self.lines[device].open()
 
     def close(self, device: str) -> bool:
@@ -277,7 +281,9 @@ class Playback:
             return LaserEvent(counted, 0, 0, row.lasers)
         seen = self._next_image()
         if isinstance(seen, Exposure):
-            return Frame(seen.image, 0, 0, 0, trigger_id, row.lasers, seen.window)
+            # where no row names a laser nobody knows, and it is taken to have been on
+            lasers = row.lasers if self.sources else None
+            return Frame(seen.image, 0, 0, 0, trigger_id, lasers, seen.window)
         if seen is not None:
             self.lines[device].inbox.fail(DeviceError(seen.what, where=seen.where))
         return None
@@ -311,11 +317,12 @@ class Playback:
 
 
 def _plays(source: ScanSource) -> list[Play]:
-    """All exposures, instants of the lasers and samples, in order of time from 0."""
+    """All exposures, instants of the lasers where any is named, and samples, by time from 0."""
     frames = [(row.t_ns, f"camera{row.camera}", k) for k, row in enumerate(source.rows)]
     lights, last = [], None
+    are_named = any(row.lasers for row in source.rows)
     for k, row in enumerate(source.rows):
-        if (row.t_ns, row.trigger_id) != last:
+        if are_named and (row.t_ns, row.trigger_id) != last:
             lights.append((row.t_ns, "lasers", k))
         last = row.t_ns, row.trigger_id
     samples: list[tuple[int, str, int]] = []

@@ -229,7 +229,7 @@ class _ExposureErrors:
         count = np.bincount(exposure, minlength=n)
         covariance, axis, share = without_noise(cloud, rows)
         total = _sums(exposure, n, covariance.reshape(-1, 9)).reshape(n, 3, 3)
-        by_calibration, common = _calibration_errors(cloud, rows, fit.directions)
+        by_calibration, common = calibration_errors(cloud, rows, fit.directions)
         mean = total - _sums(exposure, n, by_calibration.reshape(-1, 9)).reshape(n, 3, 3)
         mean, total = (one / count[:, None, None] for one in (mean, total))
         along = share * np.einsum("ni,ni->n", axis, fit.directions) ** 2 + 1.0 - share
@@ -507,7 +507,7 @@ def _weights(chance: FloatArray) -> FloatArray:
     return np.asarray(found / found.sum())
 
 
-def _calibration_errors(
+def calibration_errors(
     cloud: PointCloud, rows: IntArray, directions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance (N, 3, 3) of points by the calibration alone, and moves (N, K + 3) along

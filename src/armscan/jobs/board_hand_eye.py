@@ -29,6 +29,12 @@ from armscan.models.calibration import (
     ScannerCalibration,
     SensorCalibration,
 )
+from armscan.pipeline.hand_eye import (
+    REPEATED_DEG,
+    REPEATED_MM,
+    repeated_postures,
+    standing_postures,
+)
 from armscan.pipeline.targets import FoundTargets, find_targets
 from armscan.reconstruction.sync import exposure_poses
 from armscan.records.exposure import Exposure
@@ -139,7 +145,11 @@ def calibrate_hand_eye_on_board(
     places = job.places(".json", beside=(".npz", ".html"))
     plate = parse_target(target)
     camera, sensor = _cameras(source)
-    views = _scan_views(source) if source.scan is not None else _photographs(source, image_options)
+    if source.scan is None:
+        views = _photographs(source, image_options)
+    else:
+        image_options.check_unused()
+        views = _scan_views(source)
     check_same_size(views.exposures)
     plate = settle_target(views.exposures, plate)
     found = find_targets(views.exposures, plate, cache=job.cache, progress=job.progress)
@@ -206,14 +216,29 @@ def _photographs(source: LookSource, image_options: ImageOptions) -> _Views:
     gone = set(named_by(source.leave_out, names))
     kept = [k for k, name in enumerate(names) if name not in gone]
     exposures = read_exposures([paths[k] for k in kept], image_options)
+    used = [poses[k] for k in kept]
+    postures = repeated_postures([exposure.source for exposure in exposures], used)
     return _Views(
         exposures=exposures,
-        poses=tuple(poses[k] for k in kept),
-        postures=tuple(exposure.source for exposure in exposures),
+        poses=tuple(used),
+        postures=tuple(postures),
         paths=tuple(paths[k] for k in kept),
         tables=(source.poses,),
         is_simulated=are_simulated(paths),
+        warnings=_repeated(postures),
         rows=tuple(kept),
+    )
+
+
+def _repeated(postures: Sequence[str]) -> tuple[str, ...]:
+    """Say which photographs were put together without being asked."""
+    n = len(postures) - len(set(postures))
+    if not n:
+        return ()
+    verb = "counts" if n == 1 else "count"
+    return (
+        f"{plural(n, 'photograph')} with the pose of one before (within {REPEATED_MM:g} mm and "
+        f"{REPEATED_DEG:g} deg) {verb} as one posture with it",
     )
 
 
@@ -238,13 +263,17 @@ def _scan_views(source: LookSource) -> _Views:
         )
     n_used = min(len(posed), MOST_ROWS)
     chosen = [posed[k] for k in np.linspace(0, len(posed) - 1, n_used).round().astype(int)]
+    held = [poses.pose(k) for k in chosen]
+    postures, merged = standing_postures(
+        [recording.rows[k].view for k in chosen], held, [names[k] for k in chosen]
+    )
     n_other = sum(row.camera != 0 for row in recording.rows)
     note = f"{plural(n_other, 'exposure')} of other cameras not used: camera 0 gives the hand-eye"
     without = [(names[k], "the arm gave no pose for it") for k in dark or left if k not in posed]
     return _Views(
         exposures=tuple(recording.exposure(k) for k in chosen),
-        poses=tuple(poses.pose(k) for k in chosen),
-        postures=tuple(recording.rows[k].view or names[k] for k in chosen),
+        poses=tuple(held),
+        postures=tuple(postures),
         paths=tuple(folder / names[k] for k in chosen),
         tables=(*recording_tables(folder), *(() if source.arm is None else (source.arm,))),
         is_simulated=recording.is_simulated,
@@ -252,6 +281,7 @@ def _scan_views(source: LookSource) -> _Views:
             *recording.warnings,
             *recording.session.assumed,
             *poses.warnings,
+            *merged,
             *((note,) if n_other else ()),
         ),
         not_used=tuple(without),
@@ -287,8 +317,9 @@ def _readings(looks: Sequence[BoardLook], source: LookSource, views: _Views) -> 
             shifts = np.array([look.base_from_tool.translation_mm for look in looks])
             yield from other_readings(turns, shifts, views.convention)
         return
-    row_of = dict(zip(views.postures, views.rows, strict=True))
-    rows = [row_of[look.posture] for look in looks]
+    sources = [exposure.source for exposure in views.exposures]
+    row_of = dict(zip(sources, views.rows, strict=True))
+    rows = [row_of[look.source] for look in looks]
     paths, euler = expand_paths(source.images), source.euler or EULER
     for words, remedy, turns, shifts in other_table_readings(source.poses, euler, paths):
         yield words, remedy, turns[rows], shifts[rows]

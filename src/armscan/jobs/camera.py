@@ -26,7 +26,6 @@ from armscan.records.exposure import Exposure
 from armscan.report.camera import CAMERA_TITLE, camera_page, camera_quantities
 from armscan.report.photographs import refused_page, tried_targets
 from armscan.report.quantity import Quantity, Summary, Table, sentences, significant, without_source
-from armscan.storage.arm import ARM_FILE
 from armscan.storage.documents import (
     camera_document,
     observations_of,
@@ -36,7 +35,7 @@ from armscan.storage.documents import (
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, of_one_size, read_exposures
 from armscan.storage.observations import pack_observations, read_observations
-from armscan.storage.recording import read_recording, recording_tables
+from armscan.storage.recording import camera_tables, read_recording
 from armscan.thesis.ellipse import with_printed_centres
 from armscan.vision.targets.detect import settle_target
 from armscan.vision.targets.target import (
@@ -105,14 +104,16 @@ def calibrate_camera(
         provenance = job.provenance(inputs, used, warnings=read.warnings)
         tried = tried_targets(found.views, found.not_found, sources)
         page = refused_page(
-            CAMERA_TITLE, tried, by_source, provenance, is_simulated=read.is_simulated
-        )
+            CAMERA_TITLE, tried, by_source, provenance, warnings=read.warnings,
+            is_simulated=read.is_simulated,
+        )  # fmt: skip
         job.refuse(page, run)
-    fit, nonsense = run.fit, reasons_to_refuse(run.fit)
+    fit = replace(run.fit, warnings=(*read.warnings, *run.fit.warnings))
+    run, nonsense = replace(run, fit=fit), reasons_to_refuse(fit)
     provenance = job.provenance(
         inputs,
         (plate, fit.options, image_options),
-        warnings=(*read.warnings, *fit.warnings),
+        warnings=fit.warnings,
         forced=nonsense,
         is_simulated=read.is_simulated,
     )
@@ -160,11 +161,13 @@ def calibrate_camera_from_file(
     places = job.places(".json", beside=(".npz", ".html"))
     observations_file = observations_of(camera_file)
     before, found = read_camera_calibration(camera_file), read_observations(observations_file)
-    options = CameraOptions(
-        **{**recorded_options(before.provenance, CameraOptions), **(changes or {})}
-    )
     sources = [view.source for view in found.views]
-    options = replace(options, leave_out=named_by(options.leave_out, sources))
+    changed = recorded_options(before.provenance, CameraOptions)
+    # a view that was left out and has no pose is not among the observations
+    changed["leave_out"] = tuple(one for one in changed.get("leave_out", ()) if one in sources)
+    changed.update(changes or {})
+    changed["leave_out"] = named_by(changed["leave_out"], sources)
+    options = CameraOptions(**changed)
     kinds: tuple[type[Target], ...] = (Chessboard, Charuco, CircleGrid, AprilGrid)
     recorded = {kind: recorded_options(before.provenance, kind) for kind in kinds}
     targets = [kind(**values) for kind, values in recorded.items() if values]
@@ -230,7 +233,7 @@ def _camera_scan(folder: Path) -> _Images:
         tuple(recording.exposure(k) for k in chosen),
         tuple(folder / recording.rows[k].source for k in chosen),
         recording.is_simulated,
-        tuple(path for path in recording_tables(folder) if path.name != ARM_FILE),
+        camera_tables(folder),
         (*recording.warnings, *recording.session.assumed),
     )
 
@@ -250,7 +253,7 @@ def _camera_summary(
             *camera_quantities(fit, len(fit.views) + len(run.not_found)),
         ),
         tables=(table,) if rows else (),
-        warnings=sentences((*read.warnings, *fit.warnings)),
+        warnings=sentences(fit.warnings),
         written=tuple(written),
         next_step=f"open {written[-1]}, then `armscan calibrate laser --camera {written[0]} -h`; "
         f"on an arm without a laser `armscan calibrate hand-eye-target --camera {written[0]} -h`",

@@ -30,7 +30,11 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.jobs.job import Job, solved
-from armscan.models.calibration import ScannerCalibration, SensorCalibration
+from armscan.models.calibration import (
+    ScannerCalibration,
+    SensorCalibration,
+    without_covariance,
+)
 from armscan.pipeline.hand_eye import (
     ObservedStripes,
     measured_beside,
@@ -57,6 +61,7 @@ from armscan.report.photographs import MAX_PICTURES, TriedImage, evenly_chosen, 
 from armscan.report.quantity import Summary, Table, fact, sentences, significant
 from armscan.storage.arm import ARM_FILE, read_arm_model
 from armscan.storage.documents import (
+    observations_named,
     observations_of,
     read_scanner_calibration,
     read_sensor_calibration,
@@ -77,7 +82,7 @@ from armscan.storage.recording import (
     recording_name,
     recording_tables,
 )
-from armscan.storage.recordings.robot_poses import read_robot_poses
+from armscan.storage.recordings.robot_poses import USUAL_EULER, read_robot_poses
 from armscan.thesis.hand_eye import PrintedHandEye, as_printed
 from armscan.vision.stripe.image import StripeOptions
 
@@ -98,6 +103,10 @@ class StripeSource:
         ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
     profiles
         Profiles of points: files, folders or patterns, one a posture.
+    poses
+        Table of the robot's poses, one a profile.
+    euler
+        What angles in ``poses`` mean; None for `USUAL_EULER`.
     """
 
     scans: tuple[Path, ...] = ()
@@ -105,7 +114,7 @@ class StripeSource:
     arm: Path | None = None
     profiles: tuple[str, ...] = ()
     poses: Path | None = None
-    euler: EulerConvention = "extrinsic-xyz"
+    euler: EulerConvention | None = None
 
     def __post_init__(self) -> None:
         has_profiles = bool(self.profiles) or self.poses is not None
@@ -120,6 +129,13 @@ class StripeSource:
             raise OptionError(
                 "profiles and poses belong together", remedy="give --profiles and --poses"
             )
+        given: dict[str, object] = {"--sensor": self.sensor, "--arm": self.arm}
+        fact = "profiles with --poses are points already"
+        if self.scans:
+            given, fact = {"--euler": self.euler}, "a recording says what its angles mean"
+        vain = ", ".join(name for name, value in given.items() if value is not None)
+        if vain:
+            raise OptionError(f"without effect: {fact}", where=vain, remedy=f"leave out {vain}")
         if self.scans and self.sensor is None:
             raise OptionError(
                 "a recording of images needs the sensor's calibration",
@@ -249,7 +265,7 @@ def calibrate_hand_eye(
 
     n_steps = len(inputs.groups) + 1
     job.progress(ProgressEvent("solve", 0, n_steps))
-    fit, stripes = _solved_where_it_moves(solve, inputs)
+    fit, stripes = solved_where_it_moves(solve, inputs)
     if isinstance(fit, FitFailure):
         provenance = job.provenance(inputs.files, used, parents=parents, warnings=inputs.warnings)
         page = refused_page(
@@ -305,30 +321,44 @@ SENSOR_ROUNDS, STRAIGHT = 4, 0.03
 """Solutions at most, and what the sensor's step may leave unlinear, over a point's own noise."""
 
 
-def _solved_where_it_moves(
+def solved_where_it_moves(
     solve: Callable[[Sequence[PosedStripe]], HandEyeFit | FitFailure], inputs: HandEyeInputs
 ) -> tuple[HandEyeFit | FitFailure, tuple[PosedStripe, ...]]:
     """The solution, and the stripes with which it was found, linearised by the sensor it stores.
 
     The first round takes the derivatives at the sensor as it was given; a lens that is weakly known
-    moves so far that they do not hold at the image's border. Of two cameras they are kept.
+    moves so far that they do not hold at the image's border. Of two cameras they are kept. A round
+    that refuses speaks for all: the one before rests on derivatives that do not hold.
     """
     stripes, sensor = inputs.stripes, inputs.sensor
     fit = solve(stripes)
-    for _ in range(SENSOR_ROUNDS - 1):
-        if isinstance(fit, FitFailure) or sensor is None or sensor.second is not None:
-            break
-        if fit.sensor_step is None:
+    if sensor is None or sensor.second is not None:
+        return fit, stripes
+    for count in range(SENSOR_ROUNDS):
+        if isinstance(fit, FitFailure) or fit.sensor_step is None:
             break
         moved = fit.sensor_after(sensor)
         found, bend = measured_beside(stripes, inputs.images, moved, fit.sensor_step)
         if bend < STRAIGHT:
             break
+        if count == SENSOR_ROUNDS - 1:
+            fit = replace(fit, warnings=(*fit.warnings, _still_bent(bend)))
+            break
         again = solve(found)
         if isinstance(again, FitFailure):
-            break
+            reason = f"with the sensor where the stripes move it: {again.reason}"
+            return FitFailure(reason, again.remedy), stripes
         fit, stripes = again, found
     return fit, stripes
+
+
+def _still_bent(bend: float) -> str:
+    return (
+        f"the stripes move the sensor so far that {SENSOR_ROUNDS} solutions do not settle: points "
+        f"lie {significant(bend)} of their noise (rms) beside where the derivatives put them, "
+        f"{STRAIGHT:g} is the limit; calibrate camera and sheets with more views, up to the "
+        "image's border"
+    )
 
 
 def calibrate_latency(
@@ -385,7 +415,8 @@ def calibrate_latency(
         fit_latency(looks, recording.arm, before.hand_eye.tool_from_sensor, is_shared=is_shared),
         scan,
     )
-    odd = (*recording.warnings, *recording.session.assumed, *fit.warnings)
+    data, lacking = _evidence(scanner) if is_shared else (None, ())
+    odd = (*recording.warnings, *recording.session.assumed, *fit.warnings, *lacking)
     if not is_shared:
         odd += ("the clocks are separate: the time holds for this recording, nothing is written",)
     is_simulated = recording.is_simulated or are_simulated([scanner])
@@ -406,7 +437,6 @@ def calibrate_latency(
         )
         page = latency_page(fit, provenance, warnings=odd, is_simulated=is_simulated)
         # the hand-eye's own evidence goes with it
-        data = _evidence(scanner)
         beside = None if data is None else (places[1].name, data)
         kept = {} if data is None else {places[1]: data}
         written = job.write({places[0]: scanner_document(timed, beside), **kept, places[2]: page})
@@ -424,12 +454,18 @@ def calibrate_latency(
     )
 
 
-def _evidence(document: Path) -> bytes | None:
-    """Observations that a document was solved from; None where it has none any more."""
+def _evidence(document: Path) -> tuple[bytes | None, tuple[str, ...]]:
+    """Observations that a document was solved from, and what is odd about them.
+
+    None where it has none any more, or others than it was solved from.
+    """
+    beside = observations_named(document)
+    if beside is None or not beside.exists():
+        return None, ()
     try:
-        return read_bytes(observations_of(document))
-    except FileFormatError:
-        return None
+        return read_bytes(observations_of(document)), ()
+    except FileFormatError as error:
+        return None, (f"the hand-eye's observations are left out: {error.where}: {error.what}",)
 
 
 def _beside_thesis(
@@ -484,6 +520,8 @@ def read_hand_eye_inputs(
     files = [path for path in (*tables, source.sensor, artefact.plate, source.arm) if path]
     odd = [text for r in recordings for text in (*r.warnings, *r.session.assumed)]
     of_groups = [text for _, seen in groups for text in seen.warnings]
+    if not sensor.has_camera_covariance:
+        of_groups.append(without_covariance("the hand-eye's sigmas"))
     return HandEyeInputs(
         groups=tuple(groups),
         sensor=sensor,
@@ -511,7 +549,7 @@ def _from_profiles(source: StripeSource, artefact: Artefact) -> HandEyeInputs:
         raise OptionError("profiles need a table of poses", remedy="give --poses")
     files = [path for name in source.profiles for path in profile_files(Path(name))]
     profiles = read_profiles(files)
-    poses = read_robot_poses(source.poses, source.euler, files)
+    poses = read_robot_poses(source.poses, source.euler or USUAL_EULER, files)
     stripes = posed_stripes_from_profiles(profiles, poses)
     plate, notes = _reference(artefact, np.array([pose.translation_mm for pose in poses]))
     seen = ObservedStripes(stripes, (), (), ())

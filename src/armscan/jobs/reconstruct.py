@@ -76,7 +76,7 @@ from armscan.storage.recording import (
     recording_name,
     recording_tables,
 )
-from armscan.storage.recordings.robot_poses import read_robot_poses
+from armscan.storage.recordings.robot_poses import USUAL_EULER, read_robot_poses
 
 LISTED = 4
 
@@ -98,7 +98,7 @@ class PoseTable:
     """A robot's poses, one a profile of a sensor that delivers points."""
 
     path: Path
-    euler: EulerConvention = "extrinsic-xyz"
+    euler: EulerConvention = USUAL_EULER
 
     def __post_init__(self) -> None:
         check_convention(self.euler)

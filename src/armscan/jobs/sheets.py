@@ -128,18 +128,22 @@ def calibrate_sheets(
         )
         tried = [TriedImage(item.source, item.reason, False) for item in read.left_out]
         tried += [_tried(pair) for pair in seen]
-        page = refused_page(TITLE, tried, by_source, provenance, is_simulated=is_simulated)
+        page = refused_page(
+            TITLE, tried, by_source, provenance, warnings=read.warnings, is_simulated=is_simulated
+        )
         job.refuse(page, fit)
     other_size = _other_size(board, camera.provenance)
     fit = replace(
-        fit, skipped=(*read.left_out, *fit.skipped), warnings=(*fit.warnings, *other_size)
+        fit,
+        skipped=(*read.left_out, *fit.skipped),
+        warnings=(*read.warnings, *fit.warnings, *other_size),
     )
     nonsense = reasons_to_refuse(fit)
     provenance = job.provenance(
         inputs,
         (board, options.stripes, fit.options, image_options),
         parents=(camera.provenance,),
-        warnings=(*read.warnings, *sheet_warnings(fit)),
+        warnings=sheet_warnings(fit),
         forced=nonsense,
         is_simulated=is_simulated,
     )
@@ -151,7 +155,7 @@ def calibrate_sheets(
     observations = pack_board_stripes(fit, hashes)
     document = sensor_document(fit.to_calibration(provenance), (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
-    summary = sheets_summary(fit, written, read.warnings, is_simulated=is_simulated)
+    summary = sheets_summary(fit, written, is_simulated=is_simulated)
     return replace(with_old_layout(summary, board), forced=provenance.forced)
 
 
@@ -186,7 +190,7 @@ def calibrate_sheets_from_file(
     observations = pack_board_stripes(fit, found.sha256)
     document = sensor_document(fit.to_calibration(provenance), (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
-    summary = sheets_summary(fit, written, (), is_simulated=is_simulated)
+    summary = sheets_summary(fit, written, is_simulated=is_simulated)
     return replace(summary, forced=provenance.forced)
 
 
@@ -315,9 +319,7 @@ def _other_size(target: Target, parent: Provenance) -> tuple[str, ...]:
     )
 
 
-def sheets_summary(
-    fit: LaserFit, written: Sequence[Path], notes: Sequence[str], *, is_simulated: bool
-) -> Summary:
+def sheets_summary(fit: LaserFit, written: Sequence[Path], *, is_simulated: bool) -> Summary:
     """What a person, and a program, wants to know of a calibration of light sheets."""
     told = [Quantity("laser_colour", "", fit.laser_colour)]
     if fit.channel_reason:
@@ -335,7 +337,7 @@ def sheets_summary(
         title=f"Light sheets calibrated{' from simulated images' if is_simulated else ''}: {names}",
         quantities=tuple(told),
         tables=(skipped,) if reasons else (),
-        warnings=sentences((*notes, *sheet_warnings(fit))),
+        warnings=sentences(sheet_warnings(fit)),
         written=tuple(written),
         next_step=f"open {written[-1]}, then `armscan reconstruct IMAGES --sensor {written[0]}`",
         extra={

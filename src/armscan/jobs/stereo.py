@@ -44,18 +44,20 @@ from armscan.storage.documents import (
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, of_one_size, read_exposures
 from armscan.storage.observations import pack_observations
-from armscan.storage.recording import read_recording
+from armscan.storage.recording import camera_tables, read_recording
 from armscan.vision.targets.detect import settle_target
 from armscan.vision.targets.target import parse_target
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
-    """Exposures in pairs, and the files that they came from."""
+    """Exposures in pairs, the files they came from, other files that went in, and what is odd."""
 
     pairs: list[ExposedPair]
     paths: dict[str, Path]
     is_simulated: bool
+    tables: tuple[Path, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def calibrate_stereo(
@@ -73,12 +75,14 @@ def calibrate_stereo(
 
     ``left``, ``right``: image file, folder or pattern of each camera; empty if a recording is
     given. ``scan``: folder recording of a head with two cameras, instead of images. ``cameras``:
-    calibrations of the single cameras, left and right, or None.
+    calibrations of the single cameras, left and right, or None; for ``options.intrinsics`` that
+    take them.
     """
     options, image_options = options or StereoOptions(), image_options or ImageOptions()
     plate = parse_target(target)
     places = job.places(".json", beside=(".npz", ".html"))
     given = _given(*cameras)
+    options.check_given(is_given=given is not None)
     read = _stereo_images(left, right, scan, image_options, options.leave_out)
     hashes = {source: fingerprint(path).sha256 for source, path in read.paths.items()}
     if given is not None and options.intrinsics == "prior":
@@ -91,17 +95,20 @@ def calibrate_stereo(
     plate = settle_target(exposures, plate)
     found = find_targets(exposures, plate, cache=job.cache, progress=job.progress)
     run = calibrate_stereo_from_found(pairs, found, plate, options, given, progress=job.progress)
-    inputs = (*read.paths.values(), *(path for path in cameras if path is not None))
+    given_files = (path for path in cameras if path is not None)
+    inputs = (*read.paths.values(), *read.tables, *given_files)
     parents = tuple(one.provenance for one in given or ())
     used = (plate, options, image_options)
     if isinstance(run, FitFailure):
-        provenance = job.provenance(inputs, used, parents=parents)
+        provenance = job.provenance(inputs, used, parents=parents, warnings=read.warnings)
         tried = tried_targets(found.views, found.not_found, list(by_source))
         page = refused_page(
-            STEREO_TITLE, tried, by_source, provenance, is_simulated=read.is_simulated
-        )
+            STEREO_TITLE, tried, by_source, provenance, warnings=read.warnings,
+            is_simulated=read.is_simulated,
+        )  # fmt: skip
         job.refuse(page, run)
-    fit, nonsense = run.fit, reasons_to_refuse(run.fit)
+    fit = replace(run.fit, warnings=(*read.warnings, *run.fit.warnings))
+    run, nonsense = replace(run, fit=fit), reasons_to_refuse(fit)
     provenance = job.provenance(
         inputs,
         used,
@@ -189,7 +196,13 @@ def _stereo_scan(folder: Path) -> _Pairs:
         pair = [None if row is None else recording.exposure(row) for row in rows]
         pairs.append((pair[0], pair[1]))
         paths |= {one.source: folder / one.source for one in pair if one is not None}
-    return _Pairs(pairs, paths, recording.is_simulated)
+    return _Pairs(
+        pairs,
+        paths,
+        recording.is_simulated,
+        camera_tables(folder),
+        (*recording.warnings, *recording.session.assumed),
+    )
 
 
 def _check_not_the_same(given: Given, hashes: dict[str, str]) -> None:

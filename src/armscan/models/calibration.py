@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import ArrayRecord, FloatArray, floats
+from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, floats
 from armscan.geometry.poses import CameraRight, Pose, Sensor, Tool
 from armscan.geometry.shapes import Plane
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
@@ -183,6 +183,30 @@ class Provenance:
         return CalibrationMark(self.document_id, self.created_utc)
 
 
+WHOLLY_ALIKE = 1e-9
+"""Share of the focal lengths' variance below which that of their difference is rounding."""
+
+
+def is_aspect_held(covariance: FloatArray) -> bool:
+    """True if the focal lengths of a camera's covariance (9, 9) err as one: fy was held to fx."""
+    fx, fy = (CAMERA_PARAMETER_NAMES.index(name) for name in ("fx_px", "fy_px"))
+    both = covariance[fx, fx] + covariance[fy, fy]
+    apart = both - covariance[fx, fy] - covariance[fy, fx]
+    return bool(both > 0.0 and apart <= WHOLLY_ALIKE * both)
+
+
+def independent_parameters(covariance: FloatArray) -> IntArray:
+    """Numbers of the parameters that a camera's covariance (9, 9) knows with an error of their own.
+
+    Parameters that were held are none, and of focal lengths that err as one fy is none: without
+    them the covariance has an inverse.
+    """
+    is_own = np.diag(covariance) > 0.0
+    if is_aspect_held(covariance):
+        is_own[CAMERA_PARAMETER_NAMES.index("fy_px")] = False
+    return np.flatnonzero(is_own)
+
+
 class CameraCalibration(ArrayRecord):
     """A camera with its uncertainty.
 
@@ -219,6 +243,11 @@ class CameraCalibration(ArrayRecord):
         """The camera with its parameters moved by a step (9,), known to another covariance."""
         moved = self.camera.moved_to(self.camera.parameters + step)
         return replace(self, camera=moved, covariance=covariance)
+
+
+def without_covariance(figures: str, camera: str = "the camera") -> str:
+    """The warning that ``figures`` do not hold what a camera errs by."""
+    return f"{camera} came without covariance: {figures} leave its errors out"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -318,6 +347,13 @@ class SensorCalibration(ArrayRecord):
         """Columns of ``covariance`` that belong to sheet number ``index``."""
         start = len(CAMERA_PARAMETER_NAMES) + index * len(SHEET_PARAMETER_NAMES)
         return slice(start, start + len(SHEET_PARAMETER_NAMES))
+
+    @property
+    def has_camera_covariance(self) -> bool:
+        """False if a camera came without covariance."""
+        return self.camera.has_covariance and (
+            self.second is None or self.second.camera.has_covariance
+        )
 
     @property
     def second_parameter_slice(self) -> slice:

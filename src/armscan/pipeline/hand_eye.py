@@ -35,7 +35,6 @@ from armscan.reconstruction.sync import exposure_poses
 from armscan.reconstruction.triangulate import StripePoints, sensor_columns
 from armscan.records.exposure import Exposure
 from armscan.records.profile import PointProfile
-from armscan.records.recording import ExposureRow
 
 STAGE, LOOKS = "stripes of the postures", "stripes on the plate"
 MAX_EXPOSURES = 200
@@ -44,7 +43,7 @@ SAME_PLACE_MM = 0.05
 SAME_TURN_RAD = 2e-4
 """Consecutive exposures without a view whose poses differ by less are one posture."""
 REPEATED_DEG, REPEATED_MM = 0.1, 0.1
-"""Profiles whose poses, as a robot tells them, differ by less are one posture."""
+"""Poses of a table, as a robot tells them, that differ by less are one posture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,8 +117,11 @@ def observe_stripes(
     scan = ScanInstants(source, len(cameras_of(sensor)))
     has_pose = np.array([poses.has_pose[list(one.rows)].all() for one in scan.lit], dtype=np.bool_)
     chosen = [scan.lit[k] for k in _spread(np.flatnonzero(has_pose), max_exposures)]
-    postures, merged = _postures(
-        [source.rows[one.rows[0]] for one in chosen], [poses.pose(one.rows[0]) for one in chosen]
+    rows = [source.rows[one.rows[0]] for one in chosen]
+    postures, merged = standing_postures(
+        [row.view for row in rows],
+        [poses.pose(one.rows[0]) for one in chosen],
+        [f"exposure {row.index}" for row in rows],
     )
     posture_of = dict(zip(chosen, postures, strict=True))
     stripes: list[PosedStripe] = []
@@ -339,27 +341,30 @@ def _spread(rows: IntArray, most: int) -> IntArray:
     return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.int64)]
 
 
-def _postures(
-    rows: list[ExposureRow], poses: list[Pose[Base, Tool]]
+def standing_postures(
+    views: Sequence[str | None], poses: Sequence[Pose[Base, Tool]], names: Sequence[str]
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Name the posture of each exposure; say which were put together without being asked."""
-    names: list[str] = []
+    """Name the posture of each exposure; say which were put together without being asked.
+
+    A posture is named by its view, else by the name of its first exposure.
+    """
+    postures: list[str] = []
     n_merged = 0
     first = 0
-    for k, row in enumerate(rows):
-        if row.view is not None:
-            names.append(row.view)
+    for k, view in enumerate(views):
+        if view is not None:
+            postures.append(view)
             continue
-        may_join = k > 0 and rows[k - 1].view is None
+        may_join = k > 0 and views[k - 1] is None
         if may_join and _agree(poses[first], poses[k]):
-            names.append(names[-1])
+            postures.append(postures[-1])
             n_merged += 1
             continue
         first = k
-        names.append(f"exposure {row.index}")
+        postures.append(names[k])
     if not n_merged:
-        return names, ()
-    return names, (
+        return postures, ()
+    return postures, (
         f"{n_merged} exposures were taken where the one before was (within {SAME_PLACE_MM} mm and "
         f"{np.degrees(SAME_TURN_RAD):.3f} deg) and count as one posture with it",
     )
@@ -370,6 +375,20 @@ def _agree(pose: Pose[Base, Tool], other: Pose[Base, Tool]) -> bool:
     turn: Pose[Tool, Tool] = pose.inverse() @ other
     angle = float(np.linalg.norm(turn.rotation_vector_rad))
     return shift < SAME_PLACE_MM and angle < SAME_TURN_RAD
+
+
+def repeated_postures(names: Sequence[str], poses: Sequence[Pose[Base, Tool]]) -> list[str]:
+    """Name the posture of each pose of a table: that of the first with the same pose."""
+    postures: list[str] = []
+    for k, pose in enumerate(poses):
+        same = [
+            j
+            for j in range(k)
+            if np.linalg.norm(poses[j].translation_mm - pose.translation_mm) < REPEATED_MM
+            and np.abs(poses[j].rotation - pose.rotation).max() < np.radians(REPEATED_DEG)
+        ]
+        postures.append(postures[same[0]] if same else names[k])
+    return postures
 
 
 def posed_stripes_from_profiles(
@@ -390,15 +409,7 @@ def posed_stripes_from_profiles(
         If the counts differ.
     """
     check_poses(profiles, poses)
-    postures: list[str] = []
-    for k, pose in enumerate(poses):
-        same = [
-            j
-            for j in range(k)
-            if np.linalg.norm(poses[j].translation_mm - pose.translation_mm) < REPEATED_MM
-            and np.abs(poses[j].rotation - pose.rotation).max() < np.radians(REPEATED_DEG)
-        ]
-        postures.append(postures[same[0]] if same else profiles[k].source)
+    postures = repeated_postures([profile.source for profile in profiles], poses)
     stripes = []
     for profile, posture, pose in zip(profiles, postures, poses, strict=True):
         points = delivered_points(profile)

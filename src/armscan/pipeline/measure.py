@@ -17,7 +17,7 @@ import numpy as np
 
 from armscan.errors import ArmscanError, EstimationError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.models.calibration import LaserColour, SensorCalibration
+from armscan.models.calibration import LaserColour, SensorCalibration, without_covariance
 from armscan.models.camera import CameraModel
 from armscan.pipeline.instants import (
     ExposurePair,
@@ -612,10 +612,8 @@ def measurement_warnings(
             f"{n_outside} points were left out: too far outside the calibrated depths; "
             "`reconstruct --depth-margin`, in widths of these depths, takes more"
         )
-    if not sensor.camera.has_covariance:
-        warnings.append(
-            "the camera came without covariance: the points' sigmas leave its errors out"
-        )
+    if not sensor.has_camera_covariance:
+        warnings.append(without_covariance("the points' sigmas"))
     for sheet, depth in zip(sensor.sheets, depths, strict=True):
         low, high = depth.range_mm
         if depth.n_beyond:

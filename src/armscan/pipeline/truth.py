@@ -25,6 +25,7 @@ from armscan.models.calibration import (
     ScannerCalibration,
     SensorCalibration,
     SheetCalibration,
+    independent_parameters,
 )
 from armscan.pipeline.instants import group_instants
 from armscan.pipeline.measure import measured_again
@@ -226,9 +227,13 @@ def calibration_errors(
 
 
 def camera_errors(camera: CameraCalibration, true_parameters: FloatArray) -> CameraErrors:
-    """Errors of a camera; the true parameters (9,) in the order of the camera's own."""
+    """Errors of a camera; the true parameters (9,) in the order of the camera's own.
+
+    Where fy was held to fx, their common error counts once.
+    """
     error = camera.camera.parameters - true_parameters
-    is_free = np.asarray(np.diag(camera.covariance) > 0.0)
+    is_free = np.zeros(len(error), dtype=np.bool_)
+    is_free[independent_parameters(camera.covariance)] = True
     return CameraErrors(
         focal_px=float(error[0]),
         focal_sigma_px=float(np.sqrt(camera.covariance[0, 0])),

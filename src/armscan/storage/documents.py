@@ -407,16 +407,31 @@ def document_schema(path: Path) -> str | None:
     return found if isinstance(found, str) else None
 
 
+def observations_named(path: Path) -> Path | None:
+    """Where a document's file of observations should be; None if it names none."""
+    entry = _observations_entry(path)
+    return None if entry is None else _beside(path, entry)
+
+
+def _observations_entry(path: Path) -> dict[str, Any] | None:
+    entry = parse_json(read_bytes(path), path_text(path)).get("observations")
+    return entry if isinstance(entry, dict) else None
+
+
+def _beside(path: Path, entry: dict[str, Any]) -> Path:
+    return path.parent / Path(str(entry.get("file"))).name
+
+
 def observations_of(path: Path) -> Path:
     """The file of observations beside a document, as the document says it was written."""
-    entry = parse_json(read_bytes(path), path_text(path)).get("observations")
-    if not isinstance(entry, dict):
+    entry = _observations_entry(path)
+    if entry is None:
         raise FileFormatError(
             "the document names no observations from which it could be solved again",
             where=path_text(path),
             remedy="calibrate again from the images",
         )
-    beside = path.parent / Path(str(entry.get("file"))).name
+    beside = _beside(path, entry)
     if sha256(read_bytes(beside)).hexdigest() != entry.get("sha256"):
         raise FileFormatError(
             f"these are not the observations that {path.name} was solved from",

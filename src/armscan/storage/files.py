@@ -198,6 +198,57 @@ Content: TypeAlias = bytes | Iterable[bytes]
 """Of a file: all of it, or pieces that follow each other."""
 
 
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.before")
+
+
+def check_aside(path: Path) -> None:
+    """Raise `OutputError` if a file that `set_aside` moved was never brought back or removed."""
+    if _aside(path).exists():
+        raise OutputError(
+            f"an earlier file of this name lies in {_aside(path).name}: the run that was to "
+            "replace it was killed, or still goes on",
+            where=path_text(path),
+            remedy="rename that file to keep it or remove it, or choose another name",
+        )
+
+
+def set_aside(path: Path, *, is_overwriting: bool = False) -> Path | None:
+    """Give a file another name until its successor is there; None where there is no file.
+
+    Raises
+    ------
+    OutputError
+        As `check_outputs` and `check_aside`, or if another run writes the file now.
+    """
+    check_outputs((path,), is_overwriting=is_overwriting)
+    check_aside(path)
+    if not path.exists():
+        return None
+    if _is_held(path):
+        raise OutputError(
+            "another run writes this file",
+            where=path_text(path),
+            remedy="wait for its end, or choose another name",
+        )
+    with _refusing("the file cannot be replaced", path, "choose another name"):
+        _rename(path, _aside(path))
+    return _aside(path)
+
+
+def bring_back(aside: Path, path: Path) -> None:
+    """Undo `set_aside`; raises `OutputError` where another program took the name meanwhile."""
+    remedy = "both files are whole: rename them as you like"
+    with _refusing(f"what was there before lies in {aside.name}", path, remedy):
+        _rename(aside, path)
+
+
+def _rename(path: Path, free: Path) -> None:
+    """Give a name that nothing has; raise `FileExistsError` where something does."""
+    _give_name(path, free, is_overwriting=False)
+    path.unlink(missing_ok=True)
+
+
 def make_folder(folder: Path, *, with_parents: bool = False) -> None:
     """Make a folder where there is none; those above it, too, only where that is asked for."""
     with _refusing("the folder cannot be made", folder, "choose another place"):
@@ -316,7 +367,7 @@ def new_folder(folder: Path, beside: Mapping[Path, bytes] | None = None) -> Iter
     try:
         with _refusing("nothing was written", folder):
             partial.mkdir()
-            with _locked(partial):
+            with locked(partial):
                 yield partial
                 write_files(beside or {})
                 try:
@@ -351,7 +402,7 @@ def replaced_folder(folder: Path, check: Callable[[], None]) -> Iterator[Path]:
             check()
             _remove_rests(target)
             partial.mkdir()
-            with _locked(partial):
+            with locked(partial):
                 _NAMES_TO_COME[partial] = folder
                 yield partial
                 check()
@@ -367,7 +418,7 @@ def _swap(partial: Path, target: Path) -> None:
         partial.rename(target)
         return
     old = partial.with_suffix(".old")
-    with _locked(target):
+    with locked(target):
         target.rename(old)
         try:
             partial.rename(target)
@@ -424,7 +475,7 @@ def scratch_folder(document: Path) -> Iterator[Path]:
     with _refusing("nothing can be written there", folder.parent):
         folder.mkdir()
     try:
-        with _locked(folder):
+        with locked(folder):
             yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -432,7 +483,7 @@ def scratch_folder(document: Path) -> Iterator[Path]:
 
 def _write_part(part: Path, content: Content, locks: ExitStack) -> None:
     with part.open("xb") as file:
-        locks.enter_context(_locked(part))
+        locks.enter_context(locked(part))
         for piece in (content,) if isinstance(content, bytes) else content:
             file.write(piece)
         file.flush()
@@ -456,7 +507,7 @@ def _give_name(part: Path, path: Path, *, is_overwriting: bool) -> None:
 
 
 @contextmanager
-def _locked(part: Path) -> Iterator[None]:
+def locked(part: Path) -> Iterator[None]:
     """Hold a lock while something is written, so that a second run does not take it for a rest."""
     if fcntl is None:
         yield
@@ -468,6 +519,18 @@ def _locked(part: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def _is_held(path: Path) -> bool:
+    """Whether a run has it `locked`; False where files cannot be locked."""
+    if fcntl is None:
+        return False
+    with suppress(OSError), path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def _remove_rests(path: Path) -> None:

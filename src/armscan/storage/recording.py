@@ -379,6 +379,11 @@ def recording_tables(folder: Path) -> tuple[Path, ...]:
     return tuple(path for path in places if is_file(path))
 
 
+def camera_tables(folder: Path) -> tuple[Path, ...]:
+    """Those of `recording_tables` that say something of the images."""
+    return tuple(path for path in recording_tables(folder) if path.name != ARM_FILE)
+
+
 def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording:
     """Read a folder recording, or the one in an MCAP file; images are read later, one by one.
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib.util
 import os
 import socket
@@ -13,6 +14,7 @@ import time
 import tty
 import zlib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,13 @@ from scipy.spatial.transform import Rotation
 
 from armscan.devices.protocols import ArmFlag, ArmSample
 from armscan.devices.registry import open_device
-from armscan.drivers.arm_stream import ArmStreamDecoder, encode_sample
+from armscan.drivers.arm_stream import (
+    KEEPALIVE,
+    ArmStreamDecoder,
+    StreamedArm,
+    TcpLink,
+    encode_sample,
+)
 from armscan.errors import DeviceError, DeviceTakenError, InputError, OptionError
 from armscan.geometry.poses import Pose
 
@@ -173,6 +181,109 @@ def test_the_count_turns_over_and_lost_frames_are_counted() -> None:
     assert came == numbers and decoder.n_lost == 2
     with pytest.raises(InputError):
         encode_sample(sample(0, joints_rad=np.zeros(13)))
+
+
+@contextlib.contextmanager
+def serving(frames: list[ArmSample]) -> Iterator[str]:
+    """Address of a server that sends frames to whoever connects first, then nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        is_over = threading.Event()
+
+        def send() -> None:
+            client, _ = server.accept()
+            with client:
+                client.sendall(b"".join(encode_sample(one) for one in frames))
+                is_over.wait(60.0)
+
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        yield f"tcp:127.0.0.1:{server.getsockname()[1]}"
+        is_over.set()
+        thread.join()
+
+
+class FakeClock:
+    """Time that passes by reading alone, so that a slow computer changes nothing."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def monotonic_ns(self) -> int:
+        return round(1e9 * self.now_s)
+
+
+class PlayedLink:
+    """Frames that come in pieces a tenth of a second apart, then nothing."""
+
+    def __init__(self, clock: FakeClock, pieces: list[list[ArmSample]], place: str) -> None:
+        self.clock, self.pieces, self.name = clock, iter(pieces), place
+
+    def read(self) -> bytes:
+        self.clock.now_s += 0.1
+        return b"".join(encode_sample(one) for one in next(self.pieces, []))
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+EMPTY: dict[str, Any] = {"pose": None, "flags": ArmFlag.NONE}
+JOINTS: dict[str, Any] = {"pose": None, "n_joints": 6}
+
+
+@pytest.mark.parametrize(
+    ("first", "later", "form"),
+    [
+        (EMPTY, {}, "quaternion"),
+        (EMPTY, {"n_joints": 6}, "quaternion"),
+        (EMPTY, JOINTS | {"flags": ArmFlag.REFERENCED}, "joints"),
+        (JOINTS | {"flags": ArmFlag.NONE}, {}, "quaternion"),
+        (EMPTY, JOINTS | {"flags": ArmFlag.NONE}, "joints"),
+        (EMPTY, EMPTY, "quaternion"),
+    ],
+)
+def test_the_first_frame_that_shows_it_says_what_an_arm_delivers(
+    first: dict[str, Any], later: dict[str, Any], form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before it is referenced an arm may send neither pose nor joint angles."""
+    pieces = [[sample(n, **given), sample(n + 1, **given)] for n, given in ((0, first), (2, later))]
+    clock = FakeClock()
+    monkeypatch.setattr("armscan.drivers.arm_stream.time", clock)
+    link: Any = partial(PlayedLink, clock, pieces)
+    arm = StreamedArm(link, "played")
+    assert arm.pose_form == form
+    arm.close()
+
+
+def test_a_connection_is_asked_whether_the_other_side_is_there() -> None:
+    """A pulled cable ends no connection; an arm that waits for its next trigger is there."""
+    with serving([sample(0)]) as address:
+        link = TcpLink(address.removeprefix("tcp:"))
+        asked = link._socket
+        assert asked.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        set_here = {name: seconds for name, seconds in KEEPALIVE.items() if hasattr(socket, name)}
+        for name, wanted in set_here.items():
+            assert asked.getsockopt(socket.IPPROTO_TCP, getattr(socket, name)) == wanted
+        link.close()
+
+
+class Unanswered:
+    """A connection of which the system finds that it has ended."""
+
+    def recv(self, most: int) -> bytes:
+        raise TimeoutError(errno.ETIMEDOUT, "Connection timed out")
+
+
+def test_a_connection_that_the_system_gives_up_has_ended_and_silence_is_none() -> None:
+    with serving([]) as address:
+        link: Any = TcpLink(address.removeprefix("tcp:"))
+        assert link.read() == b""
+        link.close()
+        link._socket = Unanswered()
+        with pytest.raises(OSError, match="timed out"):
+            link.read()
 
 
 class Sender(threading.Thread):

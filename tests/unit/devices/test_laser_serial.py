@@ -15,7 +15,7 @@ from armscan.devices.protocols import LaserController, LaserEvent
 from armscan.devices.registry import open_device
 from armscan.drivers.arm_stream import SerialLink
 from armscan.drivers.laser_serial import framed, unframed
-from armscan.errors import DeviceError, DeviceTakenError, OptionError
+from armscan.errors import DeviceError, DeviceStoppedError, DeviceTakenError, OptionError
 from rigs.laser_controller import ReferenceController
 
 pytest.importorskip("serial")
@@ -112,6 +112,22 @@ def test_lasers_stay_on_while_the_host_lives_and_go_off_where_it_is_silent(
         while True:
             lasers.read(0.1)
     firmware.spoils_in = 0
+    lasers.start(20.0)
+    assert events(lasers, 2)
+    lasers.close()
+
+
+def test_lasers_that_went_off_by_themselves_stay_off_until_they_are_started(
+    firmware: ReferenceController,
+) -> None:
+    lasers = open_device("lasers", firmware.address)
+    lasers.set_schedule([("A",)])
+    lasers.start(20.0)
+    firmware.say("OFF WATCHDOG")
+    for _ in range(2):
+        with pytest.raises(DeviceStoppedError, match=r"switched the lasers off; start it again"):
+            while True:
+                lasers.read(0.1)
     lasers.start(20.0)
     assert events(lasers, 2)
     lasers.close()

@@ -106,6 +106,29 @@ def test_plays_at_another_rate_round_after_round(folder: Path) -> None:
     assert all(latched[frame.trigger_id] == frame.t_device_ns for frame in frames)
 
 
+def test_a_recording_that_names_no_lasers_does_not_say_that_they_were_off(tmp_path: Path) -> None:
+    unnamed = EXPOSURES.replace(",A+B,", ",,").replace(",A,", ",,")
+    folder = lab_folder(tmp_path / "scan", exposures=unnamed, arm=ARM)
+    camera = open_device("camera", f"replay:{folder}")
+    camera.start()
+    frames = [camera.read(20.0) for _ in range(3)]
+    assert [one.lasers for one in frames if one is not None] == [None] * 3
+    with pytest.raises(DeviceError, match=r"no lasers.*leave this device out"):
+        open_device("lasers", f"replay:{folder}")
+    camera.close()
+
+
+def test_a_row_without_lasers_among_others_was_dark(tmp_path: Path) -> None:
+    dark = EXPOSURES.replace(",A+B,", ",,")
+    camera = open_device(
+        "camera", f"replay:{lab_folder(tmp_path / 'scan', exposures=dark, arm=ARM)}"
+    )
+    camera.start()
+    frames = [camera.read(20.0) for _ in range(3)]
+    assert [one.lasers for one in frames if one is not None] == [(), ("A",), ("A",)]
+    camera.close()
+
+
 def test_waits_while_everything_is_stopped(folder: Path) -> None:
     camera = open_device("camera", f"replay:{folder}?rate=50&loop=1")
     camera.start()

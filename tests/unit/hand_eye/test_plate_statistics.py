@@ -18,10 +18,13 @@ from armscan.calibration.hand_eye.noise import (
     solve_linear,
 )
 from armscan.calibration.hand_eye.observations import HandEyeOptions
+from armscan.calibration.hand_eye.probed_plate import ProbingOptions, fit_probed_plate
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.surface import TIP_SHARE, PlateSurface
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import N_DRAWS, normal_draws
+from armscan.records.points import ProbedPoints
 from rigs.plate_bound import cramer_rao, plain_least_squares, scored_densely
 from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
 
@@ -142,15 +145,42 @@ def test_a_tip_is_known_as_from_twenty_touches() -> None:
         errors.append(np.linalg.lstsq(way, rng.normal(size=20), rcond=None)[0])
     by_one_touch = float(np.sqrt(np.mean(np.square(errors))))
     assert by_one_touch == pytest.approx(TIP_SHARE, rel=0.1)
-    known = np.diag([1e-5, 2e-5, 0.001]) ** 2
-    plate = replace(PlateRig(good_postures(6, rng)).draw(1)[1], covariance=known, rms_mm=0.004)
+    plate = PlateRig(good_postures(6, rng)).draw(1)[1]
+    known, touch_mm = plate.covariance, plate.touch_sigma_mm
+    assert known is not None and touch_mm is not None
+    assert touch_mm == pytest.approx(0.0061, rel=0.3), "64 touches of 5.3 um on a plate of 3 um"
     prior = PlateSurface(plate).prior(HandEyeOptions())
     assert prior is not None
-    expected = np.diag([1e-10, 4e-10, 0.001**2 + (by_one_touch * 0.004) ** 2])
+    expected = known + np.diag([0.0, 0.0, (by_one_touch * touch_mm) ** 2])
     np.testing.assert_allclose(prior, expected, rtol=0.2)
     exact = replace(plate, covariance=None)
     assert PlateSurface(exact).prior(HandEyeOptions()) is None
     assert PlateSurface(plate).prior(HandEyeOptions(solve_plate=True)) is None
+
+
+@pytest.mark.parametrize(
+    ("n_touches", "least", "most"), [(3, 1.0, 1.0), (4, 0.8, 1.3), (20, 0.9, 1.1)]
+)
+def test_a_tip_shifts_few_touches_as_much_as_many(
+    n_touches: int, least: float, most: float
+) -> None:
+    """Three touches have no residuals; the arm and the tip that made them err all the same.
+
+    Medians of 40 plates whose touches scatter as is expected of one, over 0.4 of that.
+    """
+    rng, found = np.random.default_rng(4), []
+    sigma_mm = ProbingOptions().touch_sigma_mm
+    for _ in range(40):
+        place = rng.uniform(-100.0, 100.0, (n_touches, 2))
+        points = np.column_stack([place, sigma_mm * rng.normal(size=n_touches)])
+        probed = fit_probed_plate(ProbedPoints(points, 6.0), np.array([0.0, 0.0, 300.0]))
+        if isinstance(probed, FitFailure):
+            continue  # three that lie nearly on one line
+        known, prior = probed.reference.covariance, PlateSurface(probed.reference).prior(GIVEN)
+        assert known is not None and prior is not None
+        found.append(float(np.sqrt(prior[2, 2] - known[2, 2])) / (TIP_SHARE * sigma_mm))
+    assert len(found) > 30
+    assert 0.999 * least < np.median(found) < 1.001 * most
 
 
 def test_restricted_likelihood_of_repeats_is_the_sample_variance() -> None:

@@ -10,9 +10,12 @@ import pytest
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import HandEyeOptions, PosedStripe, check_postures
+from armscan.calibration.hand_eye.on_board import calibrate_on_board
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import InputError
 from armscan.geometry.poses import Pose, Tool
+from armscan.pipeline.hand_eye import repeated_postures, standing_postures
+from rigs.board_postures import board_rig
 from rigs.plate_rig import PlateRig, good_postures
 
 STANDING_MM, STANDING_RAD = 0.02, np.radians(0.002)
@@ -32,6 +35,32 @@ def test_two_postures_of_one_name_are_refused_on_a_plate() -> None:
     ) as e:
         calibrate_on_plate(named, plate)
     assert "a view of its own" in str(e.value)
+
+
+def test_two_postures_of_one_name_are_refused_before_a_target() -> None:
+    """Taken for one posture, two poses that err by themselves would share one error."""
+    rig = board_rig(1, 8)
+    named = [replace(look, posture=f"view{k // 2}") for k, look in enumerate(rig.looks)]
+    with pytest.raises(InputError, match=r"'view0' has different poses.*0\.png to 1\.png"):
+        calibrate_on_board(named, rig.camera)
+
+
+def test_looks_that_share_a_pose_share_a_posture_s_name() -> None:
+    """By the rule of a recording and by that of a table, also where encoders jitter by 2 um."""
+    rig = board_rig(2, 6, images=3)
+    step = np.array([0.0, 0.0, 0.0, 0.002, 0.0, 0.0])
+    names = [look.source for look in rig.looks]
+    poses = [look.base_from_tool.retract((-1) ** k * step) for k, look in enumerate(rig.looks)]
+    first_of_each = [names[k - k % 3] for k in range(len(names))]
+    assert repeated_postures(names, poses) == first_of_each
+    standing, notes = standing_postures([None] * len(names), poses, names)
+    assert standing == first_of_each
+    assert notes[0].startswith("12 exposures were taken where the one before was")
+    # a table is in any order, an arm that comes back along another way errs anew
+    again = [*poses[:3], *poses[3:6], *poses[:3]]
+    assert repeated_postures(names[:9], again) == [names[k] for k in (0, 0, 0, 3, 3, 3, 0, 0, 0)]
+    back, _ = standing_postures([None] * 9, again, names[:9])
+    assert back == [names[k] for k in (0, 0, 0, 3, 3, 3, 6, 6, 6)]
 
 
 def test_an_arm_that_stands_still_is_one_posture() -> None:

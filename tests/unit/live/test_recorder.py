@@ -307,3 +307,47 @@ def test_joints_are_recorded_with_the_arm_s_document(tmp_path: Path) -> None:
     assert recorded.arm.is_known.tolist() == [True, False, True]
     np.testing.assert_allclose(recorded.arm.translations_mm[::2], places[::2], atol=1e-9)
     np.testing.assert_allclose(recorded.arm.rotations[::2], rotations[::2], atol=1e-12)
+
+
+def add_posed(recorder: LiveRecorder, samples: list[ArmSample]) -> None:
+    """Exposures and samples of triggers from 3 on, their poses as they are sent."""
+    for k, one in enumerate(samples):
+        recorder.add_instant(instant(k, 10**9 * (k + 1)))
+        own = replace(one, trigger_id=k + 3, t_host_ns=10**9 * (k + 1))
+        pose = own.pose if ArmFlag.REFERENCED in own.flags else None
+        recorder.add_samples((TimedSample(own, 10**9 * (k + 1), ElementStatus.USABLE, pose),))
+
+
+def test_joint_angles_beside_poses_are_recorded_too(tmp_path: Path) -> None:
+    """Also where the first samples have none: no column of a later one is lost."""
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    joints = np.random.default_rng(2).uniform(-0.5, 0.5, (4, 6))
+    pose = triggered_scan(1).truth[0]
+    empty = ArmSample(0, 1, 0, flags=ArmFlag.NONE)
+    both = [replace(empty, number=k, pose=pose, joints_rad=joints[k]) for k in range(4)]
+    flags = (ArmFlag.NONE, ArmFlag.REFERENCED, ArmFlag.REFERENCED)
+    add_posed(recorder, [empty, *(replace(both[k + 1], flags=one) for k, one in enumerate(flags))])
+    recorder.close()
+    assert (recorder.n_samples, recorder.n_posed) == (4, 2)
+    recorded, _, _ = read_back(tmp_path / "scan.mcap")
+    assert recorded.session.pose_form == "quaternion"
+    assert recorded.arm.is_known.tolist() == [False, False, True, True]
+    np.testing.assert_array_equal(recorded.arm.joints_rad[2:], joints[2:])
+    assert np.isnan(recorded.arm.joints_rad[:2]).all()
+    np.testing.assert_allclose(recorded.arm.translations_mm[2], pose.translation_mm, atol=1e-9)
+    # the gaps alone are told: two ways of saying one pose are no contradiction
+    assert [note for note in recorded.warnings if "samples have no pose" not in note] == []
+    assert describe_recording(tmp_path / "scan.mcap")["has_joints"] is True
+
+
+def test_joint_angles_of_an_arm_that_showed_nothing_at_first_are_kept(tmp_path: Path) -> None:
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    joints = np.random.default_rng(2).uniform(-0.5, 0.5, (3, 6))
+    add_posed(recorder, [ArmSample(k, 1, 0, joints_rad=joints[k]) for k in range(3)])
+    recorder.close()
+    assert (recorder.n_samples, recorder.n_posed) == (3, 0)
+    recorded, _, _ = read_back(tmp_path / "scan.mcap")
+    assert not recorded.arm.is_known.any()
+    np.testing.assert_array_equal(recorded.arm.joints_rad, joints)

@@ -99,23 +99,33 @@ def test_an_image_of_another_size(capsys: pytest.CaptureFixture[str], tmp_path: 
     assert "642 x 480 px" in capsys.readouterr().err
 
 
-def test_a_recording_of_two_cameras(tmp_path: Path) -> None:
-    """The same images as rows of a recording, paired by trigger; a row with laser is not used."""
+def test_a_recording_of_two_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same images as rows of a recording, paired by trigger; a row with laser is not used.
+
+    The list of exposures is among the inputs, what the arm said is not; a column that nothing is
+    known of is told on the terminal, on the page and in the document.
+    """
     patterns = sides("0[1-4]")
-    lines = ["index,t_ns,camera,file,lasers,trigger_id"]
+    lines = ["index,t_ns,camera,file,lasers,trigger_id,weather"]
     for camera, pattern in enumerate(patterns):
         for k, path in enumerate(sorted(Path(pattern).parent.glob(Path(pattern).name))):
             (tmp_path / "scan").mkdir(exist_ok=True)
             (tmp_path / "scan" / path.name).write_bytes(path.read_bytes())
             # The right camera's clock is late: the trigger tells which images belong together.
             t_ns = 1000000 * k + 700000 * camera
-            lines.append(f"{4 * camera + k},{t_ns},{camera},{path.name},,{k}")
-    lines.append(f"99,99000000,0,{path.name},A,99")
+            lines.append(f"{4 * camera + k},{t_ns},{camera},{path.name},,{k},fair")
+    lines.append(f"99,99000000,0,{path.name},A,99,fair")
     (tmp_path / "scan" / "exposures.csv").write_text("\n".join(lines) + "\n")
     output = tmp_path / "s.json"
     words = ("--scan", str(tmp_path / "scan"), *TARGET, *SMALL, "-o", str(output))
-    assert calibrate(*words) == 0
-    assert read_stereo_calibration(output).n_pairs == 4
+    assert calibrate(*words, "--json") == 0
+    found = read_stereo_calibration(output)
+    assert found.n_pairs == 4
+    inputs = [Path(item.path).name for item in found.provenance.inputs]
+    assert "exposures.csv" in inputs and len(inputs) == 9
+    told = json.loads(capsys.readouterr().out)["warnings"]
+    for place in (told, found.provenance.warnings, [output.with_suffix(".html").read_text()]):
+        assert any("weather" in text for text in place)
 
 
 def test_calibrations_of_the_cameras_from_the_same_images_do_not_count_twice(
@@ -126,7 +136,7 @@ def test_calibrations_of_the_cameras_from_the_same_images_do_not_count_twice(
         camera = tmp_path / f"{side}.json"
         assert main(["calibrate", "camera", pattern, *TARGET, *SMALL, "-o", str(camera)]) == 0
         words += [f"--{side}", str(camera)]
-    both = (*sides("0[1-4]"), *TARGET, *SMALL, *words, "-o", str(tmp_path / "s.json"))
+    both = (*sides("0[1-4]"), *TARGET, *words, "-o", str(tmp_path / "s.json"))
     capsys.readouterr()
     assert calibrate(*both) == 2
     assert "count twice" in capsys.readouterr().err

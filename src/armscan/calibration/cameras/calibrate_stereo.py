@@ -62,7 +62,7 @@ from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
-from armscan.models.calibration import CameraCalibration
+from armscan.models.calibration import CameraCalibration, independent_parameters
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import TwoViews, epipolar_distances_px
 from armscan.vision.targets.target import Target, TargetView
@@ -157,6 +157,8 @@ def joint_basis(cameras: Cameras) -> FloatArray:
 def prior_of(given: tuple[CameraCalibration, CameraCalibration]) -> Prior:
     """The given calibrations as observations of the intrinsics.
 
+    Of focal lengths that were held to each other fx is observed; fy follows it (`joint_basis`).
+
     Raises
     ------
     OptionError
@@ -165,7 +167,7 @@ def prior_of(given: tuple[CameraCalibration, CameraCalibration]) -> Prior:
     information = np.zeros((N_INTRINSICS, N_INTRINSICS))
     n_known = 0
     for side, calibration in enumerate(given):
-        known = np.flatnonzero(np.diag(calibration.covariance) > 0.0)
+        known = independent_parameters(calibration.covariance)
         if not calibration.has_covariance or not len(known):
             raise OptionError(
                 f"the {('left', 'right')[side]} camera's calibration brings no covariance",
@@ -373,24 +375,18 @@ def calibrate_stereo(
     that all pairs agree. Pairs that contradict the others are named and taken apart. A bow of the
     board that a camera by itself cannot do without is taken over from there.
 
-    ``given`` are calibrations of the left and of the right camera, unless the intrinsics are
-    ``free``.
+    ``given`` are calibrations of the left and of the right camera; none for ``free`` intrinsics.
 
     Raises
     ------
     InputError
         If the images of one camera differ in size or name, or not in name.
     OptionError
-        If a pair to leave out does not exist, or given calibrations are missing or without
-        covariance where one is needed.
+        If a pair to leave out does not exist, or calibrations are given for ``free`` intrinsics,
+        or are missing or without covariance where one is needed.
     """
     options = options or StereoOptions()
-    if options.intrinsics != "free" and given is None:
-        raise OptionError(
-            f"intrinsics '{options.intrinsics}' need calibrations of both cameras",
-            remedy="give them, or let the intrinsics be free",
-        )
-    given = None if options.intrinsics == "free" else given
+    options.check_given(is_given=given is not None)
     chosen = check_pairs(pairs, options.leave_out)
     n_both = sum(pair.is_seen_by_both for pair in chosen)
     if n_both < MIN_PAIRS:

@@ -22,7 +22,11 @@ from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.models.calibration import CameraCalibration
+from armscan.models.calibration import (
+    CameraCalibration,
+    independent_parameters,
+    is_aspect_held,
+)
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.models.two_views import IntrinsicsUse
 from armscan.vision.targets.detect import Numbering, renumbered
@@ -41,8 +45,9 @@ class StereoOptions:
     Parameters
     ----------
     camera
-        Of each camera: distortion model, what is held, most steps. What it
-        says of views to leave out and of folds does not count here.
+        Of each camera: distortion model, what is held, most steps. Where calibrations are given,
+        these say what is solved: the model is then that of the solutions which they are compared
+        with. What it says of views to leave out and of folds does not count here.
     intrinsics
         What given calibrations of the cameras are for: ``free`` takes none, ``prior`` takes their
         values with their covariance as observations beside the images, ``fixed`` holds them (their
@@ -70,6 +75,20 @@ class StereoOptions:
             )
         if self.n_folds < 0 or self.n_folds == 1:
             raise OptionError(f"n_folds is {self.n_folds}", remedy="give 0 (off) or at least 2")
+
+    def check_given(self, *, is_given: bool) -> None:
+        """Raise `OptionError` if calibrations are given for nothing, or missing."""
+        if is_given and self.intrinsics == "free":
+            raise OptionError(
+                "calibrations of the cameras are given, and free intrinsics take none",
+                where="--intrinsics free",
+                remedy="leave --left and --right out, or count them (prior) or hold them (fixed)",
+            )
+        if not is_given and self.intrinsics != "free":
+            raise OptionError(
+                f"intrinsics '{self.intrinsics}' need calibrations of both cameras",
+                remedy="give them, or let the intrinsics be free",
+            )
 
 
 SIDES = ("left", "right")
@@ -171,6 +190,8 @@ class SingleCamera:
         Reason for each other view, by source.
     fit
         The camera by itself; None if its views do not determine one and it was given.
+    has_covariance
+        False if it is held as a calibration without uncertainty gives it.
     given_level
         Squared distance of given intrinsics from what the images say by themselves, over both
         covariances and the degrees of freedom; NaN where there is none.
@@ -184,6 +205,7 @@ class SingleCamera:
     fit: CameraFit | None
     reason: str
     given_level: float = float("nan")
+    has_covariance: bool = True
 
     def kept(self, view: TargetView | None) -> TargetView | None:
         """The view if it can be used."""
@@ -285,10 +307,10 @@ def _given(
     fit: CameraFit | None,
     options: StereoOptions,
 ) -> SingleCamera:
-    known = np.diag(given.covariance) > 0.0
     is_prior = options.intrinsics == "prior"
-    names = tuple(name for name, is_free in zip(PARAMETER_NAMES, known, strict=True) if is_free)
-    free = names if is_prior else ()
+    known = independent_parameters(given.covariance)
+    free = tuple(PARAMETER_NAMES[k] for k in known) if is_prior else ()
+    is_held = is_prior and is_aspect_held(given.covariance)
     outliers: dict[str, BoolArray] = {}
     left_out: dict[str, str] = {}
     found = {view.source: view for view in fit.used_views} if fit is not None else {}
@@ -307,12 +329,13 @@ def _given(
     return SingleCamera(
         given.camera,
         free,
-        basis_of(free, is_aspect_fixed=False)[: len(PARAMETER_NAMES)],
+        basis_of(free, is_aspect_fixed=is_held)[: len(PARAMETER_NAMES)],
         outliers,
         left_out,
         fit,
         f"the given calibration is {word}",
         float("nan") if fit is None else _level(fit, given),
+        given.has_covariance,
     )
 
 
@@ -366,9 +389,10 @@ def _level(own: CameraFit, given: CameraCalibration) -> float:
     a, b = own.camera, given.camera
     if (a.width_px, a.height_px) != (b.width_px, b.height_px):
         return float("inf")
-    free = np.flatnonzero(own.sigma > 0.0)
+    both = own.covariance + given.covariance
+    free = np.intersect1d(np.flatnonzero(own.sigma > 0.0), independent_parameters(both))
     apart = (a.parameters - b.parameters)[free]
-    covariance = (own.covariance + given.covariance)[np.ix_(free, free)]
+    covariance = both[np.ix_(free, free)]
     sigma = np.sqrt(np.diag(covariance))
     white = np.linalg.solve(covariance / np.outer(sigma, sigma), apart / sigma)
     return float(white @ (apart / sigma)) / len(free)

@@ -38,6 +38,7 @@ from armscan.geometry.arrays import (
     floats,
 )
 from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.models.calibration import without_covariance
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import TwoViews
 
@@ -384,6 +385,8 @@ def _about_cameras(fit: StereoFit) -> list[str]:
     cameras = (fit.views.left, fit.views.right)
     for word, side, camera in zip(SIDES, fit.sides, cameras, strict=True):
         warnings += [f"{word} camera: {text}" for text in about_coverage(side.coverage)]
+        if not side.single.has_covariance:
+            warnings.append(without_covariance("the pair's sigmas", f"the {word} camera"))
         if side.single.given_level > ODD_GIVEN_LEVEL:
             warnings.append(
                 f"{word} camera: the given calibration lies {np.sqrt(side.single.given_level):.0f} "

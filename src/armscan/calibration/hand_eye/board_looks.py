@@ -78,6 +78,11 @@ class BoardLook:
     base_from_tool: Pose[Base, Tool]
     poses: tuple[BoardPose, ...]
 
+    @property
+    def source(self) -> str:
+        """Name of its image."""
+        return self.poses[0].view.source
+
 
 def board_poses(
     view: TargetView, target: Target, camera: CameraModel, bow: BoardBow | None = None

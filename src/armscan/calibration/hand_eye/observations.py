@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -187,8 +188,35 @@ class PlateReference(ArrayRecord):
     n_points: int = 0
     tip_diameter_mm: float = 0.0
 
+    @property
+    def touch_sigma_mm(self) -> float | None:
+        """Standard deviation of one touch on which the covariance rests; None where not known.
 
-def check_postures(stripes: Sequence[PosedStripe], options: HandEyeOptions) -> None:
+        Of few touches it is mostly what was expected of one: their residuals say little of it, and
+        those of three nothing.
+        """
+        if self.covariance is None or not self.n_points:
+            return None
+        return float(np.sqrt(self.n_points * self.covariance[2, 2]))
+
+
+class Posed(Protocol):
+    """What was seen in one exposure, with the pose that the arm reported for it."""
+
+    @property
+    def source(self) -> str:
+        """Name of its image."""
+
+    @property
+    def posture(self) -> str:
+        """Exposures of equal posture were taken without moving the arm."""
+
+    @property
+    def base_from_tool(self) -> Pose[Base, Tool]:
+        """As the arm reported it."""
+
+
+def check_postures(exposures: Sequence[Posed], options: HandEyeOptions) -> None:
     """Refuse a posture's name that stands for different poses of the arm.
 
     An arm of which a larger scatter from exposure to exposure was given may move that much more.
@@ -202,17 +230,17 @@ def check_postures(stripes: Sequence[PosedStripe], options: HandEyeOptions) -> N
     exposure_rad = options.exposure_rotation_rad or 0.0
     most_mm = max(SAME_POSTURE_MM, STANDING_SIGMAS * exposure_mm)
     most_rad = max(SAME_POSTURE_RAD, STANDING_SIGMAS * exposure_rad)
-    first_of: dict[str, PosedStripe] = {}
-    for stripe in stripes:
-        first = first_of.setdefault(stripe.posture, stripe)
-        change: Pose[Tool, Tool] = first.base_from_tool.inverse() @ stripe.base_from_tool
+    first_of: dict[str, Posed] = {}
+    for exposure in exposures:
+        first = first_of.setdefault(exposure.posture, exposure)
+        change: Pose[Tool, Tool] = first.base_from_tool.inverse() @ exposure.base_from_tool
         shift_mm = float(np.linalg.norm(change.translation_mm))
         turn_rad = float(np.linalg.norm(change.rotation_vector_rad))
         if shift_mm > most_mm or turn_rad > most_rad:
             raise InputError(
-                f"posture '{stripe.posture}' has different poses: the arm moved by "
+                f"posture '{exposure.posture}' has different poses: the arm moved by "
                 f"{shift_mm:.1f} mm and {np.degrees(turn_rad):.1f} deg from {first.source} to "
-                f"{stripe.source}",
+                f"{exposure.source}",
                 remedy="give every posture of the arm a view of its own; if the arm stood still, "
                 "check that both exposures have their own poses",
             )

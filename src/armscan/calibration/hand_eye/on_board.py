@@ -62,7 +62,7 @@ from armscan.calibration.hand_eye.noise import (
     solve_linear,
     total_covariance,
 )
-from armscan.calibration.hand_eye.observations import HandEyeOptions
+from armscan.calibration.hand_eye.observations import HandEyeOptions, check_postures
 from armscan.calibration.hand_eye.result import FINITE_CONDITION
 from armscan.calibration.sheets.board_points import BoardBow
 from armscan.errors import EstimationError
@@ -75,6 +75,7 @@ from armscan.models.calibration import (
     CameraCalibration,
     HandEyeCalibration,
     HandEyeDiagnostics,
+    without_covariance,
 )
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Target
@@ -106,8 +107,14 @@ def calibrate_on_board(
     (6, 9) says how the hand-eye follows it. ``bow`` is that of the target with which its poses were
     found; None if it is flat. ``target`` is for words about its size. ``readings`` are other ways
     to read the arm's poses, of all looks, that are tried where they do not fit.
+
+    Raises
+    ------
+    InputError
+        If looks of one posture have different poses of the arm.
     """
     options = options or HandEyeOptions()
+    check_postures(looks, options)
     refused = _refuse_few(looks)
     if refused is not None:
         return refused
@@ -126,10 +133,7 @@ def calibrate_on_board(
         if better is not None:
             return better
     if not camera.has_covariance:
-        notes += (
-            "the camera's calibration came without uncertainty and is taken as exact: the "
-            "hand-eye's sigmas do not hold what it errs by",
-        )
+        notes += (without_covariance("the hand-eye's sigmas"),)
     return replace(found, warnings=(*notes, *found.warnings))
 
 

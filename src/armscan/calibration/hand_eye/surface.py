@@ -102,14 +102,13 @@ class PlateSurface:
     def prior(self, options: HandEyeOptions) -> FloatArray | None:
         """(K, K) covariance of parameters that are held; None where they are exact or solved.
 
-        Of probed ones that of the touches, and what the tip shifts them by; what the arm errs alike
-        in all of them is not in it.
+        Of probed ones that of the touches, and what the tip shifts them by: `TIP_SHARE` of what a
+        touch is taken to scatter by. What the arm errs alike in all of them is not in it.
         """
         known = self.reference.covariance
         if options.solve_plate or known is None:
             return None
-        n, rms_mm = self.reference.n_points, self.reference.rms_mm or 0.0
-        tip_mm = TIP_SHARE * rms_mm * np.sqrt(n / max(n - len(known), 1))
+        tip_mm = TIP_SHARE * (self.reference.touch_sigma_mm or 0.0)
         return known + np.diag([0.0, 0.0, tip_mm**2])
 
     def plane_at(self, parameters: FloatArray) -> Plane:

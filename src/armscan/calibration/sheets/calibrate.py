@@ -69,6 +69,7 @@ from armscan.models.calibration import (
     SensorDiagnostics,
     SheetCalibration,
     SheetDiagnostics,
+    without_covariance,
 )
 from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import StereoCalibration
@@ -375,9 +376,7 @@ class _Case:
                     "found rightly, and are they flat? leave them out if not"
                 )
         if not self.cameras.has_covariance:
-            warnings.append(
-                "the camera came without covariance: the sheets' sigmas leave its errors out"
-            )
+            warnings.append(without_covariance("the sheets' sigmas"))
         return tuple(warnings)
 
     def _strays(self, model: SheetModel) -> list[str]:

@@ -60,6 +60,11 @@ ALONG_FACE = 0.98
 edge: the facets of a round face are up to 10 degrees apart, and the point may be of either face."""
 MOST_BEYOND = 0.5
 """Part of the points that may lie beyond the reach: the best fit, too, rests on most points."""
+PARALLEL = 0.9
+"""Cosine between the surface of points above a face and that face, from which on they may be a
+boss on it: a table beside a wall stands across it."""
+HIGHEST_BOSS = 0.05
+"""Over the part's diagonal: what lies higher over a face is a fixture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +160,10 @@ class FaceComparison:
     is_seen_once
         What would fail it was shown by no two exposures, so it is undecided: a stripe along an
         edge, or half in a shadow, errs by tenths of a millimetre, and alone.
+    beyond_mm, beyond_place_mm
+        Median deviation of the spot beyond the reach that is farthest off the face, and (3,) where
+        in Cad; NaN for none. It may be a dent, a boss, a fixture or a reflection, and the face does
+        not pass.
     """
 
     name: str
@@ -166,6 +175,8 @@ class FaceComparison:
     tolerance_mm: float
     decision: Decision | Literal["", "not seen"]
     is_seen_once: bool = False
+    beyond_mm: float = math.nan
+    beyond_place_mm: FloatArray = field(default_factory=lambda: np.full(3, math.nan))
 
 
 class CadComparison(RowRecord):
@@ -261,8 +272,9 @@ def compare_with_part(
     placed = alignment.cad_from_part.apply(cloud.points_mm)
     normals, d = found.normals, found.signed_mm
     along = np.abs(np.einsum("nk,nk->n", surface.part.normals[found.triangle], normals))
-    is_beside = near & ((along < ALONG_FACE) | _seen_from_behind(surface, cloud, alignment, found))
-    face = np.where(near & ~is_beside, part.face[found.triangle], -1)
+    is_off_face = (along < ALONG_FACE) | _seen_from_behind(surface, cloud, alignment, found)
+    is_beside = near & is_off_face
+    face = np.where(near & ~is_off_face, part.face[found.triangle], -1)
     by_density = math.sqrt(2 * LEAST_SPOT_POINTS * float(part.areas_mm2.sum()) / len(rows))
     spot_width = max(SPOT_SHARE * part.diagonal_mm, by_density)
     spot, n_spots = _spots(found.closest_mm, face, spot_width)
@@ -283,6 +295,8 @@ def compare_with_part(
     of_spot[spot[face >= 0]] = face[face >= 0]
     once = _shown_once(spot, cloud, d, limits[of_spot] + u_spot)
     spots = _spot_results(spot, face, d, found.closest_mm, u_spot, is_once=once)
+    is_beyond = ~near & ~is_off_face & _may_be_of_part(surface, cloud, alignment, found)
+    beyond = _spots_beyond(is_beyond, part.face[found.triangle], cloud, found, spot_width)
     once = _shown_once(face, cloud, d, limits + u_face)
     by_face = _rows_by(face, n_faces)
     faces = tuple(
@@ -291,7 +305,7 @@ def compare_with_part(
             float(limits[k]),
             d[by_face[k]],
             float(u_face[k]),
-            spots.select(spots.face == k),
+            (spots.select(spots.face == k), beyond.select(beyond.face == k)),
             is_once=bool(once[k]),
         )
         for k, name in enumerate(part.face_names)
@@ -407,6 +421,40 @@ def _seen_from_behind(
         return np.zeros(len(cloud), dtype=np.bool_)
     cosine = np.einsum("ni,ni->n", sight, surface.part.normals[found.triangle])
     return np.asarray(cosine < FROM_BEHIND)
+
+
+def _may_be_of_part(
+    surface: PartSurface, cloud: PointCloud, alignment: Alignment, found: SurfaceDistance
+) -> BoolArray:
+    """(N,) points that may be a dent or a boss of the face next to them, however deep or high.
+
+    Nothing but the part is below a face; above it, what is not too high and lies along the face, if
+    the cloud tells.
+    """
+    below = found.signed_mm < 0.0
+    if cloud.normals is None:
+        return below
+    normals = alignment.cad_from_part.rotate(cloud.normals)
+    cosine = np.einsum("ni,ni->n", normals, surface.part.normals[found.triangle])
+    highest_mm = HIGHEST_BOSS * surface.diagonal_mm
+    return np.asarray(below | ((cosine > PARALLEL) & (found.signed_mm < highest_mm)))
+
+
+def _spots_beyond(
+    is_beyond: BoolArray,
+    face: IntArray,
+    cloud: PointCloud,
+    found: SurfaceDistance,
+    width_mm: float,
+) -> _Spots:
+    """Spots beyond the reach that more than one exposure shows, of a cloud of several."""
+    label, count = _spots(found.closest_mm, np.where(is_beyond, face, -1), width_mm)
+    once = np.zeros(count, dtype=np.bool_)
+    if not cloud.is_fused:
+        once = _shown_once(label, cloud, found.signed_mm, np.zeros(count))
+    unknown = np.full(count, math.nan)
+    spots = _spot_results(label, face, found.signed_mm, found.closest_mm, unknown, is_once=once)
+    return spots.select(~spots.is_once)
 
 
 class _Spots(RowRecord):
@@ -548,8 +596,16 @@ def _deciding(spots: _Spots, local: IntArray) -> int:
 
 
 def _face(
-    name: str, limit: float, d: FloatArray, u_mean: float, spots: _Spots, *, is_once: bool
+    name: str,
+    limit: float,
+    d: FloatArray,
+    u_mean: float,
+    found: tuple[_Spots, _Spots],
+    *,
+    is_once: bool,
 ) -> FaceComparison:
+    """``found``: the spots within the reach, and those beyond it."""
+    spots, beyond = found
     statistics = deviation_statistics(d)
     local = _decisions(spots.deviation_mm, np.full(len(spots), limit), spots.u_mm)
     shown = _deciding(spots, local)
@@ -564,6 +620,9 @@ def _face(
         is_excused = bool(fails.any() and once[fails].all())
         decided = max(whole, int(local.max(initial=0)))
         decision = DECISIONS[decided - is_excused]
+    if len(beyond) and math.isfinite(limit) and decision != "fail":
+        decision = "undecided"
+    farthest = int(np.argmax(np.abs(beyond.deviation_mm))) if len(beyond) else -1
     return FaceComparison(
         name=name,
         statistics=statistics,
@@ -574,4 +633,6 @@ def _face(
         tolerance_mm=limit,
         decision=decision,
         is_seen_once=is_excused,
+        beyond_mm=float(beyond.deviation_mm[farthest]) if len(beyond) else math.nan,
+        beyond_place_mm=beyond.place_mm[farthest] if len(beyond) else np.full(3, math.nan),
     )

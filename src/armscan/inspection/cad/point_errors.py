@@ -7,7 +7,12 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats
 from armscan.geometry.poses import Cad, Part, Pose
-from armscan.inspection.uncertainty import COARSE_BLOCKS, exposure_blocks, without_noise
+from armscan.inspection.uncertainty import (
+    COARSE_BLOCKS,
+    calibration_errors,
+    exposure_blocks,
+    without_noise,
+)
 from armscan.records.cloud import PointCloud
 
 MOST_BLOCKS = 200
@@ -28,6 +33,9 @@ class PointErrors(RowRecord):
     private_mm2
         (N,) variance along the normal that each point has of its own, times the points along the
         stripe that share it.
+    common_mm
+        (N, K) move along the normal by each of K errors of the calibration, one sigma, which all
+        points share.
     covariance_mm2
         (N, 3, 3) the rest, in Cad, which points of a block share.
     blocks
@@ -37,6 +45,7 @@ class PointErrors(RowRecord):
 
     normals: FloatArray = floats("N", 3)
     private_mm2: FloatArray = floats("N")
+    common_mm: FloatArray = floats("N", "K")
     covariance_mm2: FloatArray = floats("N", 3, 3)
     blocks: tuple[IntArray, ...]
 
@@ -72,16 +81,19 @@ class PointErrors(RowRecord):
             # of neighbours that share their noise, a thinned cloud keeps so many
             thinned = len(chosen) / max(len(cloud), 1) if kept_share is None else kept_share
             shared = 1.0 + np.maximum(cloud.noise_length[chosen] - 1.0, 0.0) * thinned
+        by_calibration, common = calibration_errors(cloud, chosen, normals @ pose.rotation)
         return PointErrors(
             normals=normals,
             private_mm2=cloud.sigma_noise_mm[chosen] ** 2 * along * shared,
-            covariance_mm2=pose.rotate_covariance(covariance),
+            common_mm=common,
+            covariance_mm2=pose.rotate_covariance(covariance - by_calibration),
             blocks=tuple(_blocks(cloud, chosen)),
         )
 
     def covariance(self, influence: FloatArray) -> FloatArray:
         """(K, K) of K sums of the points' errors along their normals, (K, N) their weights."""
         private = influence * self.private_mm2 @ influence.T
+        common = influence @ self.common_mm
         found = []
         for block in self.blocks:
             n = int(block.max()) + 1
@@ -89,7 +101,7 @@ class PointErrors(RowRecord):
             mean = _block_means(self.covariance_mm2, block, n)
             found.append(np.einsum("kbi,bij,lbj->kl", pulls, mean, pulls))
         size = [float(np.trace(one)) for one in found]
-        return np.asarray(private + found[int(np.argmax(size))])
+        return np.asarray(private + common @ common.T + found[int(np.argmax(size))])
 
     def group_variances(
         self, label: IntArray, count: int, jacobian: FloatArray, influence: FloatArray
@@ -119,8 +131,11 @@ class PointErrors(RowRecord):
         both = influence * v @ influence.T
         private = own - 2.0 * np.einsum("fk,fk->f", jacobian, cross)
         private += np.einsum("fk,kl,fl->f", jacobian, both, jacobian)
+        common = -jacobian @ (influence @ self.common_mm)
+        for k, move in enumerate(self.common_mm.T):
+            common[:, k] += np.bincount(group, move[inside], count) / n
         shared = self._shared_variances(label, count, jacobian, influence)
-        return np.asarray(np.maximum(private, 0.0) + shared)
+        return np.asarray(np.maximum(private, 0.0) + (common**2).sum(axis=1) + shared)
 
     def _shared_variances(
         self, label: IntArray, count: int, jacobian: FloatArray, influence: FloatArray
@@ -229,10 +244,14 @@ def _pulls(influence: FloatArray, normals: FloatArray, block: IntArray, n: int) 
 
 
 def _block_means(covariance: FloatArray, block: IntArray, n: int) -> FloatArray:
-    """(B, 3, 3) mean covariance of each block."""
+    """(B, 3, 3) mean covariance of each block, along no way below zero.
+
+    Less what polynomials tell of the calibration it may be, where nothing else is stated.
+    """
     count = np.maximum(np.bincount(block, minlength=n), 1)
     mean = np.zeros((n, 3, 3))
     for i in range(3):
         for j in range(3):
             mean[:, i, j] = np.bincount(block, covariance[:, i, j], n) / count
-    return mean
+    values, vectors = np.linalg.eigh(mean)
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ vectors.transpose(0, 2, 1))

@@ -30,7 +30,7 @@ from armscan.report.inspection.cad import (
     verdict_table,
 )
 from armscan.report.quantity import Summary, sentences
-from armscan.storage.clouds import read_cloud
+from armscan.storage.clouds import read_cloud_file
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.parts.meshes import UNITS_MM, read_part
 from armscan.storage.parts.step import ChordError
@@ -105,7 +105,8 @@ def inspect_cad(
     limit, by_face = read_tolerances(tolerance, part)
     options = replace(options, tolerance_mm=limit, face_tolerances_mm=by_face)
     _tell(job, 1, cloud_path.name)
-    cloud, notes = _with_own_normals(read_cloud(cloud_path))
+    source = read_cloud_file(cloud_path)
+    cloud, notes = _with_own_normals(source.cloud)
     if box is not None:
         cloud = cloud.select(box.holds(cloud.points_mm))
     if len(cloud) == 0:
@@ -122,7 +123,7 @@ def inspect_cad(
     found = solved(compare_with_part(surface, cloud, alignment, options, errors_known), cloud_path)
     _tell(job, 4)
     is_simulated = cloud.is_simulated or are_simulated((cloud_path, part_path))
-    warnings = (*part.notes, *notes, *cad_warnings(found, errors_known))
+    warnings = (*source.remarks, *part.notes, *notes, *cad_warnings(found, errors_known))
     told = cad_quantities(found, part)
     delivery = job.delivery(cloud, cloud_path)
     written: tuple[Path, ...] = ()

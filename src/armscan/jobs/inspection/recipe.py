@@ -23,7 +23,7 @@ from armscan.report.inspection.recipe import (
 )
 from armscan.report.page import Page, page_of
 from armscan.report.quantity import Summary, sentences
-from armscan.storage.clouds import CLOUD_SUFFIXES, read_cloud
+from armscan.storage.clouds import CLOUD_SUFFIXES, read_cloud_file
 from armscan.storage.documents import fingerprint
 from armscan.storage.files import Content, is_folder, make_folder, path_text, write_files
 from armscan.storage.image_paths import are_simulated, natural_key
@@ -94,7 +94,8 @@ class _Run:
         return (*names, PART_PDF) if self.file.has_pdf else names
 
     def _inspected(self, name: str, path: Path, cloud_hash: str) -> PartRow:
-        cloud = read_cloud(path)
+        source = read_cloud_file(path)
+        cloud = source.cloud
         recipe = solved(self.file.for_part(path, cloud.frame), path)
         found = solved(follow_recipe(recipe, cloud), path)
         simulated = cloud.is_simulated or are_simulated((path, *self.file.inputs))
@@ -107,7 +108,9 @@ class _Run:
             name=name,
             cloud=path_text(path),
             quantities=found.quantities,
-            notes=sentences((*delivery.warnings, *found.notes, *cleaned, *model, *warned)),
+            notes=sentences(
+                (*delivery.warnings, *source.remarks, *found.notes, *cleaned, *model, *warned)
+            ),
             is_simulated=simulated,
             forced=cloud.forced,
         )
@@ -165,8 +168,8 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
     """Inspect parts by a recipe.
 
     ``job``: its output is the folder of the results, made if need be. A part that is in it, done
-    with the same recipe, model and cloud, is not done again. ``places``: clouds, and folders of
-    clouds, in the order of the trend.
+    with the same recipe, model, scanner and cloud, is not done again. ``places``: clouds, and
+    folders of clouds, in the order of the trend.
     """
     if job.output is None:
         raise OptionError("no folder is named", where="-o", remedy="name a folder for the results")
@@ -177,7 +180,9 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
     if file.has_pdf:
         require_pdf()
     own = replace(job, is_overwriting=True, title_block=file.title_block)
-    recipe_hash = " ".join((hashes[0], *hashes[2:]))
+    # a scanner that was calibrated anew changes what the pages say of the cloud's calibration
+    scanner = [] if file.scanner_path is None else [fingerprint(file.scanner_path).sha256]
+    recipe_hash = " ".join((hashes[0], *hashes[2:], *scanner))
     run = _Run(own, job.output, file, (recipe_hash, hashes[1] if len(hashes) > 1 else ""))
     rows: list[PartRow] = []
     make_folder(job.output)

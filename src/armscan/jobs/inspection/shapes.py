@@ -43,7 +43,7 @@ from armscan.report.inspection.shapes import (
     step_report,
 )
 from armscan.report.quantity import Summary, sentences
-from armscan.storage.clouds import read_cloud
+from armscan.storage.clouds import CloudFile, read_cloud_file
 from armscan.storage.files import path_text
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.points import parse_plane, read_points_or_plane
@@ -68,11 +68,13 @@ def inspect_plane(
     """
     options = options or InspectionOptions()
     job.places(".html")
-    box, cloud = region_of(region), read_cloud(path)
+    box, source = region_of(region), read_cloud_file(path)
+    cloud = source.cloud
     reference, text, weak = _reference(cloud, plane, plate, side)
     found = plane_of(cloud, reference, reference_text=text, region=box, options=options)
     report = plane_report(solved(found, path), cloud)
-    report = replace(report, warnings=(*weak, *_flat_by_itself(cloud), *report.warnings))
+    weak = (*source.remarks, *weak, *_flat_by_itself(cloud))
+    report = replace(report, warnings=(*weak, *report.warnings))
     inputs = (path, *(() if plate is None else (plate,)))
     return finished_inspection(job, cloud, report, inputs, (options,))
 
@@ -88,9 +90,10 @@ def inspect_sphere(
     """Inspect a ball of known diameter; the rest as `inspect_plane`."""
     options = options or InspectionOptions()
     job.places(".html")
-    box, cloud = region_of(region), read_cloud(path)
+    box, source = region_of(region), read_cloud_file(path)
+    cloud = source.cloud
     found = sphere_of(cloud, diameter_mm, region=box, options=options)
-    report = sphere_report(solved(found, path), cloud)
+    report = _as_read(sphere_report(solved(found, path), cloud), source)
     return finished_inspection(job, cloud, report, (path,), (options,))
 
 
@@ -111,13 +114,19 @@ def inspect_step(
     """
     options, step_options = options or InspectionOptions(), step_options or StepOptions()
     job.places(".html")
-    box, cloud = region_of(region), read_cloud(path)
+    box, source = region_of(region), read_cloud_file(path)
+    cloud = source.cloud
     given = _normal(normal) if normal else None
     found = step_of(
         cloud, height_mm, normal=given, region=box, options=options, step_options=step_options
     )
-    report = step_report(solved(found, path), cloud)
+    report = _as_read(step_report(solved(found, path), cloud), source)
     return finished_inspection(job, cloud, report, (path,), (options, step_options))
+
+
+def _as_read(report: InspectionReport, source: CloudFile) -> InspectionReport:
+    """The report with what is to be known of the reading of its cloud."""
+    return replace(report, warnings=(*source.remarks, *report.warnings))
 
 
 def region_of(numbers: Sequence[float]) -> Box | None:
@@ -256,9 +265,11 @@ def inspect_feature(
     """Inspect one feature of a cloud."""
     options = options or InspectionOptions()
     job.places(".html")
-    cloud = read_cloud(path)
+    source = read_cloud_file(path)
+    cloud = source.cloud
     found = solved(feature_of(cloud, wanted, options), path)
-    return finished_inspection(job, cloud, feature_report(found, cloud), (path,), (options, wanted))
+    report = _as_read(feature_report(found, cloud), source)
+    return finished_inspection(job, cloud, report, (path,), (options, wanted))
 
 
 def inspect_relation(
@@ -272,9 +283,10 @@ def inspect_relation(
     """Inspect how two features of a cloud stand to each other; the rest as `inspect_feature`."""
     options = options or InspectionOptions()
     job.places(".html")
-    cloud = read_cloud(path)
+    source = read_cloud_file(path)
+    cloud = source.cloud
     both = [solved(feature_of(cloud, wanted, options), path) for wanted in (first, second)]
-    report = relation_report(relate(cloud, both[0], both[1]), cloud)
+    report = _as_read(relation_report(relate(cloud, both[0], both[1]), cloud), source)
     return finished_inspection(job, cloud, report, (path,), (options, first, second))
 
 

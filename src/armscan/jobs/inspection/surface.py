@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from armscan.errors import EstimationError, OptionError
+from armscan.geometry.arrays import FloatArray
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import part_of
 from armscan.inspection.cleaning import CleaningOptions, clean_cloud
@@ -24,7 +25,6 @@ from armscan.storage.clouds import (
     CLOUD_SUFFIXES,
     cloud_bytes,
     cloud_losses,
-    read_cloud,
     read_cloud_file,
 )
 from armscan.storage.files import path_text
@@ -36,6 +36,8 @@ FINE = 0.6
 """Cells below this part of the lines' distance are said to be too small."""
 MANY_WITHOUT = 0.2
 """Part of the points without a normal from which it is said."""
+COARSE_STL_MM = 0.001
+"""Spacing of an STL file's numbers from which it is said: far from the origin they are coarse."""
 
 
 def draw_mesh(
@@ -52,7 +54,8 @@ def draw_mesh(
     if n_triangles is not None and n_triangles < LEAST_TRIANGLES:
         raise OptionError(f"--triangles is {n_triangles}", remedy="give 4 or more")
     job.places(*SURFACE_SUFFIXES, reads=(path,))
-    cloud = read_cloud(path)
+    source = read_cloud_file(path)
+    cloud = source.cloud
     try:
         full = draw_surface(cloud, options)
     except EstimationError as error:
@@ -65,7 +68,10 @@ def draw_mesh(
     quantities = (*_quantities(surface), *extra)
     is_simulated = cloud.is_simulated or are_simulated((path,))
     written: tuple[Path, ...] = ()
+    rounded: tuple[str, ...] = ()
     if job.output is not None:
+        if job.output.suffix.lower() == ".stl":
+            rounded = _rounded(surface.vertices_mm)
         title = f"armscan mesh of {path.name}, mm" + (", simulated data" if is_simulated else "")
         content = encoded_surface(
             job.output.suffix.lower(), surface.vertices_mm, surface.triangles, title
@@ -74,7 +80,7 @@ def draw_mesh(
     return Summary(
         title="Mesh" + (" (simulated data)." if is_simulated else "."),
         quantities=quantities,
-        warnings=sentences(_warnings(full)),
+        warnings=sentences((*source.remarks, *_warnings(full), *rounded)),
         written=written,
         next_step=f"open {job.output} in any program for meshes" if written else "",
         forced=cloud.forced,
@@ -132,6 +138,18 @@ def _warnings(surface: ScannedSurface) -> tuple[str, ...]:
     return tuple(texts)
 
 
+def _rounded(vertices_mm: FloatArray) -> tuple[str, ...]:
+    """What STL's single precision takes from corners far from the origin."""
+    far_mm = float(np.abs(vertices_mm).max(initial=0.0))
+    step_mm = float(np.spacing(np.float32(far_mm)))
+    if step_mm <= COARSE_STL_MM:
+        return ()
+    return (
+        f"STL holds coordinates of {far_mm:,.0f} mm as multiples of {step_mm:.2g} mm: write .ply, "
+        "which holds all digits, or move the cloud nearer to the origin",
+    )
+
+
 def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
     """Clean a cloud."""
     if job.output is None:
@@ -142,7 +160,7 @@ def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
     found = clean_cloud(cloud, options)
     losses = cloud_losses(found.cloud, job.output, source.dropped)
     lost = (f"the new file does not hold: {', '.join(losses)}",) if losses else ()
-    warnings = (*found.warnings, *lost)
+    warnings = (*source.remarks, *found.warnings, *lost)
     provenance = job.provenance((path,), (options,), warnings=warnings, forced=cloud.forced)
     page = cleaning_page(found, cloud.points_mm, provenance, is_simulated=cloud.is_simulated)
     written = job.write({places[0]: cloud_bytes(found.cloud, job.output), places[1]: page})

@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
 from armscan.pipeline.simulate import TwinName
 from armscan.report.quantity import Quantity, Summary, plural
 from armscan.storage.documents import read_scanner_calibration
-from armscan.storage.files import check_outputs
+from armscan.storage.files import bring_back, check_aside, check_outputs, locked, set_aside
 from armscan.storage.recordings.write_mcap import WriterOptions, WriterStatus
 
 TOLD_EVERY_S = 1.0
@@ -139,7 +139,8 @@ def record_scan(
         If a device does not answer at the start, no image came at all, what arrived could not be
         kept to the end, or none of it can be used; what was written stays.
     OutputError
-        If the file exists, or the disk is full; what was written stays.
+        If the file exists, a killed run left what it was to replace, or the disk is full; what was
+        written stays.
     """
     description = request.description()
     if output.suffix.lower() != SUFFIX:
@@ -148,13 +149,21 @@ def record_scan(
             remedy=f"end it in {SUFFIX}",
         )  # fmt: skip
     check_outputs((output,), is_overwriting=is_overwriting)
+    check_aside(output)
     place = request.scanner or (Path(description.scanner) if description.scanner else None)
+    if description.chooses_lasers and place is None:
+        raise OptionError(
+            "chooses_lasers asks the scanner which lasers come next, and no scanner is given",
+            where=request.rig,
+            remedy='give --scanner, or schedule = ["A", "B"] in place of chooses_lasers',
+        )
     scanner = None if place is None else read_scanner_calibration(place)
     tell("opening the devices ...")
     with Rig.open(description, open_device) as rig:
         rig.set_windows()
         options = WriterOptions(is_stripe_band=request.is_stripe_band)
-        run = _Recording(rig, scanner, output, options, (tell, show_rate or tell))
+        told = tell, show_rate or tell
+        run = _Recording(rig, scanner, output, options, told, is_overwriting=is_overwriting)
         run.until_the_end(request)
     return run.summary(place)
 
@@ -182,7 +191,10 @@ class _Recording:
         output: Path,
         writer_options: WriterOptions,
         tell: tuple[Callable[[str], None], Callable[[str], None]],
+        *,
+        is_overwriting: bool = False,
     ) -> None:
+        self._is_overwriting = is_overwriting
         self._output, (self._tell, self._show_rate) = output, tell
         self._recorder = LiveRecorder(output, rig, options=writer_options)
         options = LiveOptions.of(rig.description)
@@ -196,7 +208,9 @@ class _Recording:
         self._before = replace(self._end), 0.0
         self._is_interrupted = False
         self._before_it: Path | None = None
+        self._held = ExitStack()
         self._why_ended = ""
+        self._is_over = False
         self._is_triggered = rig.description.is_common_trigger
 
     def until_the_end(self, request: RecordRequest) -> None:
@@ -206,6 +220,7 @@ class _Recording:
             self._wait_for_clocks()
             self._put_aside()
             self._recorder.begin()
+            self._held.enter_context(locked(self._output))
             self._session.add_listener(self._recorder.hear)
             start = time.monotonic()
             self._session.start()
@@ -220,7 +235,7 @@ class _Recording:
                 with suppress(OutputError):
                     self._close()
             raise
-        is_kept = self._session.is_recording
+        is_kept = self._session.is_recording and not self._is_over
         with _deaf():
             self._session.stop()
             self._close()
@@ -230,7 +245,8 @@ class _Recording:
         """An error where there is nothing to go on with, or not all."""
         if not self._end.n_written:
             raise DeviceError(
-                f"no image came in {self._seconds:.1f} s",
+                f"no image came in {self._seconds:.1f} s"
+                + (f"; {self._why_ended}" if self._why_ended else ""),
                 remedy="check camera and trigger; `armscan devices` lists what answers",
             )
         if self._recorder.n_aside == self._end.n_written:
@@ -249,23 +265,33 @@ class _Recording:
             )
 
     def _put_aside(self) -> None:
-        """What is to be replaced, until the first image is there."""
-        if self._output.exists():
-            place = self._output.with_name(f".{self._output.name}.before")
-            self._output.replace(place)
-            self._before_it = place
+        """What is to be replaced, until this recording has ended with an image."""
+        self._before_it = set_aside(self._output, is_overwriting=self._is_overwriting)
+        if self._before_it is not None:
+            self._tell(f"what was there lies in {self._before_it.name} until the recording ends")
 
     def _close(self) -> None:
         """The new file where it holds an image; else what was there before."""
+        is_new = False
         try:
             self._end = self._recorder.close()
         finally:
-            if not self._recorder.status().n_written:
-                self._output.unlink(missing_ok=True)
-                if self._before_it is not None:
-                    self._before_it.replace(self._output)
-            elif self._before_it is not None:
+            if self._recorder.is_begun:
+                # what another run made there meanwhile is not ours to remove
+                is_new = self._recorder.status().n_written > 0
+                if not is_new:
+                    self._output.unlink(missing_ok=True)
+            self._held.close()
+            if self._before_it is not None and is_new:
                 self._before_it.unlink()
+            elif self._before_it is not None:
+                self._bring_back(self._before_it)
+
+    def _bring_back(self, before: Path) -> None:
+        try:
+            bring_back(before, self._output)
+        except OutputError as error:
+            self._tell(f"warning: {error}")
 
     def _wait_for_clocks(self) -> None:
         """Without an arm nothing is placed by time, so that nobody waits for clocks."""
@@ -288,7 +314,7 @@ class _Recording:
             wanted = request.n_exposures
             if is_over or (wanted is not None and status.n_accepted >= wanted):
                 return
-            if not self._session.is_recording:
+            if self._is_over or not self._session.is_recording:
                 return
             if now - told >= TOLD_EVERY_S:
                 told = now
@@ -311,6 +337,8 @@ class _Recording:
             f"lost {n_lost}, late {n_late}, not to be used {self._n_unusable}",
             f"{speed / 1e6:.0f} MB/s, {free / 1e9:,.0f} GB left{lasts}",
         ]
+        if self._recorder.n_samples and not self._recorder.n_posed:
+            words.append("the arm gives no pose")
         if status.fill > 0.5:
             words.append(f"the disk is behind ({100.0 * status.fill:.0f} % of the buffer)")
         shown = self._session.snapshot()
@@ -334,8 +362,10 @@ class _Recording:
         if event.kind in ("fault", "recovered", "warning"):
             self._n_faults += event.kind == "fault" and event.device not in OWN_PARTS
             self._tell(f"{event.kind}: {event.words}")
-        if event.device in (MATCHING, RECORDER) and not self._why_ended:
-            self._why_ended = event.text
+        # lasers that went off for safety are lit by a person alone, and nothing is seen without
+        self._is_over |= event.is_final
+        if (event.is_final or event.device in (MATCHING, RECORDER)) and not self._why_ended:
+            self._why_ended = event.words
 
     def _strained(self) -> list[str]:
         """How many of the arm's samples it spoke against itself."""
@@ -377,6 +407,12 @@ class _Recording:
                 0,
                 f"{self._recorder.n_aside} of {self._end.n_written} exposures are kept and not to "
                 "be used: parts of them were lost, or their clock was not known",
+            )
+        if self._recorder.n_samples and not self._recorder.n_posed:
+            warnings.insert(
+                0,
+                f"none of {self._recorder.n_samples} samples of the arm has a pose: reference the "
+                "arm, let it send poses, or name its arm_model in rig.toml, and record again",
             )
         if self._recorder.n_untriggered:
             warnings.insert(

@@ -18,7 +18,7 @@ import numpy as np
 from armscan.devices.clocks import ElementStatus, StreamMonitor
 from armscan.devices.matching import LASER_BOUND_NS, InstantMatcher, MatchedInstant, TimedSample
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
-from armscan.errors import ArmscanError
+from armscan.errors import ArmscanError, DeviceStoppedError
 from armscan.pipeline.live.rig import Rig, told_as_fault_of
 from armscan.records.exposure import Exposure
 from armscan.records.recording import CameraSetup
@@ -91,11 +91,14 @@ class LiveEvent:
         In words.
     device
         Name of the device, or of one of `OWN_PARTS`, that it concerns; empty for none.
+    is_final
+        Of a fault: the device does nothing until a person has it started again.
     """
 
     kind: EventKind
     text: str
     device: str = ""
+    is_final: bool = False
 
     @property
     def words(self) -> str:
@@ -338,6 +341,7 @@ class Acquisition:
 
     def _read_all(self, what: str, k: int, device: Any, stream: _Stream) -> None:
         last, is_silent, n_faults = time.monotonic(), False, 0
+        has_stopped = was_stopped = False
         told_ns = 0
         while True:
             # asked before reading: what came before the stop is then read by this very read
@@ -347,7 +351,7 @@ class Acquisition:
                 with told_as_fault_of(device.name):
                     found = device.read(READ_S)
             except ArmscanError as error:
-                fault = str(error)
+                fault, has_stopped = str(error), isinstance(error, DeviceStoppedError)
             stream.asked_ns = 0
             if fault:
                 self._stopping.wait(READ_S)
@@ -360,16 +364,20 @@ class Acquisition:
                     self.faults.pop((what, k), None)
                     self._tell(LiveEvent("recovered", f"{device.name} answers again", device.name))
                 last, is_silent = time.monotonic(), False
+                has_stopped = was_stopped = False
                 self._put(what, k, found)
                 continue
             if asked_ns - told_ns > SEEN_EVERY_NS:
                 told_ns = asked_ns
                 self._put(what, k, asked_ns)
-            if not is_silent and (fault or time.monotonic() - last > SILENT_S):
+            is_news = has_stopped and not was_stopped
+            was_stopped = has_stopped
+            is_due = not is_silent and (fault or time.monotonic() - last > SILENT_S)
+            if is_news or is_due:
                 is_silent = True
                 since = f"{device.name} has delivered nothing for {time.monotonic() - last:.1f} s"
                 self.faults[what, k] = fault or since
-                self._tell(LiveEvent("fault", fault or since, device.name))
+                self._tell(LiveEvent("fault", fault or since, device.name, has_stopped))
 
     def _is_late(self, found: Any) -> bool:
         first = found[0] if isinstance(found, tuple) else found

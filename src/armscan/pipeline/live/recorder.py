@@ -65,10 +65,13 @@ class LiveRecorder:
         listed, and get no pose.
     n_laser_unknown
         Frames of which it is not known what lasers were on: they are listed, and not measured.
+    n_samples, n_posed
+        Samples of the arm, and those of them that tell where it was.
     """
 
     def __init__(self, path: Path, rig: Rig, *, options: WriterOptions | None = None) -> None:
         self.n_aside = self.n_untriggered = self.n_laser_unknown = 0
+        self.n_samples = self.n_posed = 0
         self._writer = RecordingWriter(path, options)
         self._rig, self._is_triggered = rig, rig.description.is_common_trigger
         by_joints = rig.arm is not None and rig.arm.pose_form == "joints"
@@ -97,6 +100,11 @@ class LiveRecorder:
         model = self._rig.arm_model
         documents = {} if model is None else {ARM_MODEL_FILE: arm_model_toml(model)}
         self._writer.begin(self._session, documents)
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether the file at the path is its own."""
+        return self._writer.is_begun
 
     def status(self) -> WriterStatus:
         """How far the file is."""
@@ -219,6 +227,8 @@ class LiveRecorder:
         if not samples:
             return
         own = [one.sample for one in samples]
+        self.n_samples += len(own)
+        self.n_posed += sum(map(self._is_posed, samples))
         facts: dict[str, Any] = {
             "number": [one.number for one in own],
             "t_device_ns": [one.t_device_ns for one in own],
@@ -275,15 +285,21 @@ class LiveRecorder:
         self._last_device_ns = t_device_ns
         return max(t_ns, self._last_sample_ns + 1)
 
-    def _joints(self, samples: Sequence[TimedSample]) -> FloatArray | None:
-        """(N, J) angles of an arm that gives those alone; NaN where they are not valid."""
+    def _is_posed(self, one: TimedSample) -> bool:
+        """Whether the table tells where the arm was, to whoever has its document."""
         if self._form != "joints":
-            return None
+            return one.pose is not None
+        return one.sample.joints_rad is not None and one.sample.is_valid
+
+    def _joints(self, samples: Sequence[TimedSample]) -> FloatArray | None:
+        """(N, J) angles as delivered, NaN where they are not valid; None where none are given."""
         given = [one.sample.joints_rad for one in samples]
-        n_joints = max((len(one) for one in given if one is not None), default=1)
+        is_form = self._form == "joints"
+        n_joints = max((len(one) for one in given if one is not None), default=int(is_form))
+        if not n_joints:
+            return None
         angles = np.full((len(samples), n_joints), np.nan)
         for k, (one, own) in enumerate(zip(samples, given, strict=True)):
-            is_placed = one.pose is not None or self._rig.arm_model is None
-            if own is not None and is_placed and one.sample.is_valid:
-                angles[k] = own
+            if own is not None and one.sample.is_valid:
+                angles[k, : len(own)] = own
         return angles

@@ -29,6 +29,8 @@ from armscan.vision.stripe.image import StripeOptions
 OpenDevice = Callable[[DeviceKind, str], Any]
 """Opens the device of a kind at an address, or raises `DeviceError`."""
 MOST_RATE_HZ = 10_000.0
+NO_CONTROLLER = "{} says which lasers are on, and there is no laser controller"
+NAME_IT = 'name it, as lasers = "laser-serial:/dev/ttyUSB0:115200", or leave the key out'
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +69,8 @@ class RigDescription:
     Raises
     ------
     InputError
-        If both a schedule and the head's rule say what is on, or windows do not fit the cameras.
+        If both a schedule and the head's rule say what is on, a step of the schedule names a laser
+        twice or an empty one, or windows do not fit the cameras.
     """
 
     cameras: tuple[str, ...]
@@ -87,6 +90,13 @@ class RigDescription:
     def __post_init__(self) -> None:
         if self.chooses_lasers and self.schedule:
             raise InputError("schedule and chooses_lasers both say which lasers are on")
+        for step in filter(None, self.schedule):
+            names = step.split("+")
+            if not all(names) or len(set(names)) < len(names):
+                raise InputError(
+                    f"the step '{step}' of schedule names a laser twice, or none",
+                    remedy='write steps as "A", "A+B", or "" for a dark one',
+                )
         if self.windows and len(self.windows) != len(self.cameras):
             raise InputError(f"{len(self.windows)} windows for {len(self.cameras)} cameras")
         if any(min(x, y) < 0 or min(w, h) < 1 for x, y, w, h in self.windows):
@@ -97,6 +107,11 @@ class RigDescription:
         """Sources of each step of the schedule."""
         return tuple(tuple(filter(None, step.split("+"))) for step in self.schedule)
 
+    @property
+    def lasers_key(self) -> str:
+        """The key that says which lasers are on, and needs a controller; empty for none."""
+        return "schedule" if self.schedule else "chooses_lasers" if self.chooses_lasers else ""
+
 
 def read_rig(path: Path) -> RigDescription:
     """Read ``rig.toml``; paths in it are relative to it.
@@ -104,7 +119,8 @@ def read_rig(path: Path) -> RigDescription:
     Raises
     ------
     FileFormatError
-        If it is no TOML, a key is unknown or of a wrong type, or it names no camera.
+        If it is no TOML, a key is unknown or of a wrong type, it names no camera, or says which
+        lasers are on and names no controller.
     """
     where = path_text(path)
     content = parse_toml(read_bytes(path), where, 'write lines as cameras = ["webcam:0"]')
@@ -112,15 +128,18 @@ def read_rig(path: Path) -> RigDescription:
     try:
         rig = RecordCodec({}, unknown).read(RigDescription, content)
     except (MismatchError, OptionError) as error:
-        raise FileFormatError(
-            str(error), where=where, remedy='write lines as cameras = ["webcam:0"], rate_hz = 40.0'
-        ) from error
+        cause = error.__cause__
+        own = cause.remedy if isinstance(cause, ArmscanError) else ""
+        usual = 'write lines as cameras = ["webcam:0"], rate_hz = 40.0'
+        raise FileFormatError(str(error), where=where, remedy=own or usual) from error
     fault = f"the key {unknown[0]}" if unknown else ""
     fault = fault or ("it names no camera" if not rig.cameras else "")
     if not 0.0 < rig.rate_hz <= MOST_RATE_HZ:
         fault = fault or f"rate_hz is {rig.rate_hz:g}"
     if fault:
         raise FileFormatError(fault, where=where, remedy="correct the description of the rig")
+    if rig.lasers_key and not rig.lasers:
+        raise FileFormatError(NO_CONTROLLER.format(rig.lasers_key), where=where, remedy=NAME_IT)
 
     def beside(name: str) -> str:
         return str(path.parent / name) if name else ""
@@ -308,26 +327,30 @@ def told_as_fault_of(device: str) -> Iterator[None]:
 
 
 def check_targets(description: RigDescription, lasers: LaserController | None) -> None:
-    """Refuse a target for a laser that is misspelt: it would count for none, and nobody would know.
+    """Refuse a laser that is misspelt: it would count for none, and nobody would know.
 
-    Without a controller the lasers are the rig's own business, and nothing is checked.
+    Without a controller the names are the rig's own business; a key that needs one is refused.
 
     Raises
     ------
     OptionError
-        If the controller has no laser of that name.
+        If the controller has no laser of that name, or lasers are to be chosen without one.
     DeviceError
         If it cannot tell.
     """
-    known: Sequence[str] = ()
-    if lasers is not None:
-        with told_as_fault_of(lasers.name):
-            known = lasers.sources
-    for one in description.exposure.laser:
-        if known and one.laser not in known:
+    if lasers is None:
+        if description.lasers_key:
+            raise OptionError(NO_CONTROLLER.format(description.lasers_key), remedy=NAME_IT)
+        return
+    with told_as_fault_of(lasers.name):
+        known = lasers.sources
+    asked = [("schedule", name) for step in description.steps for name in step]
+    asked += [("exposure.laser", one.laser) for one in description.exposure.laser]
+    for key, name in asked:
+        if known and name not in known:
             raise OptionError(
-                f"no laser is called '{one.laser}'",
-                where="exposure.laser",
+                f"no laser is called '{name}'",
+                where=key,
                 remedy=f"choose from {', '.join(known)}",
             )
 

@@ -57,6 +57,7 @@ RAMP = "cividis"
 and yellows stay apart for colour-blind readers."""
 RAMP_ENDS = (0.0, 0.93)
 LEAST_LIMIT_MM = 1e-4
+LISTED = 4
 DRAWN_SHARE = 0.05
 """Height of the largest deviation drawn in a section, over the part's size."""
 STATEMENT = (
@@ -204,6 +205,8 @@ def _face_data(found: CadComparison, face: int) -> dict[str, object]:
         "fraction_within_tolerance": share_within(found, face),
         "decision": one.decision,
         "is_seen_once": one.is_seen_once,
+        "beyond_mm": one.beyond_mm,
+        "beyond_place_mm": one.beyond_place_mm.tolist(),
     }
 
 
@@ -245,6 +248,7 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
             f"{100.0 * beyond:.0f} % of the points lie farther than {found.options.reach_mm:g} mm "
             "from the model and count nowhere; see whether they are of the part"
         )
+    texts += _about_beyond(found)
     unseen = [one for one in found.faces if one.decision == "not seen"]
     for what, names in (
         ("without any point, so not judged", [one.name for one in unseen if not one.statistics.n]),
@@ -269,6 +273,27 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
             "again, or look at that stripe: along an edge or a shadow it may err by tenths of a mm"
         )
     return tuple(texts)
+
+
+def _about_beyond(found: CadComparison) -> list[str]:
+    """Names faces beside which points lie that may be of the part, but beyond the reach."""
+    off = sorted(
+        (one for one in found.faces if math.isfinite(one.beyond_mm)),
+        key=lambda one: -abs(one.beyond_mm),
+    )
+    if not off:
+        return []
+    told = []
+    for one in off[:LISTED]:
+        x, y, z = one.beyond_place_mm
+        told.append(f"{one.name} ({one.beyond_mm:+.2f} mm at {x:.1f}, {y:.1f}, {z:.1f})")
+    more = f" and {len(off) - LISTED} more" if len(off) > LISTED else ""
+    lead = "undecided at best, because" if found.options.has_tolerance else "left out:"
+    return [
+        f"{lead} points lie farther than {found.options.reach_mm:g} mm off faces, where a dent or "
+        f"a boss would: {', '.join(told)}{more}; look there; give a larger --reach-mm if it is of "
+        "the part, cut it away with --region if it is a fixture or a reflection"
+    ]
 
 
 def verdict_table(found: CadComparison) -> Table:

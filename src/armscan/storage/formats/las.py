@@ -31,6 +31,8 @@ from armscan.storage.formats.columns import (
 FINEST_STEP_MM = 1e-6
 COARSEST_KEPT_MM = 1e-4
 """Step up to which nothing that a scanner can tell is lost."""
+OFFSET_OFF_MM = 0.5
+"""How far the offset, a whole number of mm, lies from a cloud's middle at most."""
 LARGEST_MULTIPLE = 2**31 - 2
 LARGEST_RECORD = 60_000
 """Bytes of a record of notes; a record may have 65,535."""
@@ -43,8 +45,8 @@ GREY_STEPS = 256
 
 def step_mm(cloud: PointCloud) -> float:
     """Step of the grid on which a cloud's positions are written: as fine as its extent allows."""
-    reach = float(np.ptp(cloud.points_mm, axis=0).max()) / 2.0 if len(cloud) else 0.0
-    needed = max(reach, 1e-9) / LARGEST_MULTIPLE
+    half_width = float(np.ptp(cloud.points_mm, axis=0).max()) / 2.0 if len(cloud) else 0.0
+    needed = (half_width + OFFSET_OFF_MM) / LARGEST_MULTIPLE
     return max(FINEST_STEP_MM, 10.0 ** math.ceil(math.log10(needed)))
 
 

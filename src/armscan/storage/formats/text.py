@@ -19,10 +19,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.records.cloud import PointCloud
 from armscan.storage.files import path_text
 from armscan.storage.formats.columns import (
-    COVARIANCE,
     FORCED,
-    NOISE_LENGTH,
-    NORMAL,
     POINT,
     SIMULATED,
     WHOLE,
@@ -31,7 +28,8 @@ from armscan.storage.formats.columns import (
     cloud_columns,
     structured,
 )
-from armscan.storage.tables import reads_as_float, refuse_other_units
+from armscan.storage.formats.headings import EMPTY_FIELD, named_columns, opening_of, words_of
+from armscan.storage.tables import reads_as_float
 
 SIGMA_LOSS = "sigma_mm and covariance"
 XYZ_LOSES = (
@@ -47,18 +45,8 @@ XYZ_LOSES = (
 """What an XYZ file does not hold."""
 CSV_LOSES = ("digits beyond 0.1 nm of a position, and beyond nine of anything else",)
 
-KNOWN = {
-    **{name: name for name in (*POINT, *NORMAL, *COVARIANCE, *WHOLE, NOISE_LENGTH)},
-    **{name: name for name in ("sigma_noise_mm", "intensity")},
-    **{f"{name}_mm": name for name in POINT},
-}
-"""Columns that are read, by their names in a heading."""
 LOOKED_AT = 1000
 """Lines in which decimal commas are sought: a table that has them has them everywhere."""
-EMPTY_FIELD = re.compile(r"(^|[,;])[ \t]*(?=[,;])", re.MULTILINE)
-"""Nothing between two separators: a value that is missing, which must not move the next ones."""
-UNIT_IN_BRACKETS = re.compile(r"(\w)[ \t]*[\[(][ \t]*([A-Za-z]+)[ \t]*[\])]")
-"""A column's name, its last character, and its unit: ``X [mm]``, ``y(m)``."""
 OWN_HEADER, OWN_NOTE = "x_mm y_mm z_mm in frame ", "written by armscan"
 COUNT = re.compile(r"points (\d+)")
 """Note of a file that armscan wrote: of how many points, so that one that was cut is told."""
@@ -99,8 +87,8 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
     """Columns of a table of numbers: those that its heading names, else the first three as xyz."""
     text = data.decode("utf-8-sig", errors="replace")
     lines, is_ended = text.splitlines(), text.endswith(("\n", "\r"))
-    start = 1 if _is_heading(lines, path) else 0
-    body = [line.partition("#")[0] for line in lines[start:]]
+    opening = opening_of(lines, path)
+    body = [line.partition("#")[0] for line in lines[opening.n_lines :]]
     filled = list(islice((line for line in body if line.strip()), LOOKED_AT))
     if not filled:
         raise FileFormatError(
@@ -108,8 +96,8 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
         )
     for line in filled:
         _refuse_decimal_commas(line, path)
-    heading = _words(_with_units_named(lines[0])) if start else []
-    if len(heading) > 1 and len(_words(filled[0])) == 2 * len(heading):
+    n_named = len(words_of(opening.heading))
+    if n_named > 1 and len(words_of(filled[0])) == 2 * n_named:
         raise FileFormatError(
             f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'",
             where=path_text(path),
@@ -117,29 +105,15 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
         )
     if not is_ended:
         _refuse_cut_line(body[-1], filled[0], len(lines), path)
-    named = _named(heading, path)
-    values = _values("\n".join(body), tuple(named.values()), path, start + 1)
-    columns = {name: values[:, k] for k, name in enumerate(named)}
+    named = named_columns(opening, filled, path)
+    numbers = tuple(named.numbers.values())
+    values = _values("\n".join(body), numbers, path, opening.n_lines + 1)
+    columns = {name: values[:, k] for k, name in enumerate(named.numbers)}
     notes = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
     _refuse_cut(notes, len(values), len(lines), path, is_ended=is_ended)
-    read = set(named.values())
-    passed_over = tuple(word for k, word in enumerate(heading) if k not in read)
-    is_table = len(_words(filled[0])) == len(heading)
-    return CloudColumns(columns, _notes(notes), passed_over=passed_over if is_table else ())
-
-
-def _named(heading: list[str], path: Path) -> dict[str, int]:
-    """Numbers of the columns that are read, by name; without x, y and z in it the first three."""
-    named: dict[str, int] = {}
-    words = [word.strip("#/\"'").lower() for word in heading]
-    for k, word in enumerate(words):
-        name = KNOWN.get(word)
-        if name is not None:
-            named.setdefault(name, k)
-    if set(POINT) <= set(named):
-        return named
-    refuse_other_units(words, path_text(path))
-    return {name: k for k, name in enumerate(POINT)}
+    return CloudColumns(
+        columns, _notes(notes), remarks=named.remarks, passed_over=named.passed_over
+    )
 
 
 def _values(body: str, columns: tuple[int, ...], path: Path, first: int) -> FloatArray:
@@ -171,7 +145,7 @@ def _first_wrong(body: str, columns: tuple[int, ...], first: int) -> str:
 
 def _refuse_cut_line(last: str, first: str, number: int, path: Path) -> None:
     """Raise for a last line without an end that holds less than the first one, or half a number."""
-    words, wanted = _words(last), _words(first)
+    words, wanted = words_of(last), words_of(first)
     pairs = zip(words, wanted, strict=False)
     is_half = any(reads_as_float(other) and not reads_as_float(word) for word, other in pairs)
     if words and (len(words) < len(wanted) or is_half):
@@ -217,29 +191,6 @@ def _notes(notes: list[str]) -> tuple[str, ...]:
     return (*found, *(f"{FORCED} {k} {json.dumps(text)}" for k, text in enumerate(reasons)))
 
 
-def _with_units_named(line: str) -> str:
-    """A heading whose units in brackets are part of the columns' names: ``X [mm]`` is ``X_mm``."""
-    return UNIT_IN_BRACKETS.sub(r"\1_\2", line)
-
-
-def _is_heading(lines: list[str], path: Path) -> bool:
-    """Whether the first line is no point but a count of points, or names of columns."""
-    words = _words(_with_units_named(lines[0])) if lines else []
-    if not words or lines[0].startswith("#"):
-        return False
-    if len(words) == 1 and words[0].isdecimal():
-        return True
-    if all(reads_as_float(word) for word in words):
-        return False
-    if not all(re.match(r"[\W_]*[A-Za-z]", word) for word in words):
-        raise FileFormatError(
-            f"the first line is neither a point nor a heading: '{lines[0][:60]}'",
-            where=path_text(path),
-            remedy="correct the line, or put # before it",
-        )
-    return True
-
-
 def _refuse_decimal_commas(line: str, path: Path) -> None:
     """Raise for a line whose commas can only be decimal signs, or may be.
 
@@ -255,7 +206,3 @@ def _refuse_decimal_commas(line: str, path: Path) -> None:
             where=path_text(path),
             remedy="write them with points: 1.5 2.5 3.5",
         )
-
-
-def _words(line: str) -> list[str]:
-    return [word for word in re.split(r"[,;\s]+", line.strip()) if word]

@@ -212,6 +212,8 @@ class RecipeFile:
         The model; None without one.
     inputs
         The recipe's file, the model's, and that of reference points.
+    scanner_path
+        The document that the title block names; None without one.
     has_pdf
         Whether every part's page is written as PDF too.
     measured_beside
@@ -225,6 +227,7 @@ class RecipeFile:
     title_block: TitleBlock = field(default_factory=TitleBlock)
     has_pdf: bool = False
     measured_beside: bool = False
+    scanner_path: Path | None = None
 
     def measured_of(self, cloud: Path) -> Path | None:
         """The table beside a cloud; None where the recipe needs none."""
@@ -290,9 +293,12 @@ def read_recipe(path: Path) -> RecipeFile:
         ),
     )
     place = f"{where}: 'title_block'"
-    block = title_block_of(keys.title_block or {}, place, path.parent)
+    entries = keys.title_block or {}
+    block = title_block_of(entries, place, path.parent)
+    scanner = str(entries.get(SCANNER, ""))
+    scanner_path = path.parent / scanner if scanner else None
     if keys.part is None:
-        return RecipeFile(recipe, None, (path,), block, keys.pdf)
+        return RecipeFile(recipe, None, (path,), block, keys.pdf, scanner_path=scanner_path)
     part_path = path.parent / keys.part
     if not is_file(part_path):
         raise FileFormatError(
@@ -312,7 +318,7 @@ def read_recipe(path: Path) -> RecipeFile:
     )
     inputs = (path, part_path) if points is None else (path, part_path, points)
     measured_beside = points is not None and not in_one_table
-    return RecipeFile(recipe, part, inputs, block, keys.pdf, measured_beside)
+    return RecipeFile(recipe, part, inputs, block, keys.pdf, measured_beside, scanner_path)
 
 
 def _holds_measured(path: Path) -> bool:

@@ -28,6 +28,8 @@ from armscan.storage.codec import parse_json
 from armscan.storage.files import read_bytes
 from armscan.storage.tables import reads_as_float, refuse_beyond_reach
 
+USUAL_EULER: EulerConvention = "extrinsic-xyz"
+"""Of angles in a table where nobody says what they mean."""
 POSITION: Final = ("x_mm", "y_mm", "z_mm")
 FORM_COLUMNS: Final[dict[PoseForm, tuple[str, ...]]] = {
     "quaternion": ("qw", "qx", "qy", "qz"),

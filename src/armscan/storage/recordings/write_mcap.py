@@ -200,6 +200,11 @@ class RecordingWriter:
                 remedy="choose another name or folder",
             ) from error
 
+    @property
+    def is_begun(self) -> bool:
+        """Whether the file at its path is this recording's own."""
+        return self._thread.ident is not None
+
     def _leave_nothing(self) -> None:
         """Remove the file that this writer made and could not begin."""
         with suppress(OSError):

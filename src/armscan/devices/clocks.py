@@ -11,6 +11,8 @@ seen; it stays in the offset, is as constant as the transport, and is what
 
 from __future__ import annotations
 
+import threading
+import time
 from collections import deque
 from dataclasses import dataclass
 from enum import IntEnum
@@ -292,6 +294,10 @@ _LABELS = {
 }
 
 
+INACCURATE = "inaccurate as the arm itself says, their poses not used"
+AT_END_STOP = "at an end stop of the arm"
+
+
 @dataclass(slots=True)
 class StreamCounts:
     """What was seen in a stream.
@@ -306,6 +312,9 @@ class StreamCounts:
         Elements by `ElementStatus`.
     n_restarts
         How often the device's count began anew; what was lost there cannot be counted.
+    n_inaccurate, n_end_stop
+        Samples of which the arm itself says that they are inaccurate, and have no valid pose, or
+        that it is at an end stop.
     """
 
     n_elements: int = 0
@@ -316,6 +325,8 @@ class StreamCounts:
     n_jumps: int = 0
     n_doubtful: int = 0
     n_restarts: int = 0
+    n_inaccurate: int = 0
+    n_end_stop: int = 0
 
     @property
     def words(self) -> str:
@@ -327,6 +338,8 @@ class StreamCounts:
             (self.n_jumps, ElementStatus.JUMP.label),
             (self.n_doubtful, ElementStatus.DOUBTFUL.label),
             (self.n_restarts, "times the count began anew"),
+            (self.n_inaccurate, INACCURATE),
+            (self.n_end_stop, AT_END_STOP),
         )
         return ", ".join(f"{n} {what}" for n, what in parts if n)
 
@@ -358,8 +371,15 @@ class StreamMonitor:
         """Whether the newest element has a time by this computer's clock."""
         return not self.clock.missing(self._t_device_ns)
 
-    def check(self, number: int, t_device_ns: int, t_host_ns: int) -> ElementStatus:
-        """Take one element by its count and its times by the device's and this computer's clock."""
+    def check(
+        self, number: int, t_device_ns: int, t_host_ns: int, *, is_timed: bool = True
+    ) -> ElementStatus:
+        """Take one element by its count and its times by the device's and this computer's clock.
+
+        ``t_device_ns`` is a moment that arrivals follow by a constant least delay: of a frame the
+        end of its exposure. An element that is not ``is_timed`` counts, and tells nothing of the
+        clock.
+        """
         self.counts.n_elements += 1
         last = self._number
         if last is not None and number <= last:
@@ -380,6 +400,8 @@ class StreamMonitor:
         uneven = has_time and self._is_uneven(step, t_device_ns)
         self._seen.append((number, t_device_ns))
         self._number, self._t_device_ns = number, t_device_ns
+        if not is_timed and not back:
+            return ElementStatus.USABLE
         if back:
             self.clock.restart()
             self.clock.n_jumps += 1
@@ -432,3 +454,77 @@ class StreamMonitor:
 
 LEARNT, UNEVEN = 0.05, 5.0
 """Weight of a new element in what is usual; and steps so far from it are uneven."""
+
+SHORT_IDS = 65_535
+"""GigE Vision 1 counts frames from 1 to this and then begins again at 1."""
+UNDER_WAY, UNDER_WAY_NS = 3, 100_000_000
+"""So many frames, and all that came so soon, may still have been exposed as before a change."""
+SMALL_CHANGE_NS = 50_000
+"""A change by less moves no middle by more than 25 us."""
+
+
+class ContinuedCount:
+    """A count that goes on where a camera's own begins anew."""
+
+    def __init__(self) -> None:
+        self._last = -1
+        self._base: int | None = 0
+        self._turn = 0
+
+    def begin_anew(self, has_short_ids: bool) -> None:
+        """The device counts from its beginning again, after a start."""
+        self._turn = SHORT_IDS if has_short_ids else 0
+        self._base = None
+
+    def of(self, number: int) -> int:
+        """The frame's number among all since its camera was opened."""
+        if self._base is None:
+            self._base = self._last + 1 - number
+        while self._turn and number + self._base < self._last - self._turn // 2:
+            self._base += self._turn
+        self._last = number + self._base
+        return self._last
+
+
+class ExposureInUse:
+    """The exposure time of frames that do not tell their own; any thread may ask.
+
+    After a change nobody tells which frame is the first of the new time. Until all that were under
+    way must have come, the shorter one is told, with which no arrival is too early, as not sure.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._possible_ns: tuple[int, ...] = (0,)
+        self._is_changing = False
+        self._settled_ns = self._n_since = 0
+
+    def begin_change(self, wished_us: float) -> None:
+        """Another time is about to be set."""
+        with self._lock:
+            self._possible_ns = (*self._possible_ns, round(1e3 * wished_us))
+            self._is_changing = True
+
+    def settle(self, exposure_us: float | None) -> None:
+        """This one is set now; without a change that was begun, nothing else is under way."""
+        with self._lock:
+            set_ns = round(1e3 * (exposure_us or 0.0))
+            if self._is_changing:
+                self._settled_ns, self._n_since = time.monotonic_ns(), 0
+                self._possible_ns = (min(self._possible_ns), max(self._possible_ns), set_ns)
+            else:
+                self._possible_ns = (set_ns,)
+            self._is_changing = False
+
+    def of_frame(self, t_host_ns: int, told_us: float | None = None) -> tuple[int, bool]:
+        """Exposure time in ns of a frame, by its own word if it has one, and whether it is sure."""
+        if told_us is not None:
+            return round(1e3 * told_us), True
+        with self._lock:
+            self._n_since += 1
+            is_late = t_host_ns > self._settled_ns + UNDER_WAY_NS
+            if not self._is_changing and is_late and self._n_since > UNDER_WAY:
+                self._possible_ns = self._possible_ns[-1:]
+            least, most = min(self._possible_ns), max(self._possible_ns)
+            is_sure = most - least <= SMALL_CHANGE_NS
+            return (self._possible_ns[-1] if is_sure else least), is_sure

@@ -183,9 +183,13 @@ class FaultyLine(Generic[T]):
         self.inbox.close()
 
     def send(self, t_ns: int, element: T) -> None:
-        """Deliver what was taken at a time of the monotonic clock; its number and times are set."""
+        """Deliver what was taken at a time of the monotonic clock; its number and times are set.
+
+        A frame's time is the middle of its exposure, and its delay begins with the end.
+        """
         number, self.number = self.number, self.number + 1
         delay_ns = self.delay_ns + round(self._spread_ns * self._rng.exponential())
+        delay_ns += element.exposure_ns // 2 if isinstance(element, Frame) else 0
         due_ns = max(t_ns + delay_ns, self._last_ns, self._stalled_ns)
         if self._counts_down("drop") or t_ns < self._unplugged_ns:
             return

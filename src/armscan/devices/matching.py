@@ -199,11 +199,14 @@ class InstantMatcher:
         makes an instant without time.
         """
         monitor = self.cameras[camera]
-        status = monitor.check(frame.number, frame.t_device_ns, frame.t_host_ns)
+        # a frame is sent when its exposure is over, however long that was
+        end_ns = frame.t_device_ns + frame.exposure_ns // 2
+        status = monitor.check(frame.number, end_ns, frame.t_host_ns, is_timed=frame.is_timed)
         if status in _SEEN_BEFORE:
             return status
         self._forget_apart(status)
-        t_ns = _common_ns(monitor, frame.t_device_ns) if status == ElementStatus.USABLE else None
+        is_known = frame.is_timed and status == ElementStatus.USABLE
+        t_ns = _common_ns(monitor, frame.t_device_ns) if is_known else None
         self._learn_step(camera, t_ns)
         partner = self._partner(frame, camera, t_ns)
         if partner is None:
@@ -250,6 +253,8 @@ class InstantMatcher:
         pose = self._valid_pose(sample)
         if status in _SEEN_BEFORE:
             return TimedSample(sample, None, status, pose)
+        self.arm.counts.n_inaccurate += ArmFlag.INACCURATE in sample.flags
+        self.arm.counts.n_end_stop += ArmFlag.END_STOP in sample.flags
         self._forget_apart(status)
         t_ns = None
         if status == ElementStatus.USABLE:
@@ -269,7 +274,7 @@ class InstantMatcher:
         return TimedSample(sample, t_ns, status, pose)
 
     def _valid_pose(self, sample: ArmSample) -> Pose[Base, Tool] | None:
-        if ArmFlag.REFERENCED not in sample.flags:
+        if not sample.is_valid:
             return None
         if sample.pose is not None or sample.joints_rad is None or self._model is None:
             return sample.pose

@@ -15,7 +15,7 @@ from typing import Literal, Protocol
 
 from armscan.geometry.arrays import FloatArray, ImageArray
 from armscan.geometry.poses import Base, Pose, Tool
-from armscan.records.exposure import SensorWindow
+from armscan.records.exposure import SensorWindow, unstated_window
 from armscan.records.recording import CameraSetup, PoseForm
 
 DeviceKind = Literal["camera", "arm", "lasers"]
@@ -61,6 +61,12 @@ class Frame:
         The part of the sensor that the image shows.
     is_complete
         False where parts of the image were lost on the way.
+    exposure_ns
+        How long this frame was exposed: it arrives after the END of the exposure. 0 where the
+        driver cannot tell; then its arrivals tell the clock only while the time stays the same.
+    is_timed
+        False where the middle is not certain, as of a frame that was under way while the exposure
+        time was changed.
     """
 
     image: ImageArray
@@ -69,8 +75,10 @@ class Frame:
     t_host_ns: int
     trigger_id: int | None = None
     lasers: tuple[str, ...] | None = None
-    window: SensorWindow = field(default_factory=SensorWindow)
+    window: SensorWindow = field(default_factory=unstated_window)
     is_complete: bool = True
+    exposure_ns: int = 0
+    is_timed: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +165,7 @@ class ArmSample:
     buttons
         Bit k is set while button k is down.
     flags
-        State of the arm; a sample that is not `ArmFlag.REFERENCED` has no valid pose.
+        State of the arm.
     trigger_id
         Number of the trigger that it was taken at, or None.
     """
@@ -170,6 +178,14 @@ class ArmSample:
     buttons: int = 0
     flags: ArmFlag = ArmFlag.REFERENCED
     trigger_id: int | None = None
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether pose and angles may be used: not of an arm that says that they are not right.
+
+        At an end stop they are: whether that strains the arm, its own `ArmFlag.INACCURATE` says.
+        """
+        return ArmFlag.REFERENCED in self.flags and ArmFlag.INACCURATE not in self.flags
 
 
 class Arm(Protocol):

@@ -11,11 +11,13 @@ import gc
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
+from armscan.devices.clocks import ContinuedCount, ExposureInUse
 from armscan.devices.inbox import Inbox
 from armscan.devices.protocols import (
     Camera,
@@ -28,12 +30,14 @@ from armscan.devices.protocols import (
 from armscan.devices.registry import needed_package, split_place
 from armscan.errors import ArmscanError, DeviceError, DeviceTakenError
 from armscan.geometry.arrays import ImageArray
-from armscan.records.exposure import SensorWindow
+from armscan.records.exposure import SensorWindow, window_of_sensor
 from armscan.records.recording import CameraSetup, PixelColour
 
 _EXPOSURE = ("ExposureTime", "ExposureTimeAbs")
 _GAIN = ("Gain", "GainRaw")
 _RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+_TELLING = {"ChunkModeActive": True, "ChunkSelector": "ExposureTime", "ChunkEnable": True}
+"""Has each frame tell its own exposure time."""
 _FORMATS: dict[str, tuple[int, PixelColour]] = {
     "Mono8": (8, "mono"),
     "Mono10": (10, "mono"),
@@ -45,16 +49,16 @@ _FORMATS: dict[str, tuple[int, PixelColour]] = {
     "RGB8": (8, "rgb"),
     "RGB8Packed": (8, "rgb"),
 }
-_MOST_FRAMES = 32
 _N_BUFFERS = 16
 _FETCH_S = 0.1
-_SHORT_IDS = 65_535
-"""GigE Vision 1 counts frames from 1 to this and then begins again at 1."""
+_CHUNKS = ("ChunkExposureTime", "ChunkExposureTimeAbs")
+"""Where a frame bears its own exposure time in us, if the camera sends it along."""
+PYLON_INSTALL = "pip install 'armscan[pylon]'"
+_MOST_FRAMES = 32
 ARAVIS_INSTALL = (
     "install your system's packages, on Debian: apt install gir1.2-aravis-0.8 python3-gi; "
     "and in a virtual environment: pip install 'pygobject<3.51'"
 )
-PYLON_INSTALL = "pip install 'armscan[pylon]'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +73,15 @@ class RawFrame:
         Its time at the start of the exposure; None for a camera without clock.
     is_complete
         False where packets were lost.
+    exposure_us
+        As the frame itself tells; None where it does not.
     """
 
     image: ImageArray
     number: int
     t_camera_ns: int | None
     is_complete: bool
+    exposure_us: float | None = None
 
 
 class GenICamLibrary(Protocol):
@@ -133,8 +140,10 @@ class GenICamCamera:
         self._is_closed = False
         self._trigger: TriggerMode | None = None
         self._thread: threading.Thread | None = None
-        self._numbers = _Count()
+        self._numbers = ContinuedCount()
         self._last_camera_ns: int | None = None
+        self._exposure = ExposureInUse()
+        self._is_auto = False
         self._lock = threading.RLock()
         try:
             self._setup = self._read_setup()
@@ -142,6 +151,7 @@ class GenICamCamera:
         except DeviceError:
             self.close()
             raise
+        self._exposure.settle(self._settings.exposure_us)
 
     @property
     def setup(self) -> CameraSetup:
@@ -161,9 +171,15 @@ class GenICamCamera:
             is_resized = settings.window is not None or settings.size_px is not None
             if running is not None and is_resized:
                 self._halt()
-            self._call(lambda: self._apply(settings))
-            self._setup = self._read_setup()
-            self._settings = self._read_settings()
+            if settings.exposure_us is not None:
+                self._exposure.begin_change(settings.exposure_us)
+            try:
+                self._call(lambda: self._apply(settings))
+                self._setup = self._read_setup()
+                self._settings = self._read_settings()
+            finally:
+                self._exposure.settle(self._settings.exposure_us)
+            self._is_auto = self._has_own_control()
             if running is not None and is_resized:
                 self._begin(running)
         return self._settings
@@ -219,6 +235,7 @@ class GenICamCamera:
 
     def _begin(self, trigger: TriggerMode) -> None:
         self._call(lambda: self._set_trigger(trigger))
+        self._know_exposures()
         self._numbers.begin_anew(self._camera.has_short_ids)
         self._call(self._camera.begin)
         self._trigger = trigger
@@ -233,6 +250,26 @@ class GenICamCamera:
 
     def _first_of(self, names: tuple[str, ...]) -> str | None:
         return next((name for name in names if self._camera.has(name)), None)
+
+    def _know_exposures(self) -> None:
+        """Have frames tell their exposure; else the camera must not change it by itself."""
+        try:
+            for name, value in _TELLING.items():
+                self._camera.set(name, value)
+        except Exception:
+            # libraries raise whatever they like where a feature or its value is missing
+            with suppress(Exception):
+                self._camera.set("ChunkModeActive", False)
+            if self._has_own_control():
+                self._call(lambda: self._camera.set("ExposureAuto", "Off"))
+            self._settings = self._read_settings()
+        self._exposure.settle(self._settings.exposure_us)
+        self._is_auto = self._has_own_control()
+
+    def _has_own_control(self) -> bool:
+        """Whether the camera changes its exposure time by itself."""
+        has = self._camera.has("ExposureAuto")
+        return has and str(self._call(lambda: self._camera.get("ExposureAuto"))) != "Off"
 
     def _set_trigger(self, trigger: TriggerMode) -> None:
         if self._camera.has("TriggerSelector"):
@@ -282,10 +319,14 @@ class GenICamCamera:
                 int(camera.get(name)) * step if camera.has(name) else 0
                 for name in ("OffsetX", "OffsetY")
             )
+            size_px = int(camera.get("Width")), int(camera.get("Height"))
+            place = SensorWindow(x, y, step)
+            if camera.has("SensorWidth") and camera.has("SensorHeight"):
+                sensor_px = int(camera.get("SensorWidth")), int(camera.get("SensorHeight"))
+                place = window_of_sensor(place, size_px, sensor_px)
             return CameraSetup(
-                int(camera.get("Width")),
-                int(camera.get("Height")),
-                SensorWindow(x, y, step),
+                *size_px,
+                place,
                 bits,
                 colour=colour,
             )
@@ -340,11 +381,15 @@ class GenICamCamera:
             return None
         self._last_camera_ns = t_camera_ns
         number = self._numbers.of(raw.number)
-        half_ns = round(500.0 * (self._settings.exposure_us or 0.0))
-        t_ns = t_host_ns if raw.t_camera_ns is None else raw.t_camera_ns + half_ns
+        if t_camera_ns is None:
+            t_ns, exposure_ns, is_timed = t_host_ns, 0, True
+        else:
+            exposure_ns, is_timed = self._exposure.of_frame(t_host_ns, raw.exposure_us)
+            is_timed = is_timed and not (self._is_auto and raw.exposure_us is None)
+            t_ns = t_camera_ns + exposure_ns // 2
         return Frame(
             raw.image, number, t_ns, t_host_ns, window=self._setup.window,
-            is_complete=raw.is_complete,
+            is_complete=raw.is_complete, exposure_ns=exposure_ns, is_timed=is_timed,
         )  # fmt: skip
 
 
@@ -356,29 +401,6 @@ _SWITCHES = {
     "AcquisitionFrameRate": (("AcquisitionFrameRateEnable", True),),
     "AcquisitionFrameRateAbs": (("AcquisitionFrameRateEnable", True),),
 }
-
-
-class _Count:
-    """A count that goes on where the camera's begins anew."""
-
-    def __init__(self) -> None:
-        self._last = -1
-        self._base: int | None = 0
-        self._turn = 0
-
-    def begin_anew(self, has_short_ids: bool) -> None:
-        """The camera counts from its beginning again, after a start."""
-        self._turn = _SHORT_IDS if has_short_ids else 0
-        self._base = None
-
-    def of(self, number: int) -> int:
-        """The frame's number among all since the camera was opened."""
-        if self._base is None:
-            self._base = self._last + 1 - number
-        while self._turn and number + self._base < self._last - self._turn // 2:
-            self._base += self._turn
-        self._last = number + self._base
-        return self._last
 
 
 def image_of(data: bytes, width: int, height: int, form: str) -> ImageArray:
@@ -395,6 +417,15 @@ def image_of(data: bytes, width: int, height: int, form: str) -> ImageArray:
     came = np.frombuffer(data, dtype, count=min(len(data) // flat.itemsize, len(flat)))
     flat[: len(came)] = came
     return np.asarray(flat.reshape(shape))
+
+
+def _first_told(read: Callable[[str], Any]) -> float | None:
+    """The exposure time that a frame bears; None where it bears none."""
+    for name in _CHUNKS:
+        # libraries raise whatever they like where a frame has no such part
+        with suppress(Exception):
+            return float(read(name))
+    return None
 
 
 class AravisLibrary:
@@ -417,6 +448,7 @@ class AravisLibrary:
             ) from error
         self._device = self._camera.get_device()
         self._stream: Any = None
+        self._chunks: Any = None
         self._shape = 0, 0, "Mono8"
         self._is_lost = False
         self._device.connect("control-lost", self._lose)
@@ -460,6 +492,7 @@ class AravisLibrary:
     def begin(self) -> None:
         """Start the acquisition."""
         self._stream = self._camera.create_stream(None, None)
+        self._chunks = self._camera.create_chunk_parser()
         payload = self._camera.get_payload()
         size = int(self.get("Width")), int(self.get("Height"))
         self._shape = *size, str(self.get("PixelFormat"))
@@ -487,7 +520,8 @@ class AravisLibrary:
             image = image_of(buffer.get_data(), *self._shape)
             stamp = int(buffer.get_timestamp())
             is_whole = state == status.SUCCESS
-            return RawFrame(image, int(buffer.get_frame_id()), stamp or None, is_whole)
+            told = _first_told(lambda name: self._chunks.get_float_value(buffer, name))
+            return RawFrame(image, int(buffer.get_frame_id()), stamp or None, is_whole, told)
         finally:
             self._stream.push_buffer(buffer)
 
@@ -499,7 +533,7 @@ class AravisLibrary:
 
     def close(self) -> None:
         """Give the camera back: Aravis does so when nothing holds it, so what does is swept up."""
-        self._stream = self._device = self._camera = None
+        self._stream = self._chunks = self._device = self._camera = None
         gc.collect()
 
 
@@ -576,7 +610,8 @@ class PylonLibrary:
             number = int(result.BlockID)
             if number in _NO_BLOCK:
                 return None
-            return RawFrame(image, number, t_ns, is_whole)
+            told = _first_told(lambda name: result.ChunkDataNodeMap.GetNode(name).GetValue())
+            return RawFrame(image, number, t_ns, is_whole, told)
         finally:
             result.Release()
 

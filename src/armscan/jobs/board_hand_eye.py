@@ -253,7 +253,7 @@ def _scan_views(source: LookSource) -> _Views:
     names = [row.source for row in recording.rows]
     gone = set(named_by(source.leave_out, names))
     left = [k for k, row in enumerate(recording.rows) if row.camera == 0 and names[k] not in gone]
-    dark = [k for k in left if not recording.rows[k].lasers]
+    dark = [k for k in left if recording.rows[k].is_dark]
     posed = [k for k in dark or left if poses.has_pose[k]]
     if not posed:
         raise InputError(

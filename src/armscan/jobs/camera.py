@@ -227,7 +227,7 @@ def _camera_scan(folder: Path) -> _Images:
             where=f"--scan {folder}",
             remedy="calibrate them together with `armscan calibrate stereo --scan`",
         )
-    dark = [k for k, row in enumerate(recording.rows) if not row.lasers]
+    dark = [k for k, row in enumerate(recording.rows) if row.is_dark]
     chosen = dark or list(range(len(recording.rows)))
     return _Images(
         tuple(recording.exposure(k) for k in chosen),

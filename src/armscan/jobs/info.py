@@ -27,7 +27,7 @@ from armscan.models.calibration import (
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.reconstruction.sync import exposure_poses, largest_gap_ns
 from armscan.records.cloud import PointCloud, largest_eigenvalue
-from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
+from armscan.records.recording import LASER_UNKNOWN, NO_TRIGGER, ArmTrack, CameraSetup
 from armscan.report.quantity import Summary, fact, plural, with_sigma
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
 from armscan.storage.clouds import BY_SUFFIX, parse_ply, read_cloud, read_ply
@@ -112,6 +112,7 @@ def describe_recording(folder: Path) -> dict[str, Any]:
     scan = read_recording(folder)
     times = [row.t_ns for row in scan.rows]
     lasers = sorted({name for row in scan.rows for name in row.lasers})
+    n_unknown = sum(LASER_UNKNOWN in row.flags for row in scan.rows)
     damaged = damaged_images(folder)
     content: dict[str, Any] = {
         "what": f"recording ({scan.session.kind}), {len(scan.rows)} exposures"
@@ -125,6 +126,7 @@ def describe_recording(folder: Path) -> dict[str, Any]:
         "seconds": round((max(times) - min(times)) / NS_PER_S, 3),
         **_steps("exposure", np.unique(np.array(times, dtype=np.int64))),
         **({"lasers": lasers} if lasers else {}),
+        **({"exposures_with_lasers_unknown": n_unknown} if n_unknown else {}),
         "cameras": [_camera_line(setup) for setup in scan.session.cameras],
     }
     if scan.session.is_stripe_band:

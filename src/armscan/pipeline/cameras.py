@@ -367,7 +367,7 @@ def stereo_rows(rows: Sequence[ExposureRow], where: str) -> list[tuple[int | Non
             where=where,
             remedy="name a recording of a head with two cameras",
         )
-    dark = [k for k, row in enumerate(rows) if not row.lasers]
+    dark = [k for k, row in enumerate(rows) if row.is_dark]
     chosen = dark or list(range(len(rows)))
     pairs = []
     for instant in group_instants([rows[k] for k in chosen], where):

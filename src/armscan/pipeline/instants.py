@@ -20,7 +20,7 @@ from armscan.models.camera import CameraModel
 from armscan.pipeline.progress import Progress, ProgressEvent, StageClock
 from armscan.records.exposure import Exposure
 from armscan.records.profile import PointProfile, Profile
-from armscan.records.recording import ExposureRow
+from armscan.records.recording import LASER_UNKNOWN, ExposureRow
 
 ExposurePair = tuple[Exposure, Exposure | None]
 LISTED = 4
@@ -158,13 +158,14 @@ WINDOW_REMEDY = (
 def check_sizes(exposures: Iterable[Exposure], camera: CameraModel) -> None:
     """Raise `InputError` if an exposure is not of the camera's sensor.
 
-    A window may be anywhere on the sensor; an image without window must have its full size.
+    A window may be anywhere on the sensor, also in its corner; an image of which nobody said that
+    it is a window must have the full size.
     """
     for exposure in exposures:
         window = exposure.window
         width = window.x_px + exposure.width_px * window.binning
         height = window.y_px + exposure.height_px * window.binning
-        is_whole = window.x_px == window.y_px == 0 and window.binning == 1
+        is_whole = not window.is_stated and window.x_px == window.y_px == 0 and window.binning == 1
         fits = width <= camera.width_px and height <= camera.height_px
         if not fits or (is_whole and (width, height) != (camera.width_px, camera.height_px)):
             is_window = fits and is_whole
@@ -412,15 +413,16 @@ class ScanInstants:
     ----------
     source
         The scan. If any of its rows names a laser, rows without are taken with the laser off and
-        are the background of the exposures of their view and camera; else all have it on.
+        are the background of the exposures of their view and camera; else all have it on. A row
+        of which it is not known is neither.
     n_cameras
         Cameras that the scanner has.
 
     Raises
     ------
     InputError
-        If the scan's cameras are not the scanner's, or none of its instants with the laser on has
-        the images of all of them.
+        If the scan's cameras are not the scanner's, it is of no row known what lasers were on, or
+        none of its instants with the laser on has the images of all of them.
     """
 
     def __init__(self, source: ScanSource, n_cameras: int) -> None:
@@ -434,11 +436,21 @@ class ScanInstants:
                 remedy="the scanner's document is of another head: give the one of this scan",
             )
         lit = [bool(row.lasers) for row in source.rows]
-        self.is_lit: BoolArray = np.array(lit if any(lit) else [True] * len(lit), dtype=np.bool_)
+        self.is_unknown = np.array([LASER_UNKNOWN in one.flags for one in source.rows], np.bool_)
+        """Rows of which nobody knows what lasers were on."""
+        if self.is_unknown.all():
+            raise InputError(
+                f"of none of {len(lit)} exposures is it known what lasers were on",
+                where=source.name,
+                remedy="record with a schedule of one step, fewer triggers a second, or images "
+                "that bear the controller's trigger ids",
+            )
+        is_named = any(lit) or bool(self.is_unknown.any())
+        self.is_lit: BoolArray = np.array(lit if is_named else [True] * len(lit), dtype=np.bool_)
         self._dark_row = {
             (row.view, row.camera): k
             for k, row in enumerate(source.rows)
-            if not self.is_lit[k] and row.view is not None
+            if row.is_dark and not self.is_lit[k] and row.view is not None
         }
         self._dark: dict[int, tuple[int, Exposure]] = {}
         self.lit: tuple[Instant, ...] = tuple(

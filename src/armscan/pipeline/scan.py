@@ -84,6 +84,7 @@ class ExposureStatus(Enum):
     PLACED = "placed in Base"
     NO_POSE = "without pose"
     LASER_OFF = "laser off"
+    LASER_UNKNOWN = "what laser was on is not known"
     UNREADABLE = "image cannot be read"
     NO_PARTNER = PARTNER_MISSING
     EQUAL_POSE = "left out: the pose of another exposure, but another stripe"
@@ -510,6 +511,8 @@ def _exposures(
         elif k in hung:
             status = ExposureStatus.EQUAL_POSE
             reason = f"the pose of an earlier one, but its stripe lies {hung[k]:.2g} mm away"
+        elif scan.is_unknown[k]:
+            status, reason = ExposureStatus.LASER_UNKNOWN, ExposureStatus.LASER_UNKNOWN.value
         elif not scan.is_lit[k]:
             status, reason = ExposureStatus.LASER_OFF, "no laser was on"
         elif k in scan.without_partner:
@@ -681,6 +684,8 @@ def _scan_warnings(exposures: Sequence[ScanExposure], poses: ExposurePoses) -> t
     n_outside = sum(exposure.n_outside_volume for exposure in exposures)
     if n_outside:
         warnings.append(f"{n_outside} measured points lie outside the volume asked for")
-    if not any(exposure.row.lasers for exposure in exposures):
+    if unknown := of[ExposureStatus.LASER_UNKNOWN]:
+        warnings.append(f"{len(unknown)} of {n} images were not measured: {unknown[0].reason}")
+    elif not any(exposure.row.lasers for exposure in exposures):
         warnings.append("no exposure names its lasers: the laser was taken to be on in all")
     return tuple(warnings)

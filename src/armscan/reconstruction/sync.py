@@ -17,7 +17,13 @@ from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import slerp
 from armscan.reconstruction.track_faults import TrackFault, check_track
 from armscan.records.cloud import PointCloud
-from armscan.records.recording import NO_TRIGGER, ArmTrack, Clock, ExposureRow
+from armscan.records.recording import (
+    NO_TRIGGER,
+    UNTRIGGERED,
+    ArmTrack,
+    Clock,
+    ExposureRow,
+)
 
 PoseSource = Literal["trigger", "time", "given"]
 
@@ -156,6 +162,7 @@ def exposure_poses(
 
     Trigger ids decide if exposures and samples have them. Else the pose is interpolated in time
     between two neighbouring known samples: the rotation by SLERP, the place along a straight line.
+    An exposure that was to have an id and has none gets no pose: its time may only order.
 
     Parameters
     ----------
@@ -181,10 +188,18 @@ def exposure_poses(
             "the scan has no samples of the arm", remedy="record the arm's poses in arm.csv"
         )
     has_ids = arm.trigger_ids is not None and bool((arm.trigger_ids != NO_TRIGGER).any())
-    if has_ids and any(row.trigger_id is not None for row in rows):
+    has_row_ids = any(row.trigger_id is not None for row in rows)
+    if has_ids and has_row_ids:
         poses = _by_trigger(rows, arm, clock, latency_ns)
     elif clock != "separate":
-        poses = poses_by_time(rows, arm, latency_ns)
+        poses = _without_untriggered(poses_by_time(rows, arm, latency_ns), rows)
+    elif any(row.trigger_id is not None or UNTRIGGERED in row.flags for row in rows):
+        lacking = "sample of the arm" if has_row_ids else "exposure"
+        raise InputError(
+            f"no {lacking} bears a trigger id, and poses were to be found by ids alone",
+            remedy="let cameras and arm tell the number of their common trigger, or, where there "
+            "is none, record without is_common_trigger (--common-trigger)",
+        )
     else:
         raise InputError(
             "exposures and arm samples have separate clocks and no trigger ids in common",
@@ -199,6 +214,23 @@ def exposure_poses(
             remedy="check the times and trigger ids of exposures and arm samples",
         )
     return poses
+
+
+def _without_untriggered(poses: ExposurePoses, rows: Sequence[ExposureRow]) -> ExposurePoses:
+    """Take the pose from exposures whose time was never meant to place them."""
+    is_without = np.array([UNTRIGGERED in row.flags for row in rows], dtype=np.bool_)
+    return _taken_from(poses, is_without, PoseStatus.NO_TRIGGER) if is_without.any() else poses
+
+
+def _taken_from(poses: ExposurePoses, is_taken: BoolArray, status: PoseStatus) -> ExposurePoses:
+    """Poses without those of some exposures (N,)."""
+    return replace(
+        poses,
+        rotations=np.where(is_taken[:, None, None], np.eye(3), poses.rotations),
+        translations_mm=np.where(is_taken[:, None], 0.0, poses.translations_mm),
+        status=np.where(is_taken, status, poses.status),
+        sample=np.where(is_taken, -1, poses.sample),
+    )
 
 
 def _without_contradicted(
@@ -226,11 +258,7 @@ def _without_contradicted(
             "and the track does not tell which of the two is right: scan again"
         )
     return replace(
-        poses,
-        rotations=np.where(is_wrong[:, None, None], np.eye(3), poses.rotations),
-        translations_mm=np.where(is_wrong[:, None], 0.0, poses.translations_mm),
-        status=np.where(is_wrong, PoseStatus.CONTRADICTED, poses.status),
-        sample=np.where(is_wrong, -1, poses.sample),
+        _taken_from(poses, is_wrong, PoseStatus.CONTRADICTED),
         warnings=tuple(warnings),
         track_faults=check.faults,
     )

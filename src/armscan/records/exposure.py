@@ -25,11 +25,14 @@ class SensorWindow:
         Top-left corner pixel of the window on the full sensor (unbinned pixels).
     binning
         Sensor pixels per image pixel along each axis.
+    is_stated
+        False where nobody said where the image lies: then it must be the whole sensor.
     """
 
     x_px: int = 0
     y_px: int = 0
     binning: int = 1
+    is_stated: bool = field(default=True, compare=False)
 
     def __post_init__(self) -> None:
         if self.x_px < 0 or self.y_px < 0 or self.binning < 1:
@@ -48,6 +51,22 @@ class SensorWindow:
         """Map (..., 2) full-sensor pixels to image pixels."""
         centre = 0.5 * (self.binning - 1)
         return (full_sensor_px - [self.x_px, self.y_px] - centre) / self.binning
+
+
+def unstated_window() -> SensorWindow:
+    """That of an image of which nobody said where it lies on the sensor."""
+    return SensorWindow(is_stated=False)
+
+
+def window_of_sensor(
+    window: SensorWindow, size_px: tuple[int, int], sensor_px: tuple[int, int]
+) -> SensorWindow:
+    """The window, stated as one only where it is less than the sensor.
+
+    So an image of a whole sensor is still told from one of a larger sensor's corner.
+    """
+    is_whole = size_px == sensor_px and window.binning == 1
+    return unstated_window() if is_whole else window
 
 
 ColourLayout = Literal["mono", "rgb"]
@@ -82,7 +101,7 @@ class Exposure:
     image: ImageArray
     source: str
     bits_used: int = 8
-    window: SensorWindow = field(default_factory=SensorWindow)
+    window: SensorWindow = field(default_factory=unstated_window)
     lasers: tuple[str, ...] = ()
     t_ns: int | None = None
     camera: int = 0

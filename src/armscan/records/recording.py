@@ -12,7 +12,7 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, bools, floats, ints
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import EulerConvention
-from armscan.records.exposure import SensorWindow
+from armscan.records.exposure import SensorWindow, unstated_window
 
 SessionKind = Literal["scan", "calibration"]
 Clock = Literal["shared", "related", "separate"]
@@ -41,7 +41,7 @@ class CameraSetup:
 
     width_px: int | None = None
     height_px: int | None = None
-    window: SensorWindow = field(default_factory=SensorWindow)
+    window: SensorWindow = field(default_factory=unstated_window)
     bits_used: int = 8
     align: PixelAlignment = "low"
     colour: PixelColour = "mono"
@@ -84,6 +84,11 @@ class Session:
     assumed: tuple[str, ...] = ()
 
 
+UNTRIGGERED, LASER_UNKNOWN = "no-trigger", "laser-unknown"
+"""Flags of a live recording that its readers obey: an image without a trigger's id where ids alone
+give poses, and one of which nobody knows what lasers were on."""
+
+
 @dataclass(frozen=True, slots=True)
 class ExposureRow:
     """One line of a recording's list of exposures: everything but the pixels.
@@ -102,6 +107,8 @@ class ExposureRow:
         Number of the trigger, or None.
     view
         Exposures of equal view saw one rigid arrangement; None stands for a view of its own.
+    flags
+        Marks of a live recording, as `LASER_UNKNOWN`.
     """
 
     index: int
@@ -111,6 +118,12 @@ class ExposureRow:
     lasers: tuple[str, ...] = ()
     trigger_id: int | None = None
     view: str | None = None
+    flags: tuple[str, ...] = ()
+
+    @property
+    def is_dark(self) -> bool:
+        """True if it names no laser, and that is known to be so."""
+        return not self.lasers and LASER_UNKNOWN not in self.flags
 
     @property
     def arrangement(self) -> str | int:

@@ -284,12 +284,13 @@ class TwinRig:
     def setup(self, camera: int) -> CameraSetup:
         """How a camera delivers its images now."""
         row = self._stage.instants[self._k % len(self._stage.instants)][camera]
-        window = self.scan_by(camera, self._stage).shots[row].settings.window
+        scan = self.scan_by(camera, self._stage)
+        window = scan.shots[row].settings.window
         return replace(
             self._stage.scan.session.cameras[camera],
             width_px=window.width_px,
             height_px=window.height_px,
-            window=SensorWindow(window.x_px, window.y_px),
+            window=scan.sensor_window(window, camera),
         )
 
     def samples(self, after_ns: int, start_ns: int) -> int:
@@ -405,7 +406,9 @@ class TwinRig:
             window = self.setup(camera).window
             told = trigger_id if self.plan.is_wired else None
             seen = None if self.lines["lasers"].is_open else lasers
-            self.lines[f"camera{camera}"].send(t_ns, Frame(image, 0, 0, 0, told, seen, window))
+            exposure_ns = round(1e3 * (self.settings[camera].exposure_us or 0.0))
+            frame = Frame(image, 0, 0, 0, told, seen, window, exposure_ns=exposure_ns)
+            self.lines[f"camera{camera}"].send(t_ns, frame)
         if self.are_lasers_started:
             self.lines["lasers"].send(t_ns, LaserEvent(trigger_id, 0, 0, lasers))
         is_travel = stage.way.is_travel(k)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from armscan.errors import InputError
 from armscan.geometry.arrays import ArrayRecord, FloatArray, ImageArray, floats
 from armscan.geometry.poses import Base, Board, Points, Pose, Sensor
-from armscan.records.exposure import Exposure, SensorWindow
+from armscan.records.exposure import Exposure, SensorWindow, window_of_sensor
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session, SessionKind
 from armscan.simulation.head import Head, MountedCamera, Window
 from armscan.simulation.objects.boards import (
@@ -442,7 +442,7 @@ class TwinScan:
             image,
             shot.row.source,
             bits_used=self.head.imaging.detector.bits,
-            window=SensorWindow(window.x_px, window.y_px),
+            window=self.sensor_window(window, camera),
             lasers=lasers,
             t_ns=shot.row.t_ns,
             camera=camera,
@@ -482,13 +482,20 @@ class TwinScan:
             self.head, shot.station, shot.base_from_sensor, settings, camera=shot.row.camera
         )
 
+    def sensor_window(self, window: Window, camera: int) -> SensorWindow:
+        """What a record says of a window of one of the head's cameras."""
+        sensor = self.head.cameras[camera].camera
+        size_px = window.width_px, window.height_px
+        place = SensorWindow(window.x_px, window.y_px)
+        return window_of_sensor(place, size_px, (sensor.width_px, sensor.height_px))
+
     def _setup(self, camera: int) -> CameraSetup:
         """How a camera delivers its images: all with one window."""
         window = next(shot for shot in self.shots if shot.row.camera == camera).settings.window
         return CameraSetup(
             width_px=window.width_px,
             height_px=window.height_px,
-            window=SensorWindow(window.x_px, window.y_px),
+            window=self.sensor_window(window, camera),
             bits_used=self.head.imaging.detector.bits,
             colour="mono" if self.head.imaging.laser_colour is None else "rgb",
         )

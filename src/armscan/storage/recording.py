@@ -52,6 +52,7 @@ from armscan.storage.recording_session import (
     EXPOSURES_FILE,
     FLAGS,
     SESSION_FILE,
+    WINDOW_KEYS,
     SessionFile,
     check_files,
     exposure_columns,
@@ -322,7 +323,6 @@ def _check_size(image: Exposure, setup: CameraSetup, path: Path) -> None:
 
 
 SIZE_KEYS = ("width_px", "height_px")
-WINDOW_KEYS = ("window_x_px", "window_y_px")
 CAMERA_KEYS = (*SIZE_KEYS, "bits_used", "colour")
 
 

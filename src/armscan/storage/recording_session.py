@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -70,13 +70,16 @@ class _SessionKeys:
     camera: tuple[CameraSetup, ...] = ()
 
 
+WINDOW_KEYS = ("window_x_px", "window_y_px")
+"""Both say that an image is a window, also one in the sensor's corner."""
 WINDOW_PX = (0, LARGEST_SIZE_PX)
 LAYOUTS: Mapping[type, Layout] = {
     _SessionKeys: Layout(optional=("simulated", "stripe_band")),
     CameraSetup: Layout(flat=("window",), limits={"bits_used": (1, 16)}),
     SensorWindow: Layout(
-        keys={"x_px": "window_x_px", "y_px": "window_y_px"},
+        keys={"x_px": WINDOW_KEYS[0], "y_px": WINDOW_KEYS[1]},
         optional=("binning",),
+        given=("is_stated",),
         limits={"x_px": WINDOW_PX, "y_px": WINDOW_PX, "binning": (1, 1000)},
     ),
 }
@@ -103,9 +106,14 @@ def read_session_file(path: Path) -> SessionFile:
         if isinstance(content.get("camera"), dict):
             remedy = "write [[camera]] with two brackets, once a camera"
         raise FileFormatError(str(error), where=where, remedy=remedy) from error
+    stated = frozenset(_stated(content))
+    cameras = (
+        replace(one, window=replace(one.window, is_stated=_has_window(k, stated)))
+        for k, one in enumerate(keys.camera)
+    )
     session = Session(
         kind=keys.kind,
-        cameras=keys.camera,
+        cameras=tuple(cameras),
         clock=keys.time.clock,
         pose_form=keys.pose.form,
         rotation=keys.pose.rotation,
@@ -114,11 +122,18 @@ def read_session_file(path: Path) -> SessionFile:
         is_stripe_band=keys.stripe_band,
     )
     odd = tuple(f"{path.name}: the key {fact}" for fact in unknown)
-    return SessionFile(session, frozenset(_stated(content)), odd)
+    return SessionFile(session, stated, odd)
+
+
+def _has_window(camera: int, stated: frozenset[str]) -> bool:
+    return all(f"camera.{camera}.{key}" in stated for key in WINDOW_KEYS)
 
 
 def session_toml(session: Session) -> bytes:
-    """Text of ``session.toml`` with every key; reads back as the same session."""
+    """Text of ``session.toml`` with every key, but for windows that nobody stated.
+
+    It reads back as the same session.
+    """
     keys = _SessionKeys(
         kind=session.kind,
         head=session.head,
@@ -129,7 +144,13 @@ def session_toml(session: Session) -> bytes:
         camera=session.cameras,
     )
     assumed = "".join(f"# assumed: {' '.join(fact.split())}\n" for fact in session.assumed)
-    return assumed.encode() + toml_bytes(RecordCodec(LAYOUTS).write(keys))
+    tree = RecordCodec(LAYOUTS).write(keys)
+    for setup, table in zip(session.cameras, tree["camera"], strict=True):
+        corner = setup.window.x_px, setup.window.y_px
+        if not setup.window.is_stated and corner == (0, 0):
+            for key in WINDOW_KEYS:
+                del table[key]
+    return assumed.encode() + toml_bytes(tree)
 
 
 def _stated(content: Mapping[str, Any]) -> Iterator[str]:
@@ -147,7 +168,7 @@ MOST_CAMERAS = 100
 REQUIRED = ("index", "t_ns", "camera", "file", "lasers")
 OPTIONAL = ("trigger_id", "view")
 FLAGS = "flags"
-"""Marks that a live recording gives its exposures, joined by +; kept, and read by nobody."""
+"""Marks that a live recording gives its exposures, joined by +."""
 DRIVE = re.compile(r"[A-Za-z]:")
 
 Columns = Mapping[str, tuple[str, ...]]
@@ -172,6 +193,7 @@ def exposure_rows(table: CsvTable) -> tuple[tuple[ExposureRow, ...], Columns]:
     camera = table.ints("camera")
     triggers = table.ints("trigger_id", NO_TRIGGER) if "trigger_id" in table else None
     views = table.columns.get("view", ("",) * n)
+    marks = table.columns.get(FLAGS, ("",) * n)
     cells = table.columns["lasers"]
     lasers = {cell: _lasers(cell, table.place(cells.index(cell))) for cell in dict.fromkeys(cells)}
     rows = [
@@ -183,6 +205,7 @@ def exposure_rows(table: CsvTable) -> tuple[tuple[ExposureRow, ...], Columns]:
             lasers=lasers[cells[k]],
             trigger_id=_trigger(table, triggers, k),
             view=views[k] or None,
+            flags=tuple(filter(None, marks[k].split("+"))),
         )
         for k in range(n)
     ]
@@ -210,6 +233,8 @@ def exposure_columns(rows: Sequence[ExposureRow], extra: Columns) -> dict[str, t
         columns["trigger_id"] = tuple("" if number is None else str(number) for number in ids)
     if any(row.view is not None for row in rows):
         columns["view"] = tuple(row.view or "" for row in rows)
+    if any(row.flags for row in rows):
+        columns[FLAGS] = tuple("+".join(row.flags) for row in rows)
     return {**columns, **extra}
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -255,6 +256,94 @@ def test_short_counts_go_on_after_their_end_and_after_a_start() -> None:
     library.ids = [1, 2]
     camera.start()
     assert [frame.number for frame in frames_of(camera, 2)] == [8, 9]
+    camera.close()
+
+
+class TimedLibrary(Library):
+    """A camera with a clock, 12.5 ms a frame, that may tell how long each frame was exposed."""
+
+    def __init__(self, exposures_us: list[float] | None = None, **features: Any) -> None:
+        super().__init__()
+        self.features |= {"ExposureTime": 2000.0, **features}
+        self.told_us = exposures_us
+        self.n = 0
+        self.ids = []
+
+    def set(self, feature: str, value: Any) -> None:
+        if feature == "ChunkSelector" and self.told_us is None:
+            raise RuntimeError("there is no such feature")
+        super().set(feature, value)
+
+    def expose(self, n: int) -> None:
+        """Let so many frames come."""
+        self.ids += range(self.n + 1, self.n + 1 + n)
+        self.n += n
+
+    def fetch(self) -> RawFrame | None:
+        raw = super().fetch()
+        if raw is None:
+            return None
+        told = None if self.told_us is None else self.told_us[raw.number - 1]
+        return replace(raw, t_camera_ns=12_500_000 * raw.number, exposure_us=told)
+
+
+def middles_us(frames: list[Frame]) -> list[float]:
+    """How long after the start of its exposure each frame is said to have its middle."""
+    return [(one.t_device_ns - 12_500_000 * (one.number + 1)) / 1e3 for one in frames]
+
+
+def test_a_frame_that_tells_its_exposure_is_timed_by_it() -> None:
+    library = TimedLibrary([2000.0, 900.0, 4000.0], ExposureAuto="Continuous")
+    camera = GenICamCamera("fake chunks", lambda: library, "Line1")
+    camera.start()
+    library.expose(3)
+    frames = frames_of(camera, 3)
+    camera.close()
+    assert middles_us(frames) == [1000.0, 450.0, 2000.0]
+    assert [one.exposure_ns for one in frames] == [2_000_000, 900_000, 4_000_000]
+    assert all(one.is_timed for one in frames)
+    assert library.features["ChunkEnable"] and library.features["ExposureAuto"] == "Continuous"
+
+
+def test_frames_under_way_at_a_change_are_not_timed_where_none_tells_its_exposure() -> None:
+    library = TimedLibrary()
+    camera = GenICamCamera("fake plain", lambda: library, "Line1")
+    camera.start()
+    library.expose(2)
+    before = frames_of(camera, 2)
+    camera.configure(CameraSettings(exposure_us=1000.0))
+    library.expose(3)
+    under_way = frames_of(camera, 3)
+    after: list[Frame] = []
+    end = time.monotonic() + 10.0
+    while not (after and after[-1].is_timed) and time.monotonic() < end:
+        library.expose(1)
+        after += frames_of(camera, 1)
+    camera.close()
+    assert all(one.is_timed for one in before) and middles_us(before) == [1000.0, 1000.0]
+    # the shorter time: no arrival is earlier than the clock allows
+    assert not any(one.is_timed for one in under_way)
+    assert {one.exposure_ns for one in under_way} == {1_000_000}
+    assert after[-1].is_timed and middles_us(after[-1:]) == [500.0]
+
+
+def test_a_camera_that_tells_no_exposure_may_not_change_it_by_itself() -> None:
+    library = TimedLibrary(ExposureAuto="Continuous")
+    camera = GenICamCamera("fake auto", lambda: library, "Line1")
+    camera.start()
+    library.expose(1)
+    (frame,) = frames_of(camera, 1)
+    camera.close()
+    assert library.features["ExposureAuto"] == "Off" and not library.features["ChunkModeActive"]
+    assert frame.is_timed and middles_us([frame]) == [1000.0]
+
+
+@pytest.mark.parametrize(("height", "is_stated"), [(2, False), (1, True)])
+def test_a_part_of_the_sensor_is_stated_as_a_window(height: int, is_stated: bool) -> None:
+    library = Library()
+    library.features |= {"SensorWidth": 4, "SensorHeight": 2, "Height": height}
+    camera = GenICamCamera("fake window", lambda: library, "Line1")
+    assert camera.setup.window.is_stated == is_stated
     camera.close()
 
 

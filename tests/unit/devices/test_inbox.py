@@ -6,9 +6,11 @@ from __future__ import annotations
 import threading
 import time
 
+import numpy as np
 import pytest
 
-from armscan.devices.inbox import Inbox
+from armscan.devices.inbox import DeviceClock, FaultyLine, Inbox
+from armscan.devices.protocols import Frame
 from armscan.errors import DeviceError
 
 
@@ -62,3 +64,15 @@ def test_a_reader_that_waits_is_woken_by_an_element_a_fault_and_the_close() -> N
         except DeviceError as error:
             assert "gone" in str(error) or "closed" in str(error)
         assert time.monotonic() - start < 5.0
+
+
+@pytest.mark.parametrize("exposure_ns", [0, 2_000_000, 30_000_000])
+def test_a_played_frame_arrives_after_the_end_of_its_exposure(exposure_ns: int) -> None:
+    clock, rng = DeviceClock(0, 0.0, 0), np.random.default_rng(1)
+    line: FaultyLine[Frame] = FaultyLine("f", 4, clock, delay_ns=5_000, spread_ns=0, rng=rng)
+    line.open()
+    image = np.zeros((1, 1), np.uint8)
+    line.send(10**6, Frame(image, 0, 0, 0, exposure_ns=exposure_ns))
+    frame = line.inbox.take(1.0)
+    assert frame is not None and frame.t_device_ns == 10**6
+    assert frame.t_host_ns == 10**6 + exposure_ns // 2 + 5_000

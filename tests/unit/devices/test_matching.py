@@ -194,6 +194,46 @@ def test_poses_are_where_the_tool_truly_was():
     assert np.linalg.norm(errors, axis=1).max() < 0.01
 
 
+@pytest.mark.parametrize("spread_ns", [2e4, 1e5])
+@pytest.mark.parametrize("exposures_us", [(2000, 1000), (1000, 2000), (5000, 2500, 1250)])
+def test_a_new_exposure_time_moves_no_clock_and_costs_no_frame(exposures_us, spread_ns):
+    """A frame arrives 3 ms after the end of its exposure, and by chance a little later."""
+    rng = np.random.default_rng(5)
+    matcher = InstantMatcher(has_arm=False, has_controller=False)
+    off_ns = []
+    for k in range(2400):
+        # the last but one for five frames only, as of a control that is quick
+        step = 0 if k < 1200 else 1 if k < 1205 else -1
+        exposure_ns = 1000 * exposures_us[step]
+        middle_ns = 10**9 + 12_500_000 * k + exposure_ns // 2
+        host_ns = middle_ns + exposure_ns // 2 + 3_000_000 + round(spread_ns * rng.exponential())
+        frame = Frame(IMAGE, k, middle_ns + 10**14, host_ns, exposure_ns=exposure_ns)
+        matcher.add_frame(frame)
+        (one,) = matcher.take(10**18)
+        off_ns.append(None if one.t_ns is None else one.t_ns - middle_ns)
+    counts = matcher.cameras[0].counts
+    assert (counts.n_jumps, counts.n_doubtful) == (0, 0)
+    assert None not in off_ns[100:]
+    # the constant least delay alone, before the change and after it
+    assert np.abs(np.array(off_ns[100:]) - 3_000_000).max() < 40_000
+
+
+def test_a_frame_whose_middle_is_not_certain_has_no_time_and_tells_nothing_of_the_clock():
+    matcher = InstantMatcher(has_arm=False, has_controller=False)
+    for k in range(400):
+        is_timed = not 200 <= k < 220
+        middle_ns = 10**9 + 12_500_000 * k
+        # under way at a change: exposed for 2 ms longer than is told
+        host_ns = middle_ns + 3_000_000 + 2_000_000 * (not is_timed)
+        matcher.add_frame(Frame(IMAGE, k, middle_ns, host_ns, is_timed=is_timed))
+    instants = matcher.take(10**18)
+    assert [one.frames[0].number for one in instants if one.t_ns is None][-20:] == [
+        *range(200, 220)
+    ]
+    assert instants[399].t_ns == pytest.approx(10**9 + 12_500_000 * 399 + 3_000_000, abs=100)
+    assert matcher.cameras[0].counts.words == ""
+
+
 def test_trigger_ids_alone_decide_where_there_are_any():
     matcher = InstantMatcher(is_triggered=True)
     kinds = ("frame", "triggered", "event")
@@ -256,13 +296,26 @@ def test_lasers_without_ids_are_told_only_where_they_did_not_change():
     assert set(found[196:202]) == {None}
 
 
-def test_an_unreferenced_arm_gives_no_pose():
+@pytest.mark.parametrize("said", [ArmFlag.NONE, ArmFlag.REFERENCED | ArmFlag.INACCURATE])
+def test_an_arm_that_says_that_its_poses_are_not_right_gives_none(said):
     matcher = InstantMatcher(has_controller=False)
     for k in range(600):
         t = k * 5_000_000
-        flags = ArmFlag.NONE if 300 <= k < 400 else ArmFlag.REFERENCED
+        flags = said if 300 <= k < 400 else ArmFlag.REFERENCED
         matcher.add_samples((ArmSample(k, t, t + 10**6, pose=true_pose(t * 1e-9), flags=flags),))
         matcher.add_frame(Frame(IMAGE, k, t, t + 10**6))
     status = [one.status for one in matcher.take(10**12)]
     assert set(status[310:390]) == {PoseStatus.UNKNOWN_SAMPLE}
     assert set(status[410:590]) == {PoseStatus.FOUND}
+    assert matcher.arm.counts.n_inaccurate == 100 * (ArmFlag.INACCURATE in said)
+
+
+def test_poses_at_an_end_stop_are_used_and_counted():
+    matcher = InstantMatcher(has_controller=False)
+    for k in range(600):
+        t = k * 5_000_000
+        flags = ArmFlag.REFERENCED | (ArmFlag.END_STOP if k >= 590 else ArmFlag.NONE)
+        matcher.add_samples((ArmSample(k, t, t + 10**6, pose=true_pose(t * 1e-9), flags=flags),))
+        matcher.add_frame(Frame(IMAGE, k, t, t + 10**6))
+    assert {one.status for one in matcher.take(10**12)[-10:]} == {PoseStatus.FOUND}
+    assert matcher.arm.counts.words == "10 at an end stop of the arm"

@@ -220,6 +220,7 @@ def test_a_longer_exposure_is_brighter(bench: Bench) -> None:
     n = len(bench.frames)
     bench.until(lambda: len(bench.frames) >= n + 3)
     first, last = bench.frames[0].image, bench.frames[-1].image
+    assert bench.frames[0].exposure_ns > bench.frames[-1].exposure_ns == 250_000
     lit = first < 250
     assert 0.2 < last.astype(float).sum() / first.astype(float)[lit].sum() < 0.4
 

@@ -14,6 +14,7 @@ import pytest
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
+from armscan.errors import EstimationError, InputError
 from armscan.jobs.info import describe_recording
 from armscan.models.arm import forward, thesis_arm
 from armscan.pipeline.live.acquire import LiveEvent
@@ -23,9 +24,10 @@ from armscan.pipeline.live.session import LiveSession
 from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.reconstruction.sync import PoseStatus, exposure_poses
 from armscan.reconstruction.track_faults import check_track
-from armscan.records.recording import CameraSetup
-from armscan.storage.recording import read_recording
+from armscan.records.recording import LASER_UNKNOWN, CameraSetup
+from armscan.storage.recording import read_recording, write_recording
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording
+from armscan.storage.tables import read_csv
 from rigs.scan_fake import scanner
 from unit.live.test_session import ALL, Device, rig_of, triggered_scan, waited
 
@@ -205,7 +207,8 @@ def test_times_of_arrival_are_no_false_alarm_about_ids(tmp_path: Path) -> None:
     recorded = read_recording(tmp_path / "scan.mcap")
     poses = exposure_poses(recorded.rows, recorded.arm, recorded.session.clock)
     assert poses.has_pose.all() and not any("trigger id" in text for text in poses.warnings)
-    assert recorded.session.clock == "related" and recorded.warnings == ()
+    # they order, and place nothing
+    assert recorded.session.clock == "separate" and recorded.warnings == ()
 
 
 def test_frames_before_the_first_trigger_are_listed_and_get_no_pose(tmp_path: Path) -> None:
@@ -223,6 +226,63 @@ def test_frames_before_the_first_trigger_are_listed_and_get_no_pose(tmp_path: Pa
     poses = exposure_poses(recorded.rows, recorded.arm, recorded.session.clock)
     none, found = int(PoseStatus.NO_TRIGGER), int(PoseStatus.FOUND)
     assert poses.status.tolist() == [none, none, found, found, found]
+
+
+@pytest.mark.parametrize("has_none", ["frames", "samples"])
+def test_times_that_only_order_give_no_pose_where_no_id_is(tmp_path: Path, has_none: str) -> None:
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    for k in range(5):
+        of_frame = None if has_none == "frames" else k
+        of_sample = None if has_none == "samples" else k
+        # by arrival both tables span the same time
+        recorder.add_instant(instant(k, None, trigger_id=of_frame))
+        pose = triggered_scan(5).truth[k]
+        sample = ArmSample(k, 1, 5_000_000_000 + 10**7 * k, pose, trigger_id=of_sample)
+        recorder.add_samples((TimedSample(sample, None, ElementStatus.USABLE, pose),))
+    recorder.close()
+    recorded = read_recording(tmp_path / "scan.mcap")
+    lacking = "exposure" if has_none == "frames" else "sample of the arm"
+    with pytest.raises(InputError, match=f"no {lacking} bears a trigger id"):
+        exposure_poses(recorded.rows, recorded.arm, recorded.session.clock)
+    assert describe_recording(tmp_path / "scan.mcap")["exposures_with_pose"] == 0
+    # as armscan wrote it before
+    if has_none == "frames":
+        with pytest.raises(EstimationError, match="5 without trigger id"):
+            exposure_poses(recorded.rows, recorded.arm, "related")
+
+
+def test_images_whose_lasers_are_not_known_are_marked_and_counted(tmp_path: Path) -> None:
+    rig = small_rig(is_triggered=False)
+    rig.lasers = Device("lasers", [])
+    recorder = LiveRecorder(tmp_path / "scan.mcap", rig)
+    recorder.begin()
+    for k, lasers in enumerate((("A",), None, (), None)):
+        recorder.add_instant(replace(instant(k, 10**9 * (k + 1)), lasers=lasers))
+    recorder.add_instant(replace(instant(4, None), lasers=None))
+    recorder.close()
+    # the last has no time either: it is set aside, and counted there
+    assert (recorder.n_laser_unknown, recorder.n_aside) == (2, 1)
+    recorded = read_recording(tmp_path / "scan.mcap")
+    assert [row.flags for row in recorded.rows] == [(), (LASER_UNKNOWN,), (), (LASER_UNKNOWN,)]
+    assert [row.is_dark for row in recorded.rows] == [False, False, True, False]
+    assert describe_recording(tmp_path / "scan.mcap")["exposures_with_lasers_unknown"] == 2
+    write_recording(tmp_path / "again", recorded)
+    assert read_recording(tmp_path / "again").rows == recorded.rows
+
+
+def test_angles_that_an_arm_calls_inaccurate_are_gaps(tmp_path: Path) -> None:
+    rig = small_rig(is_triggered=False, form="joints")
+    recorder = LiveRecorder(tmp_path / "scan.mcap", rig)
+    recorder.begin()
+    said = (ArmFlag.REFERENCED, ArmFlag.NONE, ArmFlag.REFERENCED | ArmFlag.INACCURATE)
+    for k, flags in enumerate(said):
+        recorder.add_instant(instant(k, 10**9 * (k + 1)))
+        own = ArmSample(k, 1, 10**9 * (k + 1), joints_rad=np.full(7, 0.1 * k), flags=flags)
+        recorder.add_samples((TimedSample(own, own.t_host_ns, ElementStatus.USABLE, None),))
+    recorder.close()
+    table = read_csv(tmp_path / "scan.mcap" / "arm.csv")
+    assert [cell != "" for cell in table.columns["j1_rad"]] == [True, False, False]
 
 
 def test_joints_are_recorded_with_the_arm_s_document(tmp_path: Path) -> None:

@@ -51,8 +51,11 @@ def test_pairs_of_two_sizes_or_of_one_image_are_refused() -> None:
 def test_images_must_be_of_the_cameras_size_or_lie_on_its_sensor() -> None:
     check_sizes([image("a.png")], CAMERA)
     check_sizes([image("w.png", (10, 40), window=SensorWindow(0, 20))], CAMERA)
+    # a window in the corner, where somebody said that it is one
+    check_sizes([image("w.png", (10, 40), window=SensorWindow(0, 0))], CAMERA)
     for wrong in (
         image("small.png", (10, 40)),
+        image("small.png", (10, 40), window=SensorWindow(is_stated=False)),
         image("turned.png", (40, 30)),
         image("w.png", (10, 40), window=SensorWindow(0, 21)),
     ):

@@ -27,7 +27,7 @@ from armscan.pipeline.scan import (
 )
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.records.recording import Clock
+from armscan.records.recording import LASER_UNKNOWN, Clock
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.detection_cache import DetectionCache
 from armscan.vision.stripe.extract import extract_stripes
@@ -142,6 +142,32 @@ def test_without_names_of_lasers_all_are_taken_as_lit(device: ScannerCalibration
     result = measure_scan(as_source(scan), device, ScanOptions(has_normals=False))
     assert len(result.images) == 3
     assert any("no exposure names its lasers" in warning for warning in result.warnings)
+
+
+def test_an_image_whose_lasers_are_not_known_is_counted_and_not_measured(
+    device: ScannerCalibration,
+) -> None:
+    unknown: dict[str, object] = {"lasers": (), "flags": (LASER_UNKNOWN,)}
+    scan = with_rows(fake_scan(), [{}, unknown, {}, {"lasers": ()}, unknown, {}])
+    result = measure_scan(as_source(scan), device)
+    states = [one.status for one in result.exposures]
+    assert [k for k, one in enumerate(states) if one is ExposureStatus.PLACED] == [0, 2, 5]
+    assert [k for k, one in enumerate(states) if one is ExposureStatus.LASER_UNKNOWN] == [1, 4]
+    assert not set(scan.reads) & {1, 4}
+    (told,) = (text for text in result.warnings if "what laser was on is not known" in text)
+    assert told.startswith("2 of 6 images were not measured")
+
+
+def test_where_no_row_names_a_laser_a_row_of_unknown_lasers_makes_none_lit(
+    device: ScannerCalibration,
+) -> None:
+    dark: dict[str, object] = {"lasers": ()}
+    unknown: dict[str, object] = {**dark, "flags": (LASER_UNKNOWN,)}
+    scan = with_rows(fake_scan(), [unknown, dark, unknown, dark, unknown, dark])
+    with pytest.raises(EstimationError, match="no exposure with a pose could be measured"):
+        measure_scan(as_source(scan), device)
+    with pytest.raises(InputError, match="of none of 6 exposures is it known"):
+        measure_scan(as_source(with_rows(scan, [unknown] * 6)), device)
 
 
 def test_latency_shifts_the_points_along_the_sweep() -> None:

@@ -9,12 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from armscan.errors import ArmscanError, FileFormatError, OptionError
+from armscan.errors import ArmscanError, FileFormatError, InputError, OptionError
+from armscan.pipeline.instants import check_sizes
 from armscan.records.exposure import SensorWindow
 from armscan.records.recording import CameraSetup, Session
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.recording import read_recording
+from armscan.storage.recording import read_recording, write_recording
 from armscan.storage.recording_session import read_session_file, session_toml
+from rigs.plain_scanner import plain_camera
 from rigs.recording_folders import ARM, EXPOSURES, SESSION, lab_folder, pixels, refusal
 
 
@@ -210,6 +212,28 @@ def test_a_window_whose_place_nobody_said_is_noted(
     assumed = read_recording(folder).session.assumed
     said = "camera 0: 0.png with 5 x 4 px is a window at 0, 0 of the camera's 8 x 6 px; window_x_px"
     assert [text.startswith(said) for text in assumed] == [True] * is_noted
+
+
+@pytest.mark.parametrize(
+    ("window", "is_stated"),
+    [("", False), ("window_x_px = 0\n", False), ("window_x_px = 0\nwindow_y_px = 0\n", True)],
+)
+def test_a_window_in_the_corner_is_one_where_the_session_says_so(
+    tmp_path: Path, window: str, is_stated: bool
+) -> None:
+    folder = lab_folder(tmp_path, session=SESSION + window)
+    scan = read_recording(folder)
+    assert scan.exposure(1).window.is_stated == is_stated
+    write_recording(tmp_path / "again", scan)
+    again = read_recording(tmp_path / "again")
+    assert again.exposure(1).window.is_stated == is_stated and again.warnings == scan.warnings
+    # a larger sensor's corner, or another camera's whole image
+    sensor = plain_camera(10.0, (5.0, 4.0), (16, 12))
+    if is_stated:
+        check_sizes([again.exposure(1)], sensor)
+        return
+    with pytest.raises(InputError, match="window_x_px and window_y_px"):
+        check_sizes([again.exposure(1)], sensor)
 
 
 def test_high_aligned_bits_are_shifted_and_too_many_are_refused(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from armscan.devices.clocks import AT_END_STOP, INACCURATE
 from armscan.devices.registry import device_drivers, open_device
 from armscan.errors import DeviceError, OptionError, OutputError
 from armscan.jobs.live.recordings import SUFFIX
@@ -333,7 +334,7 @@ class _Recording:
             f"{seconds:5.0f} s",
             f"{status.n_accepted:,} exposures",
             f"{rate:.1f}/s",
-            f"lost {n_lost}, late {n_late}, not to be used {self._recorder.n_aside}",
+            f"lost {n_lost}, late {n_late}, not to be used {self._n_unusable}",
             f"{speed / 1e6:.0f} MB/s, {free / 1e9:,.0f} GB left{lasts}",
         ]
         if self._recorder.n_samples and not self._recorder.n_posed:
@@ -346,6 +347,11 @@ class _Recording:
         if shown.latency_ms is not None:
             words.append(f"{shown.latency_ms[0]:.0f} ms to the screen")
         return "  ".join(words)
+
+    @property
+    def _n_unusable(self) -> int:
+        """Exposures that are kept, and that no reader places or measures."""
+        return self._recorder.n_aside + self._recorder.n_laser_unknown
 
     def _losses(self) -> tuple[int, int]:
         """Elements of all streams that never came, and that came after newer ones."""
@@ -360,6 +366,15 @@ class _Recording:
         self._is_over |= event.is_final
         if (event.is_final or event.device in (MATCHING, RECORDER)) and not self._why_ended:
             self._why_ended = event.words
+
+    def _strained(self) -> list[str]:
+        """How many of the arm's samples it spoke against itself."""
+        counts = self._session.stream_counts
+        found = (
+            (sum(one.n_inaccurate for one in counts), INACCURATE),
+            (sum(one.n_end_stop for one in counts), AT_END_STOP),
+        )
+        return [f"{n} samples {what}" for n, what in found if n]
 
     def summary(self, scanner: Path | None) -> Summary:
         """What was written."""
@@ -405,6 +420,13 @@ class _Recording:
                 f"{self._recorder.n_untriggered} exposures bear no trigger's id, as those before "
                 "the first trigger: they are listed, and get no pose",
             )
+        if self._recorder.n_laser_unknown:
+            warnings.insert(
+                0,
+                f"of {self._recorder.n_laser_unknown} of {self._end.n_written} exposures it is not "
+                "known what lasers were on: they are listed, and not measured",
+            )
+        warnings = [*self._strained(), *warnings]
         if self._n_faults:
             warnings.insert(
                 0, f"devices failed {plural(self._n_faults, 'time')}; the recording says when"

@@ -6,16 +6,18 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from armscan.devices.clocks import ElementStatus, StreamMonitor
-from armscan.devices.matching import InstantMatcher, MatchedInstant, TimedSample
-from armscan.devices.protocols import ArmSample, Frame, LaserEvent
+from armscan.devices.matching import LASER_BOUND_NS, InstantMatcher, MatchedInstant, TimedSample
+from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
 from armscan.errors import ArmscanError, DeviceStoppedError
 from armscan.pipeline.live.rig import Rig, told_as_fault_of
 from armscan.records.exposure import Exposure
@@ -44,6 +46,27 @@ JUMPED = (
     "its clock jumped, or what it sends takes longer from now on; what is found by this clock's "
     "time is placed again when the clock is known anew"
 )
+
+WATCHED_NS = 2_000_000_000
+"""So long a stream may begin without ids, as before the first trigger."""
+FRAMES_WITHOUT = (
+    "none of its images bears a trigger's id, and the rig is said to have a common trigger: they "
+    "are kept and get no pose; let the camera tell the id, or leave is_common_trigger out"
+)
+SAMPLES_WITHOUT = (
+    "images bear triggers' ids, and none of its samples does: no image gets a pose; let the arm "
+    "send a sample with the id at each trigger, or leave is_common_trigger out"
+)
+LASERS_UNKNOWN = (
+    "what lasers were on is not known: the images bear no trigger's id, and the lasers change "
+    f"within {LASER_BOUND_NS / 1e6:g} ms; such images are kept and not measured: use a schedule "
+    "of one step, or fewer than 10 triggers a second"
+)
+STRAINED = {
+    ArmFlag.INACCURATE: "it says of itself that its poses are inaccurate: they are not used",
+    ArmFlag.END_STOP: "it is at an end stop: its poses are used, and may be worse than usual",
+}
+"""What an arm's own flags mean for its poses."""
 
 MOST_AHEAD = 16
 """Instants that wait where all are to be measured; further ones are recorded and not shown."""
@@ -124,6 +147,56 @@ class _Stream:
     seen_ns: int = 0
 
 
+class IdWatch:
+    """Looks at all that arrives and tells what will not be matched; called from one thread.
+
+    Parameters
+    ----------
+    is_triggered
+        True if ids alone decide which pose belongs to a frame.
+    has_controller
+        True if a laser controller tells what was on.
+    """
+
+    def __init__(self, *, is_triggered: bool, has_controller: bool) -> None:
+        self._is_triggered = is_triggered
+        self._has_controller = has_controller
+        self._begun_ns: dict[int, int] = {}
+        self._cameras_with_ids: set[int] = set()
+        self._triggered_ns: int | None = None
+        self._has_arm_ids = False
+        self._unknown_ns: int | None = None
+
+    def see_frame(self, frame: Frame, camera: int) -> str:
+        """What a person should know of this camera now; empty for nothing."""
+        begun_ns = self._begun_ns.setdefault(camera, frame.t_host_ns)
+        if frame.trigger_id is not None:
+            self._cameras_with_ids.add(camera)
+            if self._triggered_ns is None:
+                self._triggered_ns = frame.t_host_ns
+        is_without = self._is_triggered and camera not in self._cameras_with_ids
+        return FRAMES_WITHOUT if is_without and frame.t_host_ns > begun_ns + WATCHED_NS else ""
+
+    def see_samples(self, samples: Sequence[ArmSample]) -> str:
+        """The same of the arm."""
+        self._has_arm_ids |= any(one.trigger_id is not None for one in samples)
+        since_ns = self._triggered_ns
+        if not self._is_triggered or self._has_arm_ids or since_ns is None or not samples:
+            return ""
+        return SAMPLES_WITHOUT if samples[-1].t_host_ns > since_ns + WATCHED_NS else ""
+
+    def see_instant(self, instant: MatchedInstant) -> str:
+        """The same of the laser controller; what has no time yet tells nothing."""
+        if not self._has_controller or instant.trigger_id is not None or instant.t_ns is None:
+            return ""
+        if instant.lasers is not None:
+            self._unknown_ns = None
+            return ""
+        if self._unknown_ns is None:
+            self._unknown_ns = instant.t_ns
+        return LASERS_UNKNOWN if instant.t_ns > self._unknown_ns + WATCHED_NS else ""
+
+
 class Acquisition:
     """Reads a rig and hands out its instants in order; nothing that arrives is dropped.
 
@@ -164,6 +237,10 @@ class Acquisition:
             latency_ns=latency_ns,
             arm=rig.arm_model,
         )
+        self._watch = IdWatch(
+            is_triggered=rig.description.is_common_trigger and rig.arm is not None,
+            has_controller=rig.lasers is not None,
+        )
         self.faults: dict[tuple[str, int], str] = {}
         self._recording: _Recording | None = None
         self._deliver, self._tell = deliver, tell
@@ -184,7 +261,7 @@ class Acquisition:
         self._is_broken = threading.Event()
         self._threads: list[threading.Thread] = []
         self._buttons = 0
-        self._told_at: dict[str, float] = {}
+        self._told_at: dict[tuple[str, str], float] = {}
 
     def start(self) -> None:
         """Start the rig and the threads.
@@ -331,9 +408,10 @@ class Acquisition:
                 return
 
     def _warn(self, text: str, device: str = "") -> None:
-        """Tell of trouble, of the same now and then."""
-        if time.monotonic() > self._told_at.get(device, -TOLD_EVERY_S) + TOLD_EVERY_S:
-            self._told_at[device] = time.monotonic()
+        """Tell of trouble, of the same now and then; nothing where there is no text."""
+        same = device, text
+        if text and time.monotonic() > self._told_at.get(same, -TOLD_EVERY_S) + TOLD_EVERY_S:
+            self._told_at[same] = time.monotonic()
             self._tell(LiveEvent("warning", text, device))
 
     def _match(self) -> None:
@@ -372,10 +450,13 @@ class Acquisition:
         if what == "frame":
             status = self.matcher.add_frame(found, k)
             self._record(lambda recorder: recorder.add_frame(k, found, status))
+            self._warn(self._watch.see_frame(found, k), device.name)
         elif what == "samples":
             samples = self.matcher.add_samples(found)
             self._record(lambda recorder: recorder.add_samples(samples))
             self._press(found)
+            self._warn_of_strain(found, device.name)
+            self._warn(self._watch.see_samples(found), device.name)
         else:
             self.matcher.add_events(found)
             self._record(lambda recorder: recorder.add_events(found))
@@ -384,10 +465,19 @@ class Acquisition:
         last = found[-1] if isinstance(found, tuple) else found
         stream.seen_ns = max(stream.seen_ns, last.t_host_ns)
 
+    def _warn_of_strain(self, samples: tuple[ArmSample, ...], arm: str) -> None:
+        """Tell of what the arm says against its own poses, while somebody holds it."""
+        flags = reduce(or_, (sample.flags for sample in samples), ArmFlag.NONE)
+        for flag, text in STRAINED.items():
+            if flag in flags:
+                self._warn(text, arm)
+
     def _hand_out(self, seen_ns: int) -> None:
         for instant in self.matcher.take(seen_ns):
             self._deliver(instant)
             self._record_instant(instant)
+            if self.rig.lasers is not None:
+                self._warn(self._watch.see_instant(instant), self.rig.lasers.name)
 
     def _record_instant(self, instant: MatchedInstant) -> None:
         self._record(lambda recorder: recorder.add_instant(instant))

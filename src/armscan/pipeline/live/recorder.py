@@ -15,12 +15,20 @@ import numpy as np
 
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample
-from armscan.devices.protocols import ArmFlag, Frame, LaserEvent
+from armscan.devices.protocols import Frame, LaserEvent
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray
 from armscan.pipeline.live.acquire import LiveEvent
 from armscan.pipeline.live.rig import Rig
-from armscan.records.recording import NO_TRIGGER, ArmTrack, ExposureRow, PoseForm, Session
+from armscan.records.recording import (
+    LASER_UNKNOWN,
+    NO_TRIGGER,
+    UNTRIGGERED,
+    ArmTrack,
+    ExposureRow,
+    PoseForm,
+    Session,
+)
 from armscan.storage.arm import ARM_MODEL_FILE, arm_model_toml
 from armscan.storage.recordings.mcap_folder import TAKEN_BACK
 from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions, WriterStatus
@@ -33,10 +41,11 @@ _REPEATED = (ElementStatus.DUPLICATE, ElementStatus.LATE)
 class LiveRecorder:
     """Writes a rig's streams to an MCAP file; see `armscan.pipeline.live.acquire.Recorder`.
 
-    All times of the tables are this computer's; where ids of triggers decide, those of samples may
-    only order them. A frame that no table may place is written with
-    its pixels, its flag (``incomplete``, ``no-time``, ``late``, ``back``) and the time of the frame
-    before it, 0 for the first: whoever reads the recording sets it aside, and counts it.
+    All times of the tables are this computer's; where ids of triggers decide they only order, and
+    the recording says that its clocks are separate: nothing is placed by them. A frame that no
+    table may place is written with its pixels, its flag (``incomplete``, ``no-time``, ``late``,
+    ``back``) and the time of the frame before it, 0 for the first: whoever reads the recording sets
+    it aside, and counts it.
 
     Parameters
     ----------
@@ -54,12 +63,14 @@ class LiveRecorder:
     n_untriggered
         Frames without a trigger's id where ids decide, as before the first trigger: they are
         listed, and get no pose.
+    n_laser_unknown
+        Frames of which it is not known what lasers were on: they are listed, and not measured.
     n_samples, n_posed
         Samples of the arm, and those of them that tell where it was.
     """
 
     def __init__(self, path: Path, rig: Rig, *, options: WriterOptions | None = None) -> None:
-        self.n_aside = self.n_untriggered = 0
+        self.n_aside = self.n_untriggered = self.n_laser_unknown = 0
         self.n_samples = self.n_posed = 0
         self._writer = RecordingWriter(path, options)
         self._rig, self._is_triggered = rig, rig.description.is_common_trigger
@@ -68,7 +79,7 @@ class LiveRecorder:
         self._session = Session(
             "scan",
             tuple(camera.setup for camera in rig.cameras),
-            clock="related",
+            clock="separate" if self._is_triggered else "related",
             pose_form=self._form,
             is_simulated=rig.is_simulated,
         )
@@ -140,6 +151,7 @@ class LiveRecorder:
             "number": frame.number,
             "t_device_ns": frame.t_device_ns,
             "t_host_ns": frame.t_host_ns,
+            "exposure_ns": frame.exposure_ns,
             "status": status.label,
             "trigger_id": frame.trigger_id,
         }
@@ -176,12 +188,13 @@ class LiveRecorder:
             t_ns = frame.t_host_ns if instant.t_ns is None and may_guess else instant.t_ns
             flags = [] if frame.is_complete else ["incomplete"]
             flags += ["no-time"] if t_ns is None else []
-            if self._is_triggered and frame.trigger_id is None:
-                flags.append("no-trigger")
-                self.n_untriggered += 1
-            is_unknown = instant.lasers is None and self._rig.lasers is not None
-            flags += ["laser-unknown"] if is_unknown else []
             is_usable = frame.is_complete and t_ns is not None
+            if self._is_triggered and frame.trigger_id is None:
+                flags.append(UNTRIGGERED)
+                self.n_untriggered += 1
+            if instant.lasers is None and self._rig.lasers is not None:
+                flags.append(LASER_UNKNOWN)
+                self.n_laser_unknown += is_usable
             self._add(camera, frame, t_ns if is_usable else None, instant.lasers or (), flags)
 
     def _add(
@@ -276,7 +289,7 @@ class LiveRecorder:
         """Whether the table tells where the arm was, to whoever has its document."""
         if self._form != "joints":
             return one.pose is not None
-        return one.sample.joints_rad is not None and ArmFlag.REFERENCED in one.sample.flags
+        return one.sample.joints_rad is not None and one.sample.is_valid
 
     def _joints(self, samples: Sequence[TimedSample]) -> FloatArray | None:
         """(N, J) angles as delivered, NaN where they are not valid; None where none are given."""
@@ -287,6 +300,6 @@ class LiveRecorder:
             return None
         angles = np.full((len(samples), n_joints), np.nan)
         for k, (one, own) in enumerate(zip(samples, given, strict=True)):
-            if own is not None and ArmFlag.REFERENCED in one.sample.flags:
+            if own is not None and one.sample.is_valid:
                 angles[k, : len(own)] = own
         return angles

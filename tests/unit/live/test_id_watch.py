@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What will not be matched, and what an arm says against its poses, is told while it arrives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from armscan.devices.matching import MatchedInstant
+from armscan.devices.protocols import ArmFlag, ArmSample, Frame
+from armscan.pipeline.live.acquire import (
+    FRAMES_WITHOUT,
+    LASERS_UNKNOWN,
+    SAMPLES_WITHOUT,
+    WATCHED_NS,
+    IdWatch,
+)
+from armscan.pipeline.live.rig import Rig, RigDescription
+from armscan.pipeline.live.session import LiveSession
+from armscan.reconstruction.sync import PoseStatus
+from unit.live.test_session import ALL, Device, waited
+
+IMAGE = np.zeros((1, 1), np.uint8)
+STEP_NS = 500_000_000
+
+
+def frame(k: int, trigger_id: int | None) -> Frame:
+    return Frame(IMAGE, k, STEP_NS * k, STEP_NS * k, trigger_id=trigger_id)
+
+
+def sample(k: int, trigger_id: int | None) -> ArmSample:
+    return ArmSample(k, STEP_NS * k, STEP_NS * k, trigger_id=trigger_id)
+
+
+def test_a_camera_without_ids_is_told_of_where_ids_decide() -> None:
+    watch = IdWatch(is_triggered=True, has_controller=False)
+    told = [watch.see_frame(frame(k, None), 0) for k in range(7)]
+    n_quiet = WATCHED_NS // STEP_NS + 1
+    assert told == [""] * n_quiet + [FRAMES_WITHOUT] * (7 - n_quiet)
+    # the other camera may bear them
+    assert watch.see_frame(frame(9, 4), 1) == ""
+    assert watch.see_frame(frame(10, None), 0) == FRAMES_WITHOUT
+    free = IdWatch(is_triggered=False, has_controller=False)
+    assert not any(free.see_frame(frame(k, None), 0) for k in range(20))
+
+
+def test_frames_before_the_first_trigger_are_no_news() -> None:
+    watch = IdWatch(is_triggered=True, has_controller=False)
+    assert not any(watch.see_frame(frame(k, None if k < 3 else k), 0) for k in range(20))
+
+
+def test_an_arm_without_ids_is_told_of_once_images_bear_some() -> None:
+    watch = IdWatch(is_triggered=True, has_controller=False)
+    assert not any(watch.see_samples([sample(k, None)]) for k in range(20))
+    watch.see_frame(frame(20, 1), 0)
+    assert watch.see_samples([sample(21, None)]) == ""
+    assert watch.see_samples([sample(25, None)]) == SAMPLES_WITHOUT
+    assert watch.see_samples([sample(26, None), sample(26, 7)]) == ""
+    assert watch.see_samples([sample(40, None)]) == ""
+
+
+def test_lasers_that_are_never_known_are_told_of() -> None:
+    watch = IdWatch(is_triggered=False, has_controller=True)
+
+    def see(k: int, **changes: Any) -> str:
+        one = MatchedInstant((frame(k, None),), STEP_NS * k, None, None, None, PoseStatus.GAP)
+        return watch.see_instant(replace(one, **changes))
+
+    # no time is known yet
+    assert not any(see(k, t_ns=None) for k in range(20))
+    assert [see(k) for k in range(20, 26)] == [""] * 5 + [LASERS_UNKNOWN]
+    assert see(26, lasers=("A",)) == "" and see(27) == ""
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (ArmFlag.REFERENCED, ()),
+        (ArmFlag.REFERENCED | ArmFlag.INACCURATE, ("its poses are inaccurate",)),
+        (ArmFlag.REFERENCED | ArmFlag.END_STOP, ("it is at an end stop",)),
+        (
+            ArmFlag.REFERENCED | ArmFlag.END_STOP | ArmFlag.INACCURATE,
+            ("its poses are inaccurate", "it is at an end stop"),
+        ),
+    ],
+)
+def test_what_an_arm_says_against_its_poses_is_told(flags: ArmFlag, said: tuple[str, ...]) -> None:
+    arm = Device("arm", [(replace(sample(k, None), flags=flags),) for k in range(6)])
+    rig: Any = Rig([Device("camera 0", [])], arm, None, RigDescription(("c",)))  # type: ignore[list-item, arg-type]
+    session = LiveSession(rig, options=ALL)
+    told: list[Any] = []
+    session.add_listener(told.append)
+    session.open()
+    waited(lambda: session.stream_counts[1].n_elements == 6)
+    session.stop()
+    warned = [event.words for event in told if event.kind == "warning"]
+    assert len(warned) == len(said)
+    for text, part in zip(warned, said, strict=True):
+        assert part in text and text.startswith("arm: ")

@@ -600,7 +600,7 @@ def found_features(run: FollowedRecipe) -> tuple[FoundFeature, ...]:
             kind=one.shape.kind,
             point_mm=one.shape.point_mm,
             direction=one.shape.direction,
-            form_mm=one.fitted.value("range_mm"),
+            form_mm=one.form_mm,
             n_points=one.counts.n_feature,
         )
         for name, one in run.features.items()

@@ -156,6 +156,29 @@ def test_a_plane_against_a_probed_plate(
     assert nominal["counted_from"] == "the plane of plate.csv"
 
 
+def test_the_offset_from_a_badly_touched_plate_is_as_uncertain_as_the_plate(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Six touches that scatter by 0.22 mm tell no height to 0.005 mm."""
+    plate, exact = tmp_path / "plate.csv", tmp_path / "plane.csv"
+    heights = (0.25, -0.2, -0.25, 0.2, 0.2, -0.2)
+    corners = [(x, y) for x in (-20, 5, 30) for y in (0, 40)]
+    rows = "".join(f"{x},{y},{z}\n" for (x, y), z in zip(corners, heights, strict=True))
+    plate.write_text("x_mm,y_mm,z_mm\n" + rows)
+    exact.write_text("A,B,C,D\n0,0,1,0\n")
+    words = ("plane", clouds / "block.ply", "--region=-50,50,-50,50,-1,1")
+    found = report(capsys, *words, "--plate", plate)
+    nominal = found["nominal"]
+    assert isinstance(nominal, dict)
+    # over the middle of the touches: their scatter, 0.22 mm, over the root of six of them
+    assert 0.07 < nominal["offset_sigma_plate_mm"] < 0.15
+    assert nominal["offset"]["sigma_mm"] >= nominal["offset_sigma_plate_mm"]
+    assert nominal["offset_u_mm"] == pytest.approx(2.0 * nominal["offset"]["sigma_mm"])
+    for option, value, is_told in (("--plate", exact, True), ("--plane", "0,0,1,0", False)):
+        assert main(["inspect", *(str(word) for word in words), option, str(value)]) == 0
+        assert ("without the plate's own uncertainty" in capsys.readouterr().out) == is_told
+
+
 def test_what_cannot_be_inspected_gets_one_sentence(
     clouds: Path, tmp_path: Path, fails: Fails
 ) -> None:

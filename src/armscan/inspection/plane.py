@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -38,6 +39,7 @@ def inspect_plane(
     cloud: PointCloud,
     reference: Plane | None = None,
     *,
+    reference_covariance: FloatArray | None = None,
     reference_text: str = "the given plane",
     region: Box | None = None,
     options: InspectionOptions | None = None,
@@ -51,6 +53,9 @@ def inspect_plane(
     reference
         The plane to be met, in the same frame; without it the plane that most points of several
         stripes lie near is looked for, and only the fitted reference is reported.
+    reference_covariance
+        (3, 3) what it errs itself, of `armscan.geometry.shapes.PLANE_PARAMETERS` (rad, rad, mm) at
+        its point, as of a probed plate; zeros where it is exact, None where that is not known.
     reference_text
         Where it came from, for the definitions.
     region
@@ -91,7 +96,25 @@ def inspect_plane(
             f"{np.abs(start.distance_mm(points)).min():.3g} mm away",
             "check the plane, its frame and its unit (mm), or widen --feature-mm",
         )
-    return _inspected(selection, is_near, start, reference, reference_text)
+    found = _inspected(selection, is_near, start, reference, reference_text)
+    if reference_covariance is None or isinstance(found, FitFailure):
+        return found
+    return with_reference_errors(found, reference_covariance)
+
+
+def with_reference_errors(found: PlaneInspection, covariance: FloatArray) -> PlaneInspection:
+    """The same with what the reference errs itself in the offset's standard deviations.
+
+    ``covariance`` is as ``reference_covariance`` of `inspect_plane`. Without a reference nothing
+    changes.
+    """
+    reference, offset = found.reference, found.offset
+    if reference is None or offset is None:
+        return found
+    along = reference.axes[:2] @ (found.plane.point_mm - reference.point_mm)
+    slope = np.append(along, 1.0)
+    own_mm = math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+    return replace(found, offset=offset.with_independent(own_mm), reference_sigma_mm=own_mm)
 
 
 def _search(points: FloatArray, middle: FloatArray, stripe: IntArray | None) -> Plane | FitFailure:

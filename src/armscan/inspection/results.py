@@ -127,6 +127,13 @@ class MeasuredLength:
             return self.sigma_propagated_mm
         return self.sigma_scatter_mm
 
+    def with_independent(self, sigma_mm: float) -> MeasuredLength:
+        """The same less or plus a length that errs by itself, by a standard deviation in mm."""
+        scatter, propagated = (
+            math.hypot(one, sigma_mm) for one in (self.sigma_scatter_mm, self.sigma_propagated_mm)
+        )
+        return MeasuredLength(self.value_mm, scatter, propagated)
+
 
 class PlaneInspection(ArrayRecord):
     """A flat face.
@@ -140,7 +147,11 @@ class PlaneInspection(ArrayRecord):
     is_fitted
         (N,) True for those that the fit used.
     offset
-        Height of ``plane`` over ``reference`` at the middle of the points; None without one.
+        Height of ``plane`` over ``reference`` at the middle of the points, with what the reference
+        itself errs there as far as that is known; None without one.
+    reference_sigma_mm
+        Standard deviation of the reference's own height there; 0 where it is exact, NaN where that
+        is not known, or without one.
     tilt_mrad
         Angle between the two; NaN without a reference.
     side_text
@@ -160,6 +171,7 @@ class PlaneInspection(ArrayRecord):
     tilt_mrad: float
     side_text: str
     n_beyond: int
+    reference_sigma_mm: float = math.nan
 
 
 class SphereInspection(ArrayRecord):
@@ -219,8 +231,13 @@ class StepInspection(ArrayRecord):
         Heights of the upper face's points over the fitted lower plane, minus the nominal height.
     heights_mm
         (U,) the same heights themselves (figure 5.19).
+    normal_rule
+        Where the normal came from, in words.
     scatter_mm
         What neighbouring points scatter by off the faces that they make; NaN where not known.
+    is_lean_assumed
+        True where all points lie in one light sheet and nobody gave the normal of the faces: the
+        sheet is taken to stand square, so that no standard deviation of the height is known.
     """
 
     lower: IntArray = ints(None)
@@ -234,6 +251,7 @@ class StepInspection(ArrayRecord):
     heights_mm: FloatArray = floats(None)
     normal_rule: str
     scatter_mm: float = math.nan
+    is_lean_assumed: bool = False
 
 
 WITHIN_MM = (0.03, 0.05, 0.08)

@@ -26,7 +26,12 @@ from armscan.inspection.conformity import (
     check_spread,
     worst,
 )
-from armscan.inspection.plane import OFFSET_OF_PLANE, inspect_plane, linearised_plane
+from armscan.inspection.plane import (
+    OFFSET_OF_PLANE,
+    inspect_plane,
+    linearised_plane,
+    with_reference_errors,
+)
 from armscan.inspection.results import MeasuredLength, PlaneInspection, SphereInspection
 from armscan.inspection.selection import InspectionOptions
 from armscan.inspection.sphere import DIAMETER_OF_SPHERE, inspect_sphere, linearised_sphere
@@ -181,8 +186,11 @@ def verify_on_plate(
         by_place=np.zeros((len(used), 0)),
         by_standard=distance_by_plate(plate, points),
     )
-    u = max(options.reference_u_mm, COVERAGE * _plate_sigma_mm(plate, found))
-    unknown = () if plate.covariance is not None else ("the plate's own uncertainty is not known",)
+    told, u, unknown = found, options.reference_u_mm, ("the plate's own uncertainty is not known",)
+    if plate.covariance is not None:
+        # not in the offset of the check, whose U holds it beside what the scan scatters by
+        told = with_reference_errors(found, plate.covariance)
+        u = max(u, COVERAGE * told.reference_sigma_mm)
     return _judged(
         _Evidence(
             measured,
@@ -193,11 +201,11 @@ def verify_on_plate(
             standard,
             region,
         ),
-        found,
+        told,
         ("height", "of the scanned plane over the probed one, at the middle of the points"),
         offset.value_mm,
         replace(options, reference_u_mm=u),
-        warnings=unknown,
+        warnings=() if plate.covariance is not None else unknown,
     )
 
 
@@ -295,8 +303,3 @@ def _scan_sigma_mm(length: MeasuredLength) -> float:
     if math.isfinite(length.sigma_scatter_mm):
         return length.sigma_scatter_mm
     return length.sigma_propagated_mm
-
-
-def _plate_sigma_mm(plate: PlateReference, found: PlaneInspection) -> float:
-    """Standard deviation of the probed plane's height at the middle of the scanned points."""
-    return float(np.linalg.norm(distance_by_plate(plate, found.plane.point_mm[None, :])))

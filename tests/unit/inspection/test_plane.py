@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.shapes import Plane, plane_from_coefficients
-from armscan.inspection.plane import inspect_plane
+from armscan.geometry.shapes import Plane, fit_plane, plane_from_coefficients
+from armscan.inspection.plane import inspect_plane, with_reference_errors
 from armscan.inspection.results import PlaneInspection
 from armscan.inspection.selection import InspectionOptions, standings
 from armscan.records.cloud import FUSED
@@ -120,6 +120,52 @@ def test_moving_points_and_reference_changes_nothing() -> None:
             assert found.fitted.value(key) == pytest.approx(still.fitted.value(key), abs=1e-9)
         assert found.offset.value_mm == pytest.approx(still.offset.value_mm, abs=1e-9)
         assert found.tilt_mrad == pytest.approx(still.tilt_mrad, abs=1e-6)
+
+
+def test_the_sigma_of_an_offset_holds_what_touches_of_the_plate_err() -> None:
+    """Touches of 0.05 mm on one end of a face that was scanned at the other, 200 times.
+
+    The scan errs by a hundredth of that. The plate's tilts count over the 40 mm between.
+    """
+    rng = np.random.default_rng(0)
+    touched = np.array([[x, y, 0.0] for x in (0.0, 10.0, 20.0) for y in (0.0, 30.0)])
+    up = np.tile([0.0, 0.0, 1.0], (200, 1))
+    scanned = GRID + [50.0, 5.0, 0.0] + rng.normal(0.0, 0.001, (200, 1)) * up
+    exposure = np.arange(200) // 20
+    cloud = cloud_of(scanned, exposure, sigma_mm=1e-4, noise_mm=0.001, noise_along=up)
+    offsets, sigmas = [], []
+    for _ in range(200):
+        probed = fit_plane(touched + rng.normal(0.0, 0.05, (6, 1)) * [0.0, 0.0, 1.0])
+        assert not isinstance(probed, FitFailure)
+        bare = inspected(inspect_plane(cloud, probed.value))
+        found = with_reference_errors(bare, probed.covariance)
+        assert bare.offset is not None
+        assert found.offset is not None
+        assert bare.offset.sigma_mm < 0.001
+        assert np.isnan(bare.reference_sigma_mm)
+        offsets.append(found.offset.value_mm)
+        sigmas.append(found.offset.sigma_mm)
+        assert found.offset.sigma_mm == pytest.approx(
+            np.hypot(bare.offset.sigma_mm, found.reference_sigma_mm)
+        )
+    # rms of 200 draws, 5 % by chance; each sigma rests on three degrees of freedom
+    rms = np.sqrt(np.mean(np.square(offsets)))
+    assert np.sqrt(np.mean(np.square(sigmas))) == pytest.approx(rms, rel=0.2)
+
+
+def test_the_page_says_whether_the_plate_counts() -> None:
+    cloud = cloud_of(GRID)
+    reference = given_plane(0.0, 0.0, 1.0, -0.02)
+    touches = np.diag([0.0, 0.0, 0.03**2])
+    texts = {"exact": np.zeros((3, 3)), "probed": touches, "unknown": None}
+    shown = {}
+    for name, covariance in texts.items():
+        found = inspected(inspect_plane(cloud, reference, reference_covariance=covariance))
+        told = {one.key: one for one in plane_report(found, cloud).quantities}
+        shown[name] = told["nominal.offset"].meaning
+    assert "plate" not in shown["exact"]
+    assert "± holds 0.030 mm of the plate itself" in shown["probed"]
+    assert "without the plate's own uncertainty" in shown["unknown"]
 
 
 def test_the_largest_of_several_faces_is_found_without_a_reference() -> None:

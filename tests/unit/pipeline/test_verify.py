@@ -13,6 +13,8 @@ from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Points, Pose
 from armscan.geometry.shapes import Plane
+from armscan.inspection.plane import inspect_plane
+from armscan.inspection.results import PlaneInspection
 from armscan.models.calibration import ScannerCalibration
 from armscan.models.camera import CameraModel
 from armscan.pipeline.scan import ScanOptions, ScanReconstruction, measure_scan
@@ -124,6 +126,18 @@ def test_a_head_that_has_moved_on_a_plate(
     # looking straight down, a shift along the normal is the hand-eye's own sigma along it
     assert place.predicted == pytest.approx(0.015, rel=0.6)
     assert correction.unit == "sigma"
+    # the page's offset holds what the plate errs there, as the check's U does beside the scatter
+    told, bare = found.found, inspect_plane(scan.cloud, PLATE.plane)
+    assert isinstance(told, PlaneInspection)
+    assert isinstance(bare, PlaneInspection)
+    assert told.offset is not None
+    assert bare.offset is not None
+    assert told.reference_sigma_mm >= 0.002
+    both = np.hypot(bare.offset.sigma_mm, told.reference_sigma_mm)
+    assert told.offset.sigma_mm == pytest.approx(both)
+    assert place.uncertainty == pytest.approx(
+        2.0 * np.hypot(bare.offset.sigma_scatter_mm, told.reference_sigma_mm)
+    )
     given = verify_on_plate(Measured(scan.cloud), PLATE, VerifyOptions(mpe_mm=1.0))
     assert given.checks[0].verdict == "still valid"
     assert any("independent between blocks of exposures" in text for text in given.warnings)

@@ -22,7 +22,7 @@ from armscan.calibration.hand_eye.probed_plate import (
 from armscan.errors import OptionError
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.features import SHAPE_KINDS
-from armscan.geometry.shapes import Plane, plane_from_coefficients
+from armscan.geometry.shapes import plane_from_coefficients
 from armscan.inspection.features import inspect_feature as feature_of
 from armscan.inspection.features import relate
 from armscan.inspection.plane import inspect_plane as plane_of
@@ -71,7 +71,14 @@ def inspect_plane(
     box, source = region_of(region), read_cloud_file(path)
     cloud = source.cloud
     reference, text, weak = _reference(cloud, plane, plate, side)
-    found = plane_of(cloud, reference, reference_text=text, region=box, options=options)
+    found = plane_of(
+        cloud,
+        None if reference is None else reference.plane,
+        reference_covariance=None if reference is None else reference.covariance,
+        reference_text=text,
+        region=box,
+        options=options,
+    )
     report = plane_report(solved(found, path), cloud)
     weak = (*source.remarks, *weak, *_flat_by_itself(cloud))
     report = replace(report, warnings=(*weak, *report.warnings))
@@ -192,19 +199,23 @@ def _normal(values: Sequence[float]) -> FloatArray:
 
 def _reference(
     cloud: PointCloud, plane: str, plate: Path | None, side: ProbeSide | None
-) -> tuple[Plane | None, str, tuple[str, ...]]:
-    """The nominal plane, where it came from, and what is weak about it."""
+) -> tuple[PlateReference | None, str, tuple[str, ...]]:
+    """The nominal plane, where it came from, and what is weak about it.
+
+    A plane that is given in words is exact by definition.
+    """
     if plane and plate is not None:
         raise OptionError("both --plane and --plate are given", remedy="give one of them")
     if side is not None and plate is None:
         raise OptionError("a side needs a plate", where="--side", remedy="give --plate")
     middle = cloud.points_mm.mean(axis=0) if len(cloud) else np.zeros(3)
     if plane:
-        return plane_from_coefficients(parse_plane(plane, "--plane"), middle), "the given plane", ()
+        given = plane_from_coefficients(parse_plane(plane, "--plane"), middle)
+        return PlateReference(plane=given, covariance=np.zeros((3, 3))), "the given plane", ()
     if plate is None:
         return None, "", ()
     probed, weak = read_plate(plate, middle, side=side)
-    return probed.plane, f"the plane of {plate.name}", weak
+    return probed, f"the plane of {plate.name}", weak
 
 
 def finished_inspection(

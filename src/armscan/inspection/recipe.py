@@ -26,7 +26,17 @@ from armscan.inspection.cad.comparison import (
 from armscan.inspection.cad.datums import Datums, align
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cleaning import Cleaning, CleaningOptions, clean_cloud
-from armscan.inspection.conformity import COVERAGE, judge
+from armscan.inspection.conformity import (
+    COVERAGE,
+    arc_warnings,
+    face_warnings,
+    judge,
+    lean_warnings,
+    outlier_warnings,
+    seed_warnings,
+    shape_warnings,
+    sigma_warnings,
+)
 from armscan.inspection.features import (
     FeatureInspection,
     inspect_feature,
@@ -91,13 +101,15 @@ class RecipeRelation:
 class RecipeStep:
     """A step between parallel faces, as `armscan.inspection.step.inspect_step` measures it.
 
-    ``tolerance_mm`` is NaN for none; ``region`` in the model's frame, None for the whole cloud.
+    ``tolerance_mm`` is NaN for none; ``region`` in the model's frame, None for the whole cloud;
+    ``normal`` of the faces in that frame, for points of one light sheet, None where nobody says it.
     """
 
     name: str
     height_mm: float
     tolerance_mm: float = math.nan
     region: Box | None = None
+    normal: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,7 +206,8 @@ class FollowedRecipe:
         Each value: features, relations and steps as in the recipe, then the faces that have a
         tolerance.
     notes
-        What was not found, and why.
+        What was not found, and why, and what is weak about what was: a feature that may be of
+        another shape, and what rests on it, does not pass.
     """
 
     cloud: PointCloud
@@ -230,26 +243,33 @@ def follow_recipe(recipe: Recipe, cloud: PointCloud) -> FollowedRecipe | FitFail
             return found
         comparison, placed = found, placed_cloud(cleaned, alignment.cad_from_part)
     features: dict[str, FeatureInspection] = {}
-    quantities, notes = [], []
+    quantities: list[PartQuantity] = []
+    doubted: set[str] = set()
+    notes = list(sigma_warnings(placed)) if recipe.features or recipe.steps else []
     for one in recipe.features:
         feature = _feature(placed, one, comparison)
         if isinstance(feature, FitFailure):
             notes.append(f"{one.name}: {feature.reason}")
         else:
             features[one.name] = feature
-        quantities.append(feature_value(one, features.get(one.name)))
+            notes += [f"{one.name}: {text}" for text in _weak(feature, placed)]
+            if shape_warnings(feature, placed, feature.shape.kind):
+                doubted.add(one.name)
+        told = [feature_value(one, features.get(one.name))]
         if math.isfinite(one.form_tolerance):
-            quantities.append(_form_value(one, features.get(one.name), placed))
+            told.append(_form_value(one, features.get(one.name), placed))
+        quantities += [_at_best_undecided(each) if one.name in doubted else each for each in told]
     for relation in recipe.relations:
         found_value = _relation_value(placed, relation, features)
         if isinstance(found_value, FitFailure):
             notes.append(f"{relation.name}: {found_value.reason}")
-        quantities.append(_judged(relation, found_value))
+        judged = _judged(relation, found_value)
+        is_doubted = not doubted.isdisjoint(relation.of)
+        quantities.append(_at_best_undecided(judged) if is_doubted else judged)
     for step in recipe.steps:
-        height = _step_value(placed, step)
-        if isinstance(height, FitFailure):
-            notes.append(f"{step.name}: {height.reason}")
-        quantities.append(_judged_step(step, height))
+        judged, texts = _step_value(placed, step)
+        notes += [f"{step.name}: {text}" for text in texts]
+        quantities.append(judged)
     faces = () if comparison is None else comparison.faces
     return FollowedRecipe(
         cloud=cleaned,
@@ -261,6 +281,21 @@ def follow_recipe(recipe: Recipe, cloud: PointCloud) -> FollowedRecipe | FitFail
         quantities=(*quantities, *(value for face in faces for value in face_values(face))),
         notes=tuple(notes),
     )
+
+
+def _weak(found: FeatureInspection, cloud: PointCloud) -> tuple[str, ...]:
+    """What the report of a feature alone warns of."""
+    return (
+        *outlier_warnings(found.counts),
+        *seed_warnings(found, cloud),
+        *shape_warnings(found, cloud, found.shape.kind),
+        *arc_warnings(found),
+    )
+
+
+def _at_best_undecided(one: PartQuantity) -> PartQuantity:
+    """The value of what may be another shape: within its limits it says nothing."""
+    return replace(one, decision="undecided") if one.decision == "pass" else one
 
 
 def placed_cloud(cloud: PointCloud, pose: Pose[Cad, Part]) -> PointCloud:
@@ -383,20 +418,22 @@ def _judged(one: RecipeRelation, found: tuple[float, float] | FitFailure) -> Par
     return _quantity(one.name, one.unit, measured, limits, is_seen=is_seen)
 
 
-def _step_value(cloud: PointCloud, one: RecipeStep) -> tuple[float, float] | FitFailure:
+def _step_value(cloud: PointCloud, one: RecipeStep) -> tuple[PartQuantity, tuple[str, ...]]:
+    """The height of a step with its decision, and what is weak about it or why there is none."""
+    normal = None if one.normal is None else np.asarray(one.normal, dtype=np.float64)
     try:
-        found = inspect_step(cloud, one.height_mm, region=one.region)
+        found = inspect_step(cloud, one.height_mm, normal=normal, region=one.region)
     except InputError as error:
-        return FitFailure(error.what, error.remedy)
+        found = FitFailure(error.what, error.remedy)
+    limits = (one.height_mm, one.tolerance_mm)
     if isinstance(found, FitFailure):
-        return found
-    return found.height.value_mm, COVERAGE * found.height.sigma_mm
-
-
-def _judged_step(one: RecipeStep, found: tuple[float, float] | FitFailure) -> PartQuantity:
-    is_seen = not isinstance(found, FitFailure)
-    measured = (math.nan, math.nan) if isinstance(found, FitFailure) else found
-    return _quantity(one.name, "mm", measured, (one.height_mm, one.tolerance_mm), is_seen=is_seen)
+        lost = _quantity(one.name, "mm", (math.nan, math.nan), limits, is_seen=False)
+        return lost, (found.reason,)
+    height = found.height.value_mm, COVERAGE * found.height.sigma_mm
+    judged = _quantity(one.name, "mm", height, limits, is_seen=True)
+    bent = face_warnings(found, cloud)
+    weak = (*outlier_warnings(found.counts), *lean_warnings(found), *bent)
+    return _at_best_undecided(judged) if bent else judged, weak
 
 
 def face_values(face: FaceComparison) -> tuple[PartQuantity, ...]:

@@ -304,6 +304,7 @@ def inspect_step(
     single exposure or of several at rest, show two parallel lines; their distance d within the
     sheet is the height only if the sheet stands square on the faces. How far it leans, e, no single
     sheet can tell: the height is ``d cos(e)``, with e from ``normal`` if that is given, else zero.
+    By how much that is wrong is not known then, and neither is the height's standard deviation.
     Only e is taken from ``normal``: a direct projection on it would turn an error of 0.1 degrees
     into 0.03 mm.
 
@@ -358,7 +359,9 @@ def inspect_step(
             f"the best place for them, they stand {apart:.4g} mm apart",
             "check the height, or show where the step is with --region",
         )
-    return _measured(search, chosen, *_lean(section, chosen.faces.normal @ section.axes, normal))
+    lean, rule = _lean(section, chosen.faces.normal @ section.axes, normal)
+    is_assumed = section.sheet_normal is not None and normal is None
+    return _measured(search, chosen, lean, rule, is_lean_assumed=is_assumed)
 
 
 def _explained(failure: FitFailure, section: _Section, normal: FloatArray | None) -> FitFailure:
@@ -509,7 +512,9 @@ def _lean(section: _Section, upwards: FloatArray, normal: FloatArray | None) -> 
     )
 
 
-def _measured(search: _Search, chosen: _Chosen, lean: float, rule: str) -> StepInspection:
+def _measured(
+    search: _Search, chosen: _Chosen, lean: float, rule: str, *, is_lean_assumed: bool
+) -> StepInspection:
     section, nominal = search.section, search.height_mm
     full = math.cos(lean) * (chosen.faces.normal @ section.axes)
     if section.sheet_normal is not None:
@@ -522,6 +527,12 @@ def _measured(search: _Search, chosen: _Chosen, lean: float, rule: str) -> StepI
     flats = "planes" if section.sheet_normal is None else "lines"
     n_low, n_up = int(chosen.is_lower.sum()), int(chosen.is_upper.sum())
     lower, upper = (search.selection.rows[face] for face in (chosen.is_lower, chosen.is_upper))
+    # exposures of one sheet lean alike: what they disagree about would pass for all of the error
+    known = (
+        MeasuredLength(height, math.nan, math.nan)
+        if is_lean_assumed
+        else _height(search, chosen, height, full, math.cos(lean))
+    )
     # one light sheet holds no neighbourhoods that are faces
     scatter_mm = math.nan
     if section.sheet_normal is None:
@@ -531,7 +542,7 @@ def _measured(search: _Search, chosen: _Chosen, lean: float, rule: str) -> StepI
         upper=upper,
         normal=full,
         nominal_height_mm=nominal,
-        height=_height(search, chosen, height, full, math.cos(lean)),
+        height=known,
         counts=_counts(search, chosen),
         fitted=describe_deviations(
             own,
@@ -549,6 +560,7 @@ def _measured(search: _Search, chosen: _Chosen, lean: float, rule: str) -> StepI
         heights_mm=heights,
         normal_rule=rule,
         scatter_mm=scatter_mm,
+        is_lean_assumed=is_lean_assumed,
     )
 
 

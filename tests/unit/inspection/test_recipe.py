@@ -14,9 +14,11 @@ import pytest
 import trimesh
 
 from armscan.errors import FileFormatError
+from armscan.geometry.arrays import Box
 from armscan.geometry.poses import Cad, Part, Pose
 from armscan.inspection.cad.comparison import FaceComparison, deviation_statistics
 from armscan.inspection.cad.part import part_of
+from armscan.inspection.conformity import sigma_warnings
 from armscan.inspection.features import relate
 from armscan.inspection.recipe import (
     FollowedRecipe,
@@ -25,19 +27,26 @@ from armscan.inspection.recipe import (
     PartRow,
     QuantityKind,
     Recipe,
+    RecipeFeature,
+    RecipeRelation,
+    RecipeStep,
     face_values,
     follow_recipe,
     placed_cloud,
 )
+from armscan.inspection.search import WantedFeature
+from armscan.records.cloud import FUSED, PointCloud
+from armscan.report.inspection.features import feature_report
 from armscan.report.inspection.recipe import _nearness
 from armscan.storage.parts.recipes import (
     PartResult,
+    found_features,
     part_result_bytes,
     part_table_bytes,
     read_part_result,
     read_recipe,
 )
-from rigs.inspection_clouds import cloud_of, random_motion
+from rigs.inspection_clouds import block_stripes, cloud_of, random_motion
 from rigs.parts import box_corners
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "repeat-an-inspection.md"
@@ -295,7 +304,12 @@ def test_relations_steps_and_form_stand_beside_features(tmp_path: Path) -> None:
         ('of = ["base", "top"]', 'of = ["top", "top"]', "two features"),
         ('measure = "distance"', 'measure = "distant"', "measure"),
         ("nominal_deg = 90", "nominal_mm = 90", "degrees"),
+        ("nominal_deg = 90", "nominal_deg = 120", "told as 0 to 90 degrees; write 60"),
+        ("nominal_deg = 90", "nominal_deg = 180", "told as 0 to 90 degrees; write 0"),
+        ("nominal_deg = 90", "nominal_deg = -30", "told as 0 to 90 degrees; write 30"),
         ("nominal_mm = 6\n", "", "no nominal value"),
+        ("height_mm = 6", "height_mm = 6\nnormal = [0, 0, 0]", "the normal is no direction"),
+        ("height_mm = 6", "height_mm = 6\nnormal = [0, 1]", "the normal is no direction"),
         ('name = "height"', 'name = "top form"', "twice"),
         ("height_mm = 6", "height_mm = -6", "height_mm"),
         (
@@ -312,6 +326,146 @@ def test_relations_and_steps_that_are_none_are_refused(
     with pytest.raises(FileFormatError) as caught:
         read_recipe(path)
     assert word in str(caught.value)
+
+
+LEANING = """
+[[step]]
+name = "step"
+height_mm = 20
+tolerance_mm = {tolerance}
+"""
+
+
+@pytest.mark.parametrize(("error_mm", "tolerance"), [(0.0, 0.05), (-0.31, 0.05), (0.0, 0.5)])
+def test_a_step_in_a_leaning_sheet_is_decided_only_with_the_normal(
+    tmp_path: Path, error_mm: float, tolerance: float
+) -> None:
+    """Twenty exposures at rest, the sheet at 10 degrees: 20 mm read 20.31, and 19.69 mm read 20."""
+    lean = np.deg2rad(10.0)
+    normal = np.array([0.0, np.sin(lean), -np.cos(lean)])
+    x = np.tile(np.linspace(-30.0, 30.0, 600), 20)
+    apart = (20.0 + error_mm) / np.cos(lean)
+    z = 130.0 + np.where(x > 5.0, 0.0, apart)
+    z += np.random.default_rng(1).normal(0.0, 0.01, len(x))
+    points = np.column_stack([x, np.zeros_like(x), z])
+    cloud = cloud_of(points, np.repeat(np.arange(20), 600), frame="Sensor")
+    path = tmp_path / "recipe.toml"
+    text = LEANING.format(tolerance=tolerance)
+    path.write_text(text)
+    found = follow_recipe(read_recipe(path).recipe, cloud)
+    assert isinstance(found, FollowedRecipe)
+    (height,) = found.quantities
+    assert height.value == pytest.approx(apart, abs=0.005)
+    assert math.isnan(height.u_value)
+    assert height.decision == "undecided"
+    assert [note.startswith("step: one stripe: the light sheet is taken to stand square")
+            for note in found.notes] == [True]  # fmt: skip
+    path.write_text(f"{text}normal = {normal.tolist()}\n")
+    known = follow_recipe(read_recipe(path).recipe, cloud)
+    assert isinstance(known, FollowedRecipe)
+    assert known.quantities[0].value == pytest.approx(20.0 + error_mm, abs=0.005)
+    assert known.quantities[0].decision == ("fail" if error_mm else "pass")
+    assert known.notes == ()
+
+
+def rounds(kind: str) -> PointCloud:
+    """A ball of 20 mm in diameter, or the rim of a disc of it 2 mm thick, over a plane z = -30."""
+    rng = np.random.default_rng(2)
+    turn = rng.uniform(0.0, 2.0 * np.pi, 4000)
+    if kind == "ball":
+        z = rng.uniform(-2.0, 10.0, 4000)
+        radius = np.sqrt(100.0 - z**2)
+    else:
+        z, radius = rng.uniform(-1.0, 1.0, 4000), np.full(4000, 10.0)
+    points = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])
+    flat = np.column_stack([rng.uniform(-40.0, 40.0, (6000, 2)), np.full(6000, -30.0)])
+    both = np.concatenate([points, flat])
+    exposure = rng.integers(0, 30, len(both))
+    return cloud_of(both + rng.normal(0.0, 0.005, both.shape), exposure, sigma_mm=0.005)
+
+
+@pytest.mark.parametrize(("kind", "decision"), [("ball", "pass"), ("disc", "undecided")])
+def test_what_may_be_no_ball_passes_nothing(kind: str, decision: str) -> None:
+    """Nor its form, nor its distance from a plane; its diameter is 20 mm either way."""
+    ball = WantedFeature("sphere", diameter_mm=20.0, region=Box([-15, -15, -15], [15, 15, 15]))
+    recipe = Recipe(
+        features=(
+            RecipeFeature("ball", ball, 20.0, 0.3, form_tolerance=2.0),
+            RecipeFeature("table", WantedFeature("plane"), form_tolerance=0.2),
+        ),
+        relations=(RecipeRelation("height", ("ball", "table"), "distance", 30.0, 0.3),),
+    )
+    found = follow_recipe(recipe, rounds(kind))
+    assert isinstance(found, FollowedRecipe)
+    decisions = {one.name: one.decision for one in found.quantities if one.decision}
+    assert decisions == {
+        "ball": decision, "ball form": decision, "table form": "pass", "height": decision,
+    }  # fmt: skip
+    doubts = [note for note in found.notes if "may be of no sphere, but of a disc" in note]
+    assert len(doubts) == (kind == "disc")
+    assert all(note.startswith("ball: ") for note in found.notes)
+    report = feature_report(found.features["ball"], found.placed).warnings
+    assert found.notes == tuple(f"ball: {text}" for text in report)
+
+
+def test_notes_of_a_recipe_are_the_warnings_of_its_features_alone() -> None:
+    """An arc of 60 degrees, a fifth of it lifted, and a seed that is off it."""
+    rng = np.random.default_rng(4)
+    turn, z = rng.uniform(0.0, np.deg2rad(60.0), 4000), rng.uniform(0.0, 30.0, 4000)
+    radius = 20.0 + rng.normal(0.0, 0.005, 4000)
+    radius[::20] += 0.3
+    points = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])
+    wanted = WantedFeature(
+        "cylinder", diameter_mm=40.0, axis=(0.0, 0.0, 1.0), seed_mm=(18.5, 10.0, 15.0)
+    )
+    recipe = Recipe(features=(RecipeFeature("bore", wanted, 40.0, 0.5),))
+    whole = cloud_of(points, rng.integers(0, 30, 4000), sigma_mm=0.005)
+    fused = replace(
+        whole, sheet_names=(FUSED,), exposure_sources=(FUSED,), exposure=0 * whole.exposure
+    )
+    for cloud in (whole, fused, cloud_of(points, sigma_mm=0.0)):
+        found = follow_recipe(recipe, cloud)
+        assert isinstance(found, FollowedRecipe)
+        report = feature_report(found.features["bore"], cloud).warnings
+        of_cloud = sigma_warnings(cloud)
+        assert found.notes == (
+            *of_cloud, *(f"bore: {text}" for text in report if text not in of_cloud),
+        )  # fmt: skip
+        for word in ("degrees of the turn", "are outliers", "the seed is not on it"):
+            assert any(word in note for note in found.notes), word
+
+
+def test_a_step_between_bent_faces_is_undecided() -> None:
+    """Table and block bent alike by 0.2 mm, which no noise of a micron makes of flat ones."""
+    points, exposure = block_stripes(5.0)
+    rng = np.random.default_rng(0)
+    points += rng.normal(0.0, 0.001, points.shape)
+    step = Recipe(steps=(RecipeStep("pad", 5.0, 1.0),))
+    for bend, decision in ((0.0, "pass"), (0.0002, "undecided")):
+        bent = points + np.outer(bend * points[:, 0] ** 2, [0.0, 0.0, 1.0])
+        found = follow_recipe(step, cloud_of(bent, exposure, sigma_mm=0.001))
+        assert isinstance(found, FollowedRecipe)
+        assert [one.decision for one in found.quantities] == [decision]
+        said = [note for note in found.notes if "pad: the two faces are not flat" in note]
+        assert len(said) == (decision == "undecided")
+
+
+def test_the_file_of_a_part_states_the_form_that_was_measured(tmp_path: Path) -> None:
+    """Of a line the tube that holds its points: all are 0.1 mm off it, in pairs across."""
+    turn = np.linspace(0.0, 40.0 * np.pi, 600)
+    around = 0.1 * np.column_stack([np.cos(turn), np.sin(turn)])
+    z = np.linspace(0.0, 80.0, 600)[:, None]
+    points = np.concatenate([np.hstack([around, z]), np.hstack([-around, z])])
+    wanted = WantedFeature("line", region=Box([-5, -5, -5], [5, 5, 85]))
+    recipe = Recipe(features=(RecipeFeature("edge", wanted, form_tolerance=0.5),))
+    run = follow_recipe(recipe, cloud_of(points, np.tile(np.arange(600) // 20, 2)))
+    assert isinstance(run, FollowedRecipe)
+    (edge,) = found_features(run)
+    assert edge.form_mm == pytest.approx(0.2, abs=1e-6)
+    row = PartRow("a", "a.ply", run.quantities)
+    path = tmp_path / "features.json"
+    path.write_bytes(part_result_bytes(PartResult("0", "1", "", "2", row, (edge,))))
+    assert [one.form_mm for one in read_part_result(path).features] == [run.quantities[1].value]
 
 
 def test_what_was_measured_on_a_part_lies_beside_its_cloud(tmp_path: Path) -> None:

@@ -168,6 +168,33 @@ def test_one_exposure_is_as_high_as_its_lean_lets_it_be() -> None:
         assert "leans by 5.000 degrees" in told.normal_rule
 
 
+@pytest.mark.parametrize("n_exposures", [1, 3, 20])
+def test_how_a_sheet_leans_is_in_no_sigma_until_somebody_says_it(n_exposures: int) -> None:
+    """At 10 degrees 20 mm reads 20.31, and exposures of that one sheet agree on it to a micron."""
+    lean = np.deg2rad(10.0)
+    profiles = [profile(lean, 0.01, seed) for seed in range(n_exposures)]
+    points = np.concatenate(profiles)
+    exposure = np.repeat(np.arange(n_exposures), len(profiles[0]))
+    turns = np.tile(np.eye(3), (n_exposures, 1, 1))
+    still = seen_from(cloud_of(points, exposure), np.zeros((n_exposures, 3)), turns)
+    for cloud in (cloud_of(points, exposure, frame="Sensor"), still):
+        square = inspected(inspect_step(cloud, HEIGHT_MM))
+        assert square.height.value_mm == pytest.approx(HEIGHT_MM / np.cos(lean), abs=0.005)
+        assert np.isnan(square.height.sigma_mm)
+        report = step_report(square, cloud)
+        assert any("is taken to stand square on the faces" in text for text in report.warnings)
+        told = {one.key: one for one in report.quantities if one.key}
+        assert "±" not in told["fitted.height"].shown
+        assert np.isnan(told["fitted.height_u_mm"].value)
+        normal = np.array([0.0, np.sin(lean), -np.cos(lean)])
+        known = inspected(inspect_step(cloud, HEIGHT_MM, normal=normal))
+        assert not any("stand square" in text for text in step_report(known, cloud).warnings)
+        if n_exposures > 1:
+            # 10 um a point, 400 and more on each face of each exposure
+            assert known.height.sigma_mm < 0.005
+            assert abs(known.height.value_mm - HEIGHT_MM) < 4.0 * known.height.sigma_mm
+
+
 def test_a_bowed_sheet_that_leans_does_not_bend_the_faces() -> None:
     """Points lie on the faces AND on the bowed sheet: its bow must not tilt the fitted lines."""
     lean = np.deg2rad(20.0)

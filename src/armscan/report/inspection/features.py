@@ -8,7 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.inspection.conformity import COVERAGE
+from armscan.inspection.conformity import (
+    COVERAGE,
+    arc_warnings,
+    seed_warnings,
+    shape_warnings,
+)
 from armscan.inspection.features import FeatureInspection, MeasuredAngle, Relation
 from armscan.inspection.results import MeasuredLength, PointCounts
 from armscan.records.cloud import PointCloud
@@ -25,7 +30,6 @@ from armscan.report.inspection.shapes import (
     place_quantity,
     point_subtitle,
     point_warnings,
-    shape_warnings,
     share_card,
     sigma_facts,
 )
@@ -39,10 +43,6 @@ from armscan.report.quantity import (
     with_sigma,
 )
 
-NARROW_ARC_DEG = 90.0
-"""Less of a turn tells radius and place poorly apart: their errors grow as 1 / arc^2."""
-SEED_OFF_MM = 1.0
-"""Distance from a feature within which its seed is on it."""
 ANGLE_NOTE = "near 0 and 90 degrees it is the size of a tilt, which noise never makes negative"
 
 
@@ -51,12 +51,11 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
     kind = found.shape.kind
     main = found.nominal or found.fitted
     told = feature_quantities(found)
-    warnings = [*point_warnings(found.counts, cloud), *_doubts(found, cloud)]
-    if kind in ("circle", "cylinder", "cone") and found.seen_deg < NARROW_ARC_DEG:
-        warnings.append(
-            f"the points cover only {found.seen_deg:.0f} degrees of the turn, where radius and "
-            "place are poorly told apart; scan more of it"
-        )
+    warnings = (
+        *point_warnings(found.counts, cloud),
+        *_doubts(found, cloud),
+        *arc_warnings(found),
+    )
     references = [(f"against the fitted {kind}", found.fitted)]
     if found.nominal is not None:
         references.insert(0, ("against the nominal size", found.nominal))
@@ -78,29 +77,14 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
         ),
         views=(feature_view(cloud, found.rows, main),),
         counts=found.counts,
-        warnings=tuple(warnings),
+        warnings=warnings,
     )
 
 
 def _doubts(found: FeatureInspection, cloud: PointCloud, whose: str = "") -> tuple[str, ...]:
     """Warn of a seed that is on no feature, and of points that may be of another shape."""
     kind = found.shape.kind
-    return (*_seed_warnings(found, cloud, whose), *shape_warnings(found, cloud, kind, whose))
-
-
-def _seed_warnings(found: FeatureInspection, cloud: PointCloud, whose: str) -> tuple[str, ...]:
-    """Of a seed off the surface, or farther from its points than these lie from each other."""
-    if found.wanted.seed_mm is None:
-        return ()
-    seed, points = np.asarray(found.wanted.seed_mm), cloud.points_mm[found.rows]
-    off = abs(float(found.shape.distance_mm(seed[None, :])[0]))
-    far = float(np.linalg.norm(points - seed, axis=1).min())
-    if off <= SEED_OFF_MM and far <= float(np.linalg.norm(np.ptp(points, axis=0))):
-        return ()
-    return (
-        f"{whose}the seed is not on it: the nearest of its points is {significant(far, 'mm', 2)} "
-        "away; another feature may be meant",
-    )
+    return (*seed_warnings(found, cloud, whose), *shape_warnings(found, cloud, kind, whose))
 
 
 def feature_quantities(found: FeatureInspection) -> tuple[Quantity, ...]:

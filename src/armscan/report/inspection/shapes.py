@@ -11,8 +11,14 @@ from typing import Any
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.inspection.conformity import COVERAGE
-from armscan.inspection.features import FeatureInspection
+from armscan.inspection.conformity import (
+    COVERAGE,
+    face_warnings,
+    lean_warnings,
+    outlier_warnings,
+    shape_warnings,
+    sigma_warnings,
+)
 from armscan.inspection.results import (
     Deviations,
     MeasuredLength,
@@ -58,13 +64,6 @@ STATEMENT = (
     "of the feature; points that a fit left out are counted. Forms are computed as ISO 10360-8 "
     "defines them; this is not an accredited test."
 )
-NO_SIGMA = (
-    "the cloud carries no standard deviations, so it is not known how well the fit is determined"
-)
-FUSED_SIGMA = (
-    "the cloud is fused and no longer tells its exposures apart, so that no ± and no U is known; "
-    "inspect the cloud from before it was fused"
-)
 NO_SHEETS = (
     "the cloud does not tell which points lie in one (fused, XYZ, STL or foreign): one may be "
     "taken for a face"
@@ -80,13 +79,11 @@ STILL_SIGMA = fact(
     "not known from one exposure: its error is the calibration's, which shifts both faces nearly "
     "alike",
 )
-ROUND = ("sphere", "cylinder", "cone")
-OTHER_SHAPE, BEYOND_STATED = 8.0, 2.0
-"""Rms distance from a fitted shape beyond which it is doubted, in scatters of neighbours: bores,
-bosses and balls have 3 at most, a cylinder in a cone of 25 degrees or in two flat faces 15 and
-more. And in stated sigmas, for stripes that an arm shifts are smooth themselves."""
+SHEET_SIGMA = fact(
+    "Sigma of the height",
+    "not known from one light sheet: how far it leans on the faces none of its exposures tells",
+)
 NARROW_CAP_DEG = 60.0
-MANY_OUTLIERS = 0.01
 UNNAMED = "Part"
 AS_NAMED = ", as it is called where a file names none"
 BAND_MM = 0.05
@@ -147,8 +144,10 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
     else:
         references.insert(0, ("against the nominal plane", found.nominal))
         where = "of the fitted plane over the nominal one, at the middle of the points"
+        where += _own_text(found.reference_sigma_mm)
         told += [
             *length_quantities("nominal.offset", "Offset", found.offset, where),
+            Quantity("nominal.offset_sigma_plate_mm", "", found.reference_sigma_mm),
             Quantity(
                 "nominal.tilt_mrad",
                 "Tilt",
@@ -180,6 +179,13 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         counts=found.counts,
         warnings=(*point_warnings(found.counts, cloud), *_beyond_warnings(found)),
     )
+
+
+def _own_text(sigma_mm: float) -> str:
+    """How far the sigma of an offset holds what the nominal plane errs itself."""
+    if math.isnan(sigma_mm):
+        return "; without the plate's own uncertainty"
+    return f"; ± holds {significant(sigma_mm, 'mm', 2)} of the plate itself" if sigma_mm else ""
 
 
 def _sheet_facts(cloud: PointCloud) -> tuple[Quantity, ...]:
@@ -289,67 +295,17 @@ def _ball_warnings(found: SphereInspection) -> tuple[str, ...]:
     return tuple(told)
 
 
-def shape_warnings(
-    found: SphereInspection | FeatureInspection, cloud: PointCloud, kind: str, whose: str = ""
-) -> tuple[str, ...]:
-    """Warn of points that may be of another shape than the one that was fitted to them.
-
-    They are as near to a post, or lie much farther off the shape than off their neighbours and
-    than their sigmas say. ``kind`` is what the shape is called.
-    """
-    rows = found.rows[found.is_fitted]
-    rms = _rms(found.fitted.deviations_mm[found.is_fitted])
-    if found.post is not None:
-        off = significant(_rms(found.post.distance_mm(cloud.points_mm[rows])), "mm", 2)
-        return (
-            f"{whose}the points may be of no {kind}, but of a disc or a post: they lie {off} (rms) "
-            f"off a cylinder of {2.0 * found.post.radius_mm:.4g} mm, and "
-            f"{significant(rms, 'mm', 2)} off the {kind}; scan it from more sides, or show where "
-            f"the {kind} is with --region",
-        )
-    is_round = isinstance(found, SphereInspection) or found.shape.kind in ROUND
-    if not is_round or not _is_far(rms, found.scatter_mm, cloud, rows):
-        return ()
-    return (
-        f"{whose}the points may be of no {kind}: they lie {significant(rms, 'mm', 2)} (rms) off "
-        f"it, {rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, "
-        "and show where it is by a region or a seed",
-    )
-
-
-def _is_far(rms: float, scatter_mm: float, cloud: PointCloud, rows: IntArray) -> bool:
-    """Whether points are much farther off a shape than they scatter, and than their sigmas say."""
-    variance = np.median(np.einsum("nii->n", cloud.covariance_mm2[rows])) / 3.0
-    stated = BEYOND_STATED * math.sqrt(max(float(variance), 0.0))
-    # written so that a scatter that is not known is no doubt
-    return bool(rms > OTHER_SHAPE * scatter_mm and rms > stated)
-
-
-def _face_warnings(found: StepInspection, cloud: PointCloud) -> tuple[str, ...]:
-    """Warn of faces that are bent, as parts of a ball are."""
-    rms = found.fitted.value("rms_mm")
-    both = np.concatenate([found.lower, found.upper])
-    if not _is_far(rms, found.scatter_mm, cloud, both):
-        return ()
-    return (
-        f"the two faces are not flat: their points lie {significant(rms, 'mm', 2)} (rms) off them, "
-        f"{rms / found.scatter_mm:.0f} times as much as neighbours scatter; see the pictures, and "
-        "show where the step is with --region",
-    )
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
-    """Report of a step."""
+def _step_quantities(found: StepInspection, cloud: PointCloud) -> tuple[Quantity, ...]:
+    """What is told of a step."""
     nominal_mm = found.nominal_height_mm
     error = found.height.value_mm - nominal_mm
     both = np.concatenate([found.lower, found.upper])
     is_still = not _sheet_facts(cloud) and len(np.unique(cloud.exposure[both])) == 1
+    known = sigma_facts(found.height, "height")
+    if is_still or found.is_lean_assumed:
+        known = (STILL_SIGMA if is_still else SHEET_SIGMA,)
     mean, std = float(found.heights_mm.mean()), float(found.heights_mm.std(ddof=1))
-    told = (
+    return (
         Quantity("feature", "", "step"),
         *count_quantities(found.counts),
         *length_quantities(
@@ -380,10 +336,17 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
             f"{len(found.lower):,} points on the lower face, {len(found.upper):,} on the upper",
         ),
         *_sheet_facts(cloud),
-        *((STILL_SIGMA,) if is_still else sigma_facts(found.height, "height")),
+        *known,
         *deviation_quantities("fitted", found.fitted),
         *deviation_quantities("nominal", found.nominal),
     )
+
+
+def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
+    """Report of a step."""
+    both = np.concatenate([found.lower, found.upper])
+    told = _step_quantities(found, cloud)
+    std = float(found.heights_mm.std(ddof=1))
     spread = "of the heights of the upper face's points"
     return InspectionReport(
         title="Step inspected",
@@ -401,7 +364,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
         histograms=(
             height_histogram(
                 found.heights_mm,
-                nominal_mm,
+                found.nominal_height_mm,
                 found.height.value_mm,
                 title="Heights of the upper face's points",
             ),
@@ -421,7 +384,11 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
             ),
         ),
         counts=found.counts,
-        warnings=(*point_warnings(found.counts, cloud), *_face_warnings(found, cloud)),
+        warnings=(
+            *point_warnings(found.counts, cloud),
+            *lean_warnings(found),
+            *face_warnings(found, cloud),
+        ),
     )
 
 
@@ -540,15 +507,7 @@ def point_warnings(
     counts: PointCounts, cloud: PointCloud, whose: str = "feature"
 ) -> tuple[str, ...]:
     """What is weak about the points of a feature."""
-    found = []
-    if not cloud.covariance_mm2.any():
-        found.append(NO_SIGMA)
-    elif cloud.is_fused:
-        found.append(FUSED_SIGMA)
-    if counts.n_outliers > MANY_OUTLIERS * counts.n_feature:
-        share = 100.0 * counts.n_outliers / counts.n_feature
-        found.append(f"{share:.1f} % of the {whose}'s points are outliers: see the pictures")
-    return tuple(found)
+    return (*sigma_warnings(cloud), *outlier_warnings(counts, whose))
 
 
 def inspection_page(

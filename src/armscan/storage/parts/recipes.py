@@ -143,6 +143,7 @@ class _StepKeys:
     height_mm: float
     tolerance_mm: float | None = None
     region: Box | None = None
+    normal: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,10 +288,7 @@ def read_recipe(path: Path) -> RecipeFile:
         cleaning=keys.clean,
         features=features,
         relations=tuple(_relation(one, keys, where) for one in keys.relation),
-        steps=tuple(
-            RecipeStep(one.name, one.height_mm, _or_nan(one.tolerance_mm), one.region)
-            for one in keys.step
-        ),
+        steps=tuple(_step(one, where) for one in keys.step),
     )
     place = f"{where}: 'title_block'"
     entries = keys.title_block or {}
@@ -429,6 +427,9 @@ def _relation(keys: _RelationKeys, recipe: _RecipeKeys, where: str) -> RecipeRel
          "leave nominal_mm out"),
         (tolerance is not None and nominal is None and not is_zone,
          "it has a tolerance and no nominal value", "give both"),
+        (keys.nominal_deg is not None and not 0.0 <= keys.nominal_deg <= 90.0,
+         f"nominal_deg is {keys.nominal_deg}, and angles are told as 0 to 90 degrees",
+         f"write {_folded_deg(keys.nominal_deg or 0.0):g}"),
     )  # fmt: skip
     for is_wrong, what, remedy in faults:
         if is_wrong:
@@ -440,6 +441,23 @@ def _relation(keys: _RelationKeys, recipe: _RecipeKeys, where: str) -> RecipeRel
         nominal=0.0 if is_zone else _or_nan(nominal),
         tolerance=_or_nan(tolerance),
     )
+
+
+def _step(keys: _StepKeys, where: str) -> RecipeStep:
+    if keys.normal is not None and not (len(keys.normal) == 3 and any(keys.normal)):
+        raise FileFormatError(
+            "the normal is no direction",
+            where=f"{where}: step '{keys.name}'",
+            remedy="give the three numbers x, y, z of the faces' normal, not all 0",
+        )
+    tolerance_mm = _or_nan(keys.tolerance_mm)
+    return RecipeStep(keys.name, keys.height_mm, tolerance_mm, keys.region, keys.normal)
+
+
+def _folded_deg(angle_deg: float) -> float:
+    """The same angle between two directions of which either may be turned over, 0 to 90 degrees."""
+    turned = angle_deg % 180.0
+    return min(turned, 180.0 - turned)
 
 
 def _datums(keys: _RecipeKeys, part: PartModel, where: str, points: Path | None) -> Datums:

@@ -13,7 +13,7 @@ import numpy as np
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA
 from armscan.inspection.results import MeasuredLength
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import CalibrationErrors, PointCloud, PointsSeen
 
 MIN_BLOCKS = 4
 """Fewest exposures whose differences say anything about their scatter."""
@@ -229,7 +229,7 @@ class _ExposureErrors:
         count = np.bincount(exposure, minlength=n)
         covariance, axis, share = without_noise(cloud, rows)
         total = _sums(exposure, n, covariance.reshape(-1, 9)).reshape(n, 3, 3)
-        by_calibration, common = calibration_errors(cloud, rows, fit.directions)
+        by_calibration, common = _calibration_errors(cloud, rows, fit.directions)
         mean = total - _sums(exposure, n, by_calibration.reshape(-1, 9)).reshape(n, 3, 3)
         mean, total = (one / count[:, None, None] for one in (mean, total))
         along = share * np.einsum("ni,ni->n", axis, fit.directions) ** 2 + 1.0 - share
@@ -507,7 +507,21 @@ def _weights(chance: FloatArray) -> FloatArray:
     return np.asarray(found / found.sum())
 
 
-def calibration_errors(
+def points_seen(cloud: PointCloud, rows: IntArray) -> tuple[CalibrationErrors, PointsSeen] | None:
+    """What a calibration errs, and (N,) rows of the points that it moves; None if not told."""
+    errors, seen_from = cloud.calibration_errors, cloud.seen_from_mm
+    if errors is None or seen_from is None:
+        return None
+    exposure = cloud.exposure[rows]
+    return errors, PointsSeen(
+        points_mm=cloud.points_mm[rows],
+        seen_from_mm=seen_from[exposure],
+        exposure=exposure,
+        sheet=cloud.sheet[rows],
+    )
+
+
+def _calibration_errors(
     cloud: PointCloud, rows: IntArray, directions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance (N, 3, 3) of points by the calibration alone, and moves (N, K + 3) along
@@ -515,17 +529,13 @@ def calibration_errors(
 
     Both are zero of a cloud that does not tell.
     """
-    errors, seen_from = cloud.calibration_errors, cloud.seen_from_mm
-    covariance = np.zeros((len(rows), 3, 3))
-    if errors is None or seen_from is None:
-        return covariance, np.zeros((len(rows), 0))
-    exposure = cloud.exposure[rows]
-    along = [errors.arm_mm * np.einsum("ni,nik->nk", directions, errors.turns[exposure])]
-    places = cloud.points_mm[rows], seen_from[exposure]
-    for move in errors.moves_mm(*places, exposure, cloud.sheet[rows]):
-        covariance += move[:, :, None] * move[:, None, :]
-        along.append(np.einsum("ni,ni->n", move, directions)[:, None])
-    return covariance, np.concatenate(along, axis=1)
+    told = points_seen(cloud, rows)
+    if told is None:
+        return np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 0))
+    errors, seen = told
+    by_arm = errors.arm_mm * np.einsum("ni,nik->nk", directions, errors.turns[seen.exposure])
+    along = errors.moves_along_mm(seen, directions)
+    return errors.covariance_mm2(seen), np.concatenate([by_arm, along.T], axis=1)
 
 
 def without_noise(cloud: PointCloud, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 from typing import Literal, Self
 
 import numpy as np
@@ -43,6 +44,25 @@ FIELD_POWERS = tuple(
 )
 FIELD_REACH = 1.1
 """Half widths from the middle up to which a polynomial is taken; beyond, its value there."""
+POINTS_AT_ONCE = 50_000
+"""Whose products of powers and directions are held at a time: 18 MB."""
+
+
+class PointsSeen(RowRecord):
+    """Points of a scan, where the sensor stood at each, and of which exposure and sheet they are.
+
+    Parameters
+    ----------
+    points_mm, seen_from_mm
+        (N, 3) in the cloud's frame.
+    exposure, sheet
+        (N,) numbers.
+    """
+
+    points_mm: FloatArray = floats("N", 3)
+    seen_from_mm: FloatArray = floats("N", 3)
+    exposure: IntArray = ints("N")
+    sheet: IntArray = ints("N")
 
 
 class CalibrationErrors(ArrayRecord):
@@ -81,27 +101,39 @@ class CalibrationErrors(ArrayRecord):
         """The same in a frame into which ``rotation`` (3, 3) leads."""
         return replace(self, turns=rotation @ self.turns)
 
-    def moves_mm(
-        self, points_mm: FloatArray, seen_from_mm: FloatArray, exposure: IntArray, sheet: IntArray
-    ) -> Iterator[FloatArray]:
-        """(N, 3) moves of points by each error, in the cloud's frame, one error after the other.
+    def moves_along_mm(self, seen: PointsSeen, directions: FloatArray) -> FloatArray:
+        """(K, N) moves of points along unit directions (N, 3) in the cloud's frame, by error."""
+        found = np.zeros((self.modes_mm.shape[3], len(directions)))
+        for rows, turn, powers, modes in self._parts(seen):
+            along = np.einsum("nji,nj->ni", turn, directions[rows])
+            products = (powers[:, :, None] * along[:, None, :]).reshape(len(rows), -1)
+            found[:, rows] = modes.reshape(-1, len(found)).T @ products.T
+        return found
 
-        Parameters
-        ----------
-        points_mm, seen_from_mm
-            (N, 3) points, and where the sensor stood at each.
-        exposure, sheet
-            (N,) of each point.
-        """
-        turn = self.turns[exposure]
-        seen = np.einsum("nji,nj->ni", turn, points_mm - seen_from_mm)
-        powers = direction_powers(seen, self.middle[sheet], self.half_width[sheet])
-        for mode in np.moveaxis(self.modes_mm, 3, 0):
-            move = np.zeros((len(seen), 3))
-            for k in range(len(mode)):
-                of_sheet = sheet == k
-                move[of_sheet] = powers[of_sheet] @ mode[k]
-            yield np.einsum("nij,nj->ni", turn, move)
+    def covariance_mm2(self, seen: PointsSeen) -> FloatArray:
+        """(N, 3, 3) covariances of points by all errors together, in the cloud's frame."""
+        found = np.zeros((len(seen), 3, 3))
+        for rows, turn, powers, modes in self._parts(seen):
+            own = np.zeros((len(rows), 3, 3))
+            for i, j in combinations_with_replacement(range(3), 2):
+                both = np.einsum("nt,nt->n", powers @ (modes[:, i] @ modes[:, j].T), powers)
+                own[:, i, j] = own[:, j, i] = both
+            found[rows] = turn @ own @ turn.transpose(0, 2, 1)
+        return found
+
+    def _parts(
+        self, seen: PointsSeen
+    ) -> Iterator[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
+        """Of a few points of one sheet at a time: rows, turns, powers (M, T), modes (T, 3, K)."""
+        for sheet, modes in enumerate(self.modes_mm):
+            of_sheet = np.flatnonzero(seen.sheet == sheet)
+            for first in range(0, len(of_sheet), POINTS_AT_ONCE):
+                rows = of_sheet[first : first + POINTS_AT_ONCE]
+                turn = self.turns[seen.exposure[rows]]
+                away = seen.points_mm[rows] - seen.seen_from_mm[rows]
+                in_sensor = np.einsum("nji,nj->ni", turn, away)
+                scale = self.middle[sheet], self.half_width[sheet]
+                yield rows, turn, direction_powers(in_sensor, *scale), modes
 
 
 def direction_powers(seen_mm: FloatArray, middle: FloatArray, half_width: FloatArray) -> FloatArray:

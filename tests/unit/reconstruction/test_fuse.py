@@ -32,6 +32,7 @@ from armscan.reconstruction.triangulate import (
     shape_mm,
     sheet_numbers,
 )
+from armscan.records.cloud import PointsSeen
 from rigs import placing_rig
 from rigs.fisheye import fisheye_sensor
 from rigs.sheet_rig import PROVENANCE, make_profile
@@ -196,8 +197,11 @@ def test_what_two_cameras_err_is_alike_in_points_of_two_sheets(
     errors = errors_of_calibration(scanner, np.eye(3)[None])
     assert errors is not None
     none = np.zeros(3, dtype=np.int64)
-    found = errors.moves_mm(points, np.zeros((3, 3)), none, np.array(list(beside)))
-    told = np.stack([move.ravel() for move in found], axis=1)
+    seen = PointsSeen(
+        points_mm=points, seen_from_mm=np.zeros((3, 3)), exposure=none, sheet=np.array(list(beside))
+    )
+    along = [errors.moves_along_mm(seen, np.tile(axis, (3, 1))) for axis in np.eye(3)]
+    told = np.stack(along, axis=2).reshape(-1, 9).T
     assert told.shape[1] == place.MOST_MODES or not is_cut
     size = np.sqrt(np.diag(expected))
     both = np.outer(size, size)

@@ -31,6 +31,7 @@ from armscan.reconstruction.triangulate import (
     sheet_numbers,
     triangulate_stripe,
 )
+from armscan.records.cloud import PointsSeen
 from armscan.records.profile import PointProfile
 from rigs import placing_rig as rig
 from rigs.fisheye import fisheye_sensor
@@ -168,12 +169,17 @@ def test_what_a_calibration_errs_is_alike_in_points_of_two_sheets(
     assert errors is not None
     points = intersect_sheets(PLACES_PX, SHEET_OF, scanner.sensor, pose)[0]
     eye = np.tile(pose.translation_mm, (3, 1))
-    moves = errors.moves_mm(points, eye, np.zeros(3, dtype=np.int64), SHEET_OF)
-    found = np.stack([move.ravel() for move in moves], axis=1)
+    seen = PointsSeen(
+        points_mm=points, seen_from_mm=eye, exposure=np.zeros(3, dtype=np.int64), sheet=SHEET_OF
+    )
+    along = [errors.moves_along_mm(seen, np.tile(axis, (3, 1))) for axis in np.eye(3)]
+    found = np.stack(along, axis=2).reshape(-1, 9).T
     size = np.sqrt(np.diag(expected @ expected.T))
     both = np.outer(size, size)
     # polynomials follow the errors to 2 %, and 0.3 % of their variance is left out: at a point more
     np.testing.assert_allclose(found @ found.T / both, expected @ expected.T / both, atol=atol)
+    each = found.reshape(3, 3, -1)
+    np.testing.assert_allclose(errors.covariance_mm2(seen), each @ each.transpose(0, 2, 1))
 
 
 def test_covariance_is_that_of_repeats() -> None:

@@ -9,8 +9,8 @@ from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats
 from armscan.geometry.poses import Cad, Part, Pose
 from armscan.inspection.uncertainty import (
     COARSE_BLOCKS,
-    calibration_errors,
     exposure_blocks,
+    points_seen,
     without_noise,
 )
 from armscan.records.cloud import PointCloud
@@ -34,8 +34,8 @@ class PointErrors(RowRecord):
         (N,) variance along the normal that each point has of its own, times the points along the
         stripe that share it.
     common_mm
-        (N, K) move along the normal by each of K errors of the calibration, one sigma, which all
-        points share.
+        (K, N) move along the normal by each of K errors of the calibration, one sigma, which all
+        points share. What the arm errs is not in it: a part is seen from several postures.
     covariance_mm2
         (N, 3, 3) the rest, in Cad, which points of a block share.
     blocks
@@ -45,7 +45,7 @@ class PointErrors(RowRecord):
 
     normals: FloatArray = floats("N", 3)
     private_mm2: FloatArray = floats("N")
-    common_mm: FloatArray = floats("N", "K")
+    common_mm: FloatArray = floats("K", "N")
     covariance_mm2: FloatArray = floats("N", 3, 3)
     blocks: tuple[IntArray, ...]
 
@@ -81,19 +81,23 @@ class PointErrors(RowRecord):
             # of neighbours that share their noise, a thinned cloud keeps so many
             thinned = len(chosen) / max(len(cloud), 1) if kept_share is None else kept_share
             shared = 1.0 + np.maximum(cloud.noise_length[chosen] - 1.0, 0.0) * thinned
-        by_calibration, common = calibration_errors(cloud, chosen, normals @ pose.rotation)
+        common, told = np.zeros((0, len(chosen))), points_seen(cloud, chosen)
+        if told is not None:
+            calibration, seen = told
+            common = calibration.moves_along_mm(seen, normals @ pose.rotation)
+            covariance -= calibration.covariance_mm2(seen)
         return PointErrors(
             normals=normals,
             private_mm2=cloud.sigma_noise_mm[chosen] ** 2 * along * shared,
             common_mm=common,
-            covariance_mm2=pose.rotate_covariance(covariance - by_calibration),
+            covariance_mm2=pose.rotate_covariance(covariance),
             blocks=tuple(_blocks(cloud, chosen)),
         )
 
     def covariance(self, influence: FloatArray) -> FloatArray:
         """(K, K) of K sums of the points' errors along their normals, (K, N) their weights."""
         private = influence * self.private_mm2 @ influence.T
-        common = influence @ self.common_mm
+        common = influence @ self.common_mm.T
         found = []
         for block in self.blocks:
             n = int(block.max()) + 1
@@ -131,11 +135,12 @@ class PointErrors(RowRecord):
         both = influence * v @ influence.T
         private = own - 2.0 * np.einsum("fk,fk->f", jacobian, cross)
         private += np.einsum("fk,kl,fl->f", jacobian, both, jacobian)
-        common = -jacobian @ (influence @ self.common_mm)
-        for k, move in enumerate(self.common_mm.T):
-            common[:, k] += np.bincount(group, move[inside], count) / n
+        common = np.zeros(count)
+        for move in self.common_mm:
+            mean = np.bincount(group, move[inside], count) / n
+            common += (mean - jacobian @ (influence @ move)) ** 2
         shared = self._shared_variances(label, count, jacobian, influence)
-        return np.asarray(np.maximum(private, 0.0) + (common**2).sum(axis=1) + shared)
+        return np.asarray(np.maximum(private, 0.0) + common + shared)
 
     def _shared_variances(
         self, label: IntArray, count: int, jacobian: FloatArray, influence: FloatArray

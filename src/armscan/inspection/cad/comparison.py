@@ -60,11 +60,14 @@ ALONG_FACE = 0.98
 edge: the facets of a round face are up to 10 degrees apart, and the point may be of either face."""
 MOST_BEYOND = 0.5
 """Part of the points that may lie beyond the reach: the best fit, too, rests on most points."""
-PARALLEL = 0.9
-"""Cosine between the surface of points above a face and that face, from which on they may be a
-boss on it: a table beside a wall stands across it."""
+PARALLEL = 0.7
+"""Cosine between the surface of points off a face and that face, from which on they may be a dent
+or a boss of it: a table beside a wall stands across it."""
 HIGHEST_BOSS = 0.05
 """Over the part's diagonal: what lies higher over a face is a fixture."""
+AS_DENSE = 0.2
+"""Points of a spot beyond the reach, over those of the same face there, and over those of the usual
+spot, from which on they are a surface and no strays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,8 +298,13 @@ def compare_with_part(
     of_spot[spot[face >= 0]] = face[face >= 0]
     once = _shown_once(spot, cloud, d, limits[of_spot] + u_spot)
     spots = _spot_results(spot, face, d, found.closest_mm, u_spot, is_once=once)
-    is_beyond = ~near & ~is_off_face & _may_be_of_part(surface, cloud, alignment, found)
-    beyond = _spots_beyond(is_beyond, part.face[found.triangle], cloud, found, spot_width)
+    far = np.flatnonzero(~near & ~is_off_face)
+    is_beyond = np.zeros(len(cloud), dtype=np.bool_)
+    is_beyond[far] = _may_be_of_part(
+        surface, cloud, alignment, found.select(far), far, reach_mm=options.reach_mm
+    )
+    of_either = np.where(is_beyond, part.face[found.triangle], face)
+    beyond = _spots_beyond(is_beyond, of_either, cloud, found, spot_width)
     once = _shown_once(face, cloud, d, limits + u_face)
     by_face = _rows_by(face, n_faces)
     faces = tuple(
@@ -424,20 +432,30 @@ def _seen_from_behind(
 
 
 def _may_be_of_part(
-    surface: PartSurface, cloud: PointCloud, alignment: Alignment, found: SurfaceDistance
+    surface: PartSurface,
+    cloud: PointCloud,
+    alignment: Alignment,
+    found: SurfaceDistance,
+    rows: IntArray,
+    *,
+    reach_mm: float,
 ) -> BoolArray:
-    """(N,) points that may be a dent or a boss of the face next to them, however deep or high.
+    """(M,) rows of a cloud that may be a dent or a boss of the face next to them.
 
-    Nothing but the part is below a face; above it, what is not too high and lies along the face, if
-    the cloud tells.
+    Inside a part is nothing but a dent, or what is seen through a thin wall. A table under a brim
+    is next to its upper face only where normals chose that face (`PartSurface.distance`); what is
+    next to it by itself tells. Above a face is a boss, if it is not too high. Both lie along the
+    face, as far as normals tell.
     """
-    below = found.signed_mm < 0.0
+    is_below = found.signed_mm < 0.0
     if cloud.normals is None:
-        return below
-    normals = alignment.cad_from_part.rotate(cloud.normals)
+        return is_below & surface.is_closed
+    pose = alignment.cad_from_part
+    normals = pose.rotate(cloud.normals[rows])
     cosine = np.einsum("ni,ni->n", normals, surface.part.normals[found.triangle])
-    highest_mm = HIGHEST_BOSS * surface.diagonal_mm
-    return np.asarray(below | ((cosine > PARALLEL) & (found.signed_mm < highest_mm)))
+    by_itself = surface.distance(pose.apply(cloud.points_mm[rows])).signed_mm
+    is_low = found.signed_mm < HIGHEST_BOSS * surface.diagonal_mm
+    return np.asarray((cosine > PARALLEL) & np.where(is_below, by_itself < reach_mm, is_low))
 
 
 def _spots_beyond(
@@ -447,8 +465,21 @@ def _spots_beyond(
     found: SurfaceDistance,
     width_mm: float,
 ) -> _Spots:
-    """Spots beyond the reach that more than one exposure shows, of a cloud of several."""
-    label, count = _spots(found.closest_mm, np.where(is_beyond, face, -1), width_mm)
+    """Spots beyond the reach that more than one exposure shows, of a cloud of several.
+
+    ``face``: (N,) face of each point that is on one or beyond its reach, -1 for others. A spot must
+    be about as dense as the part is where it was seen, or strays of a dense scan would make one.
+    """
+    label, count = _spots(found.closest_mm, face, width_mm)
+    inside = label >= 0
+    n_near, n_beyond = (
+        np.bincount(label[inside & chosen], minlength=count) for chosen in (~is_beyond, is_beyond)
+    )
+    usual = float(np.median(n_near[n_near > 0])) if n_near.any() else 0.0
+    is_dense = n_beyond >= AS_DENSE * np.maximum(n_near, usual)
+    of_beyond = np.flatnonzero(is_beyond)
+    kept = of_beyond[is_dense[label[of_beyond]]]
+    label = np.where(np.isin(np.arange(len(label)), kept), label, -1)
     once = np.zeros(count, dtype=np.bool_)
     if not cloud.is_fused:
         once = _shown_once(label, cloud, found.signed_mm, np.zeros(count))

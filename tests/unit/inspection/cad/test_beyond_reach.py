@@ -92,6 +92,76 @@ def test_a_table_beside_the_part_is_no_boss_on_its_walls() -> None:
         assert reached(cloud) == []
 
 
+def grid(low: list[float], high: list[float], z: float, step: float = 0.4) -> FloatArray:
+    """(N, 3) points of a level rectangle."""
+    x, y = np.meshgrid(*(np.arange(a, b, step) for a, b in zip(low, high, strict=True)))
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
+
+
+def level_cloud(points: FloatArray, up: FloatArray) -> PointCloud:
+    """Points with normals up or down, in exposures 1 mm apart."""
+    exposure = np.floor(points[:, 0] - points[:, 0].min()).astype(np.int64)
+    normals = np.column_stack([np.zeros((len(points), 2)), up])
+    return cloud_of(points, exposure, sigma_mm=0.005, normals=normals)
+
+
+@pytest.mark.parametrize("gap_mm", [3.0, 8.0, 15.0])
+def test_a_table_under_a_brim_is_no_dent_in_it(gap_mm: float) -> None:
+    """A plate of 3 mm stands out over the table, which is seen beneath it from the side."""
+    foot = box_corners([25, 15, 0.0], [35, 25, gap_mm])
+    brim = box_corners([0, 0, gap_mm], [60, 40, gap_mm + 3.0])
+    part = PartSurface(part_of(np.concatenate([foot, brim]), source="brim"))
+    top, table = grid([1, 1], [59, 39], gap_mm + 3.0), grid([0, 0], [20, 40], 0.0)
+    cloud = level_cloud(np.concatenate([top, table]), np.ones(len(top) + len(table)))
+    found = compare_with_part(
+        part, cloud, align_none(cloud), CadOptions(tolerance_mm=0.1), errors_known=True
+    )
+    assert isinstance(found, CadComparison)
+    assert found.verdict == "pass"
+
+
+@pytest.mark.parametrize("depth_mm", [2.4, 2.9, 4.0])
+def test_a_dent_through_a_thin_wall_is_one(depth_mm: float) -> None:
+    """The other side of the wall is nearer to it, or it stands out there."""
+    wall = PartSurface(part_of(box_corners([0, 0, 0.0], [60, 40, 3.0]), source="wall"))
+    points = grid([1, 1], [59, 39], 3.0)
+    points[np.abs(points[:, :2] - [30.0, 20.0]).max(axis=1) < 6.0, 2] -= depth_mm
+    cloud = level_cloud(points, np.ones(len(points)))
+    found = compare_with_part(
+        wall, cloud, align_none(cloud), CadOptions(tolerance_mm=0.1), errors_known=True
+    )
+    assert isinstance(found, CadComparison)
+    assert found.verdict in ("undecided", "fail")
+
+
+@pytest.mark.parametrize("tell_normals", [True, False])
+def test_the_back_of_a_sheet_is_no_dent_in_an_open_model(tell_normals: bool) -> None:
+    box = box_corners([0, 0, -20.0], [60, 40, 0.0])
+    is_bent = (box[:, :, 2] == 0.0).all(axis=1) | (box[:, :, 0] == 0.0).all(axis=1)
+    sheet = PartSurface(part_of(box[is_bent], source="sheet"))
+    front, back = grid([1, 1], [59, 39], 0.0), grid([4, 1], [59, 39], -3.0, 0.5)
+    up = np.concatenate([np.ones(len(front)), -np.ones(len(back))])
+    cloud = level_cloud(np.concatenate([front, back]), up)
+    cloud = cloud if tell_normals else replace(cloud, normals=None)
+    found = compare_with_part(
+        sheet, cloud, align_none(cloud), CadOptions(tolerance_mm=0.1), errors_known=True
+    )
+    assert isinstance(found, CadComparison)
+    assert found.verdict == "pass"
+
+
+def test_strays_of_a_dense_scan_make_no_dent() -> None:
+    """Fifteen of them in each spot of a few, and a twentieth of all points."""
+    random = np.random.default_rng(2)
+    points = top_points(200_000)
+    in_spots = np.flatnonzero(np.abs(points[:, :2] - [30.7, 20.7]).max(axis=1) < 1.5)[:60]
+    everywhere = random.choice(len(points), len(points) // 20, replace=False)
+    for strays in (in_spots, everywhere):
+        stray = points.copy()
+        stray[strays, 2] -= random.uniform(2.1, 5.0, len(strays))
+        assert reached(level_cloud(stray, np.ones(len(stray)))) == []
+
+
 def test_a_fused_cloud_shows_a_deep_dent_too() -> None:
     cloud = block_with(-3.0)
     zeros = np.zeros_like(cloud.exposure)

@@ -36,6 +36,7 @@ SHOWN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
     "inspection/sphere": (SPHERE, VERIFY),
     "inspection/step": (STEP,),
     "inspection/conformity": (VERIFY,),
+    "inspection/doubts": (SPHERE, STEP, VERIFY),
     "jobs/camera": (CAMERA,),
     "jobs/stereo": (STEREO,),
     "jobs/sheets": (LASER,),

@@ -26,11 +26,10 @@ from armscan.inspection.cad.comparison import (
 from armscan.inspection.cad.datums import Datums, align
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cleaning import Cleaning, CleaningOptions, clean_cloud
-from armscan.inspection.conformity import (
-    COVERAGE,
+from armscan.inspection.conformity import COVERAGE, judge
+from armscan.inspection.doubts import (
     arc_warnings,
     face_warnings,
-    judge,
     lean_warnings,
     outlier_warnings,
     seed_warnings,

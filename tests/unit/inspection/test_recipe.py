@@ -18,7 +18,7 @@ from armscan.geometry.arrays import Box
 from armscan.geometry.poses import Cad, Part, Pose
 from armscan.inspection.cad.comparison import FaceComparison, deviation_statistics
 from armscan.inspection.cad.part import part_of
-from armscan.inspection.conformity import sigma_warnings
+from armscan.inspection.doubts import sigma_warnings
 from armscan.inspection.features import relate
 from armscan.inspection.recipe import (
     FollowedRecipe,

@@ -8,12 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.inspection.conformity import (
-    COVERAGE,
-    arc_warnings,
-    seed_warnings,
-    shape_warnings,
-)
+from armscan.inspection.conformity import COVERAGE
+from armscan.inspection.doubts import arc_warnings, seed_warnings, shape_warnings
 from armscan.inspection.features import FeatureInspection, MeasuredAngle, Relation
 from armscan.inspection.results import MeasuredLength, PointCounts
 from armscan.records.cloud import PointCloud

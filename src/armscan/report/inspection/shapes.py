@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.inspection.conformity import (
-    COVERAGE,
+from armscan.inspection.conformity import COVERAGE
+from armscan.inspection.doubts import (
     face_warnings,
     lean_warnings,
     outlier_warnings,

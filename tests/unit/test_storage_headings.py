@@ -15,8 +15,11 @@ POINTS = [[1.5, -2.0, 3.25], [4.0, 5.0, -6.5], [7.0, 8.5, 9.0]]
 NUMBERED = [[float(k), *point] for k, point in enumerate(POINTS, start=1)]
 WITH_GREY = [[*point, 7.0] for point in POINTS]
 WITH_COLOURS = [[*point, 7.0, 8.0, 9.0] for point in POINTS]
+WITH_TIME = [[12.0, *POINTS[0]], [12.5, *POINTS[1]], [13.0, *POINTS[2]]]
+WITH_NORMALS = [[*point, 0.0, 0.6, 0.8] for point in POINTS]
 UNKNOWN = "does not say which of"
 NOT_ONE_EACH = "does not give one name to each of"
+PROSE_OR_NAMES = "may be prose or the names of"
 
 
 def table(path: Path, opening: str, rows: list[list[float]], separator: str = " ") -> Path:
@@ -55,7 +58,10 @@ def test_a_number_before_the_coordinates_is_not_taken_for_x(
     """Of `#` lines and of nameless first columns it was: x, y, z were number, x, y."""
     found = read(tmp_path / "c.txt", opening, NUMBERED, separator)
     assert found.cloud.points_mm.tolist() == POINTS
-    assert found.remarks == ()
+    by_comment = opening.startswith(("#", "/", "3")) and not opening.endswith("\nid x y z")
+    assert [text[:35] for text in found.remarks] == [
+        "x, y and z are columns 2, 3 and 4, "
+    ] * by_comment
 
 
 def test_what_numpy_writes_with_a_header_is_read_by_it(tmp_path: Path) -> None:
@@ -110,7 +116,6 @@ def test_what_is_plain_stays_as_it_was(
         ("ID,Xcoord,Ycoord,Zcoord", NUMBERED, UNKNOWN),
         ("point,east,north,up", NUMBERED, UNKNOWN),
         ("# point east north up", NUMBERED, UNKNOWN),
-        ("Points:0,Points:1,Points:2,grey", WITH_GREY, UNKNOWN),
         ("id,x,y", POINTS, UNKNOWN),
         ("Zcoord,Ycoord,Xcoord", POINTS, UNKNOWN),
         ("pos_y pos_x pos_z", POINTS, UNKNOWN),
@@ -118,6 +123,22 @@ def test_what_is_plain_stays_as_it_was(
         ("# z y x in mm", POINTS, NOT_ONE_EACH),
         ("Point Id X Y Z Grey", [[1.0, *WITH_GREY[0]]], NOT_ONE_EACH),
         ("x y z", NUMBERED, NOT_ONE_EACH),
+        ("Point Cloud", WITH_GREY, UNKNOWN),
+        ("Data X Y Z", WITH_GREY, PROSE_OR_NAMES),
+        ("points x y z", WITH_GREY, PROSE_OR_NAMES),
+        ("# time x y z", WITH_TIME, PROSE_OR_NAMES),
+        ("# time x y z in mm", WITH_TIME, NOT_ONE_EACH),
+        ("# columns 2-4: x, y, z; column 1: time", WITH_TIME, NOT_ONE_EACH),
+        ("# 1: id, 2: x, 3: y, 4: z", NUMBERED, NOT_ONE_EACH),
+        ("# points: x y z", NUMBERED, PROSE_OR_NAMES),
+        ("# Coordinates x y z", NUMBERED, PROSE_OR_NAMES),
+        ("# Each row: x y z intensity", NUMBERED, NOT_ONE_EACH),
+        ("# x y z in mm", NUMBERED, NOT_ONE_EACH),
+        ("# points x y z", WITH_TIME[:1], PROSE_OR_NAMES),
+        ("# id y x h", NUMBERED, UNKNOWN),
+        ("# Scanned with Artec Eva", NUMBERED, UNKNOWN),
+        ("# Nr rechts hoch hoehe", [[101.1, *POINTS[0]], [101.2, *POINTS[1]]], UNKNOWN),
+        ("# time pos_x pos_y pos_z", WITH_TIME, UNKNOWN),
         ("# x y z", NUMBERED, NOT_ONE_EACH),
     ],
 )
@@ -129,6 +150,91 @@ def test_columns_that_are_not_told_are_refused(
         read_cloud_file(path)
     assert "x, y" in caught.value.remedy
     assert "c.xyz" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("opening", "rows"),
+    [
+        ("# points: x y z", WITH_GREY),
+        ("# Coordinates x y z", WITH_GREY),
+        ("// Data X Y Z", WITH_GREY),
+        ("# points x y z", WITH_GREY),
+        ("# scan A, order x y z", WITH_COLOURS),
+        ("# scan A, order x y z", WITH_NORMALS),
+        ("# export of x y z intensity", WITH_COLOURS),
+        ("# export of x y z intensity", WITH_NORMALS),
+        ("# columns 1-3: x, y, z; column 4: intensity", WITH_GREY),
+        ("# Each row: x y z intensity", WITH_GREY),
+        ("# Columns are x y z", WITH_GREY),
+        ("# Points (x, y, z) and grey", WITH_GREY),
+        ("# scan no 5, order x y z", WITH_GREY),
+        ("# Z, Y, X Axes follow ISO 841", POINTS),
+        ("# x to the right, y up, z back", WITH_GREY),
+        ("# Scanned with Artec Eva", WITH_GREY),
+        ("# Copyright Acme Metrology GmbH", WITH_GREY),
+        ("# Points measured with Eva", WITH_GREY),
+        ("# Points from Eva", POINTS),
+    ],
+)
+def test_prose_that_has_as_many_words_as_columns_moves_none(
+    tmp_path: Path, opening: str, rows: list[list[float]]
+) -> None:
+    """The first were read from columns 2 to 4, without a word; the last were refused."""
+    found = read(tmp_path / "c.xyz", opening, rows)
+    assert found.cloud.points_mm.tolist() == POINTS
+    (remark,) = found.remarks
+    assert "the first three columns were taken for x, y and z" in remark
+
+
+@pytest.mark.parametrize(
+    "opening", ["# time,x,y,z", "# columns: time x y z", "# intensity x y z", "# time;x;y;z"]
+)
+def test_other_columns_before_x_are_named_with_commas_or_after_columns(
+    tmp_path: Path, opening: str
+) -> None:
+    found = read(tmp_path / "c.xyz", opening, WITH_TIME)
+    assert found.cloud.points_mm.tolist() == POINTS
+    (remark,) = found.remarks
+    assert "x, y and z are columns 2, 3 and 4" in remark
+
+
+@pytest.mark.parametrize(
+    ("opening", "rows"),
+    [
+        ("Points:0,Points:1,Points:2", POINTS),
+        ('"Points:0","Points:1","Points:2"', POINTS),
+        ('"Points_0","Points_1","Points_2","grey"', WITH_GREY),
+        ("time,Points:0,Points:1,Points:2", WITH_TIME),
+        ("Points:2,Points:1,Points:0", [point[::-1] for point in POINTS]),
+    ],
+)
+def test_headings_of_paraview_are_read(
+    tmp_path: Path, opening: str, rows: list[list[float]]
+) -> None:
+    assert read(tmp_path / "c.csv", opening, rows, ",").cloud.points_mm.tolist() == POINTS
+
+
+@pytest.mark.parametrize(("opening", "rows"), [("# id x y z", NUMBERED), ("x y z", POINTS)])
+def test_points_that_numpy_wrote_are_counted_as_others_are(
+    tmp_path: Path, opening: str, rows: list[list[float]]
+) -> None:
+    """It writes 1.000e+00: under a comment that names fewer columns these are numbers, no x."""
+    path = tmp_path / "c.xyz"
+    np.savetxt(path, np.array(rows), header=opening.strip("# "))
+    assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS
+    np.savetxt(path, np.array(NUMBERED), header="points: x y z")
+    with pytest.raises(FileFormatError, match=PROSE_OR_NAMES):
+        read_cloud_file(path)
+
+
+def test_decimal_commas_are_named_where_there_are_commas(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text("x,y,z\n1,5,2,5,3,5\n")
+    with pytest.raises(FileFormatError, match="twice as many numbers as columns"):
+        read_cloud_file(path)
+    path.write_text("My Point Cloud\n1.5,2,3,4,5,6\n")
+    with pytest.raises(FileFormatError, match=UNKNOWN):
+        read_cloud_file(path)
 
 
 @pytest.mark.parametrize(

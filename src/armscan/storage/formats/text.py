@@ -2,9 +2,9 @@
 """Points as text: XYZ and ASC with positions alone, CSV with all columns, and tables of other
 programs.
 
-Of these a heading is a bare line of names, or a ``#`` or ``//`` line with one name a column. Where
-the lines leave open which columns are meant the table is refused: a point's number taken for its x
-is not seen in the result.
+Of these a heading is a bare line of names, or a ``#`` or ``//`` line with one name a column that is
+no prose. Where the lines leave open which columns are meant the table is refused: a point's number
+taken for its x is not seen in the result.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -58,16 +58,25 @@ KNOWN = {
     **{name: name for name in (*POINT, *NORMAL, *COVARIANCE, *WHOLE, NOISE_LENGTH)},
     **{name: name for name in ("sigma_noise_mm", "intensity")},
     **{f"{name}_mm": name for name in POINT},
+    **{f"points{mark}{k}": name for mark in ":_" for k, name in enumerate(POINT)},
 }
-"""Columns that are read, by their names in a heading."""
+"""Columns that are read, by their names in a heading; ``Points:0`` is ParaView's."""
 FIRST_THREE: Mapping[str, int] = {name: k for k, name in enumerate(POINT)}
 COMMENT_MARKS = ("#", "//")
 COLUMNS_ARE = re.compile(r"^(columns?|fields?|format|header)\s*[:=\s]\s*", re.IGNORECASE)
 """Before the names of columns in a comment: ``# columns: id x y z``."""
+NAMES_FOLLOW = re.compile(r"(columns?|fields?)\s*[:=]", re.IGNORECASE)
+INTRODUCING = (
+    *("are", "as", "columns", "coordinates", "coords", "data", "fields", "format"),
+    *("in", "is", "lines", "of", "order", "rows"),
+)
+"""Words of prose before x, y and z, which name no column: ``# export of x y z intensity``."""
+FIRST_COLUMNS = re.compile(r"1(-|\.\.)3|0(-|\.\.)2")
+AXES = {"axes", "axis", "directions"}
 POINT_NUMBER = re.compile(
     r"((points?|pt|vertex|row)[ _.-]*)?(id|nr|no|num|number|index|idx|name)?\.?", re.IGNORECASE
 )
-"""Names of a column that says which point it is."""
+"""Names of a column that says which point it is; without the last part they are words of prose."""
 EMPTY_FIELD = re.compile(r"(^|[,;])[ \t]*(?=[,;])", re.MULTILINE)
 """Nothing between two separators: a value that is missing, which must not move the next ones."""
 UNIT_IN_BRACKETS = re.compile(r"(\w)[ \t]*[\[(][ \t]*([A-Za-z]+)[ \t]*[\])]")
@@ -126,7 +135,8 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
     for line in filled:
         _refuse_decimal_commas(line, path)
     n_named = len(words_of(opening.heading))
-    if n_named > 1 and len(words_of(filled[0])) == 2 * n_named:
+    may_have_commas = "," in filled[0] and "." not in filled[0]
+    if may_have_commas and n_named > 2 and len(words_of(filled[0])) == 2 * n_named:
         raise FileFormatError(
             f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'",
             where=path_text(path),
@@ -156,7 +166,7 @@ class Opening:
     heading
         The bare line of names; empty without one.
     comments
-        Text of the ``#`` and ``//`` lines, without words such as ``columns:`` before it.
+        Text of the ``#`` and ``//`` lines.
     """
 
     n_lines: int
@@ -179,7 +189,7 @@ def opening_of(lines: Sequence[str], path: Path) -> Opening:
     for k, line in enumerate(lines):
         text = line.strip()
         if text.startswith(COMMENT_MARKS):
-            comments.append(COLUMNS_ARE.sub("", text.lstrip("#/ ")))
+            comments.append(text.lstrip("#/ "))
             continue
         words = words_of(line)
         if not words:
@@ -216,20 +226,75 @@ def named_columns(opening: Opening, rows: Sequence[str], path: Path) -> NamedCol
     FileFormatError
         If it leaves open which columns are x, y and z, or they are in another unit than mm.
     """
-    counts = _counts(rows[0])
     headings = [opening.heading] if opening.heading else []
-    for text in (*headings, *reversed(opening.comments)):
-        names = _names(text, counts)
-        numbers = _numbers(names)
-        if set(POINT) <= set(numbers) and len(names) in counts:
-            read = set(numbers.values())
-            passed_over = (word for k, word in enumerate(names) if k not in read and word)
-            return NamedColumns(numbers, tuple(passed_over))
+    for text in headings:
+        if (found := _named(text, rows)) and not _is_prose(text, found.numbers, rows):
+            return found
+    for text in reversed(opening.comments):
+        found = _named(COLUMNS_ARE.sub("", text), rows)
+        if found and _are_names(text, found.numbers, rows):
+            return _remarked(found, text)
     for text in (*headings, *opening.comments):
         _refuse_units(words_of(text), path)
     if opening.heading:
         return _by_heading(opening.heading, rows, path)
     return _by_comments(opening.comments, rows, path)
+
+
+def _named(text: str, rows: Sequence[str]) -> NamedColumns | None:
+    """Columns by a line with as many names as these, x, y and z among them; else None."""
+    counts = _counts(rows[0])
+    names = _names(text, counts)
+    numbers = _numbers(names)
+    if not set(POINT) <= set(numbers) or len(names) not in counts:
+        return None
+    read = set(numbers.values())
+    passed_over = (word for k, word in enumerate(names) if k not in read and word)
+    return NamedColumns(numbers, tuple(passed_over))
+
+
+def _is_prose(heading: str, numbers: Mapping[str, int], rows: Sequence[str]) -> bool:
+    """Whether a bare line between blanks says ``Data X Y Z``, which is one word more."""
+    if _separated(heading, _counts(rows[0])):
+        return False
+    before = words_of(heading)[: min(numbers[name] for name in POINT)]
+    return any(_introduces(word, rows) for word in before)
+
+
+def _are_names(comment: str, numbers: Mapping[str, int], rows: Sequence[str]) -> bool:
+    """Whether a comment of as many words as columns names these.
+
+    Prose may have as many by chance, as ``# points: x y z`` over four columns has.
+    """
+    text, counts = COLUMNS_ARE.sub("", comment), _counts(rows[0])
+    separated = _separated(text, counts)
+    names = separated or words_of(text)
+    before = names[: max(numbers[name] for name in POINT)]
+    if all(_is_name(name, k, rows, is_sure=bool(separated)) for k, name in enumerate(before)):
+        return True
+    if separated:
+        return all(len(name.split()) <= 1 for name in names)
+    return bool(NAMES_FOLLOW.match(comment)) and not any(_introduces(w, rows) for w in before)
+
+
+def _is_name(name: str, k: int, rows: Sequence[str], *, is_sure: bool) -> bool:
+    """Whether a word is the name of a known column, or of points' numbers, that fits column k."""
+    plain = _plain(name)
+    known, number = KNOWN.get(plain), POINT_NUMBER.fullmatch(plain)
+    if is_sure:
+        return bool(known or number)
+    if known:
+        return known not in WHOLE or _are_whole(rows, k)
+    return number is not None and (bool(number[3]) or (k == 0 and _are_counted(rows)))
+
+
+def _remarked(found: NamedColumns, text: str) -> NamedColumns:
+    """The same, with a remark where x, y and z are not the first three columns."""
+    at = [found.numbers[name] for name in POINT]
+    if at == list(FIRST_THREE.values()):
+        return found
+    columns = "columns {}, {} and {}".format(*(k + 1 for k in at))
+    return replace(found, remarks=(f"x, y and z are {columns}, as {_quoted(text)} names them",))
 
 
 def _by_heading(heading: str, rows: Sequence[str], path: Path) -> NamedColumns:
@@ -245,7 +310,7 @@ def _by_heading(heading: str, rows: Sequence[str], path: Path) -> NamedColumns:
     numbers = _numbers(words)
     if set(POINT) <= set(numbers):
         if any(numbers[name] != k for name, k in FIRST_THREE.items()):
-            raise _not_one_each(heading, n_columns, path)
+            raise _unclear(heading, words, n_columns, path)
         _refuse_numbers_first(heading, words, rows, path)
         return NamedColumns(numbers)
     is_title = len(words) == 1
@@ -258,25 +323,16 @@ def _by_heading(heading: str, rows: Sequence[str], path: Path) -> NamedColumns:
 
 def _by_comments(comments: Sequence[str], rows: Sequence[str], path: Path) -> NamedColumns:
     """Columns of a table without a heading, where no comment gives each column its name."""
-    counts, n_columns = _counts(rows[0]), len(words_of(rows[0]))
+    n_columns = len(words_of(rows[0]))
+    remarks: tuple[str, ...] = ()
     for text in comments:
-        words = words_of(text)
-        order = [KNOWN.get(_plain(word), "") for word in words]
-        runs = [k for k in range(len(order) - 2) if set(order[k : k + 3]) == set(POINT)]
-        if not runs:
-            continue
-        is_in_order = order[runs[0] : runs[0] + 3] == list(POINT)
-        if not is_in_order or (n_columns > len(POINT) and runs[0] > 0):
-            raise _not_one_each(text, n_columns, path)
-        _refuse_numbers_first(text, words, rows, path)
-        return NamedColumns(FIRST_THREE)
-    last = comments[-1] if comments else ""
-    names = _names(last, counts)
-    is_heading = len(names) in counts and len(names) >= len(POINT)
-    # prose has colons and numbers, names of columns have none
-    if is_heading and all(re.fullmatch(r"[\W_]*[A-Za-z][^:]*", word) for word in words_of(last)):
-        _refuse_unknown(last, names, rows, path)
-        return NamedColumns(FIRST_THREE, remarks=_taken(last))
+        told = _told_in_prose(text, rows, path)
+        if told == ():
+            return NamedColumns(FIRST_THREE)
+        remarks = remarks or told or ()
+    last = COLUMNS_ARE.sub("", comments[-1]) if comments else ""
+    if remarks or _may_be_names(last, rows, path):
+        return NamedColumns(FIRST_THREE, remarks=remarks or _taken(comments[-1]))
     if n_columns > len(POINT) and len(rows) >= LEAST_COUNTED and _are_counted(rows):
         return NamedColumns(
             FIRST_THREE,
@@ -288,17 +344,97 @@ def _by_comments(comments: Sequence[str], rows: Sequence[str], path: Path) -> Na
     return NamedColumns(FIRST_THREE)
 
 
-def _refuse_unknown(text: str, names: Sequence[str], rows: Sequence[str], path: Path) -> None:
-    """Raise where names without x, y and z are not those of three coordinates in their order."""
+def _told_in_prose(comment: str, rows: Sequence[str], path: Path) -> tuple[str, ...] | None:
+    """Remarks on a comment that has x, y and z in it, after which the first three columns are read.
+
+    None where it has not.
+    """
+    words, n_columns = words_of(COLUMNS_ARE.sub("", comment)), len(words_of(rows[0]))
+    order = [KNOWN.get(_plain(word.strip("()[]:.")), "") for word in words]
+    if not set(POINT) <= set(order):
+        return None
+    runs = [k for k in range(len(order) - 2) if set(order[k : k + 3]) == set(POINT)]
+    start, end = (runs[0], runs[0] + 3) if runs else (len(words), len(words))
+    before, has_more = words[:start], n_columns > len(POINT)
+    is_ordered = not runs or order[start:end] == list(POINT)
+    is_numbered = has_more and _are_counted(rows)
+    if has_more or _are_counted(rows):
+        is_numbered = is_numbered or _speak_of_numbers(before, rows)
+    if is_numbered or not (is_ordered or " ".join(words[end : end + 1]).lower() in AXES):
+        raise _unclear(comment, words, n_columns, path)
+    if is_ordered and (start == 0 or not has_more):
+        return ()
+    is_named = bool(runs) and start > 0 and has_more and words[start][0] not in "(["
+    if is_named and not _introduces(before[-1], rows):
+        raise _unclear(comment, words, n_columns, path)
+    return _taken(comment, n_columns)
+
+
+def _speak_of_numbers(words: Sequence[str], rows: Sequence[str]) -> bool:
+    """Whether some words before x, y and z name points' numbers, which the first column may be."""
+    named = [_is_sure_number(word) for word in words]
+    return any(named) and (named[-1] or _are_whole(rows, 0))
+
+
+def _may_be_names(last: str, rows: Sequence[str], path: Path) -> bool:
+    """Whether a comment without x, y and z may name the columns.
+
+    Raises
+    ------
+    FileFormatError
+        If these may be others than x, y and z in the first three.
+    """
+    counts = _counts(rows[0])
+    names = _names(last, counts)
+    if len(names) not in counts or len(names) < len(POINT):
+        return False
+    # prose has colons and numbers, names of columns have none
+    if not all(re.fullmatch(r"[\W_]*[A-Za-z][^:]*", word) for word in words_of(last)):
+        return False
+    is_prose = not _separated(last, counts) and not _numbers(names)
+    _refuse_unknown(last, names, rows, path, is_prose=is_prose)
+    return True
+
+
+def _introduces(word: str, rows: Sequence[str]) -> bool:
+    """Whether a word before x, y and z belongs to prose and names no column."""
+    plain = _plain(word).strip("([:=")
+    if any(letter.isdecimal() for letter in plain):
+        return FIRST_COLUMNS.fullmatch(plain) is not None
+    if word.endswith((":", "=", "(")) or plain in INTRODUCING:
+        return True
+    number = POINT_NUMBER.fullmatch(plain)
+    return number is not None and not number[3] and not _are_whole(rows, 0)
+
+
+def _is_sure_number(word: str) -> bool:
+    """Whether a word names points' numbers, as ``point``, a word of prose, does not."""
+    number = POINT_NUMBER.fullmatch(_plain(word).strip("([:="))
+    return number is not None and bool(number[3])
+
+
+def _refuse_unknown(
+    text: str, names: Sequence[str], rows: Sequence[str], path: Path, *, is_prose: bool = False
+) -> None:
+    """Raise where names without x, y and z are not those of three coordinates in their order.
+
+    Of what may be prose only where something in it, or in the rows, speaks for other columns.
+    """
     n_columns = len(words_of(rows[0]))
     if len(names) not in _counts(rows[0]):
         return
     plain = [_plain(name) for name in names]
-    if n_columns > len(POINT) or (plain[0] and POINT_NUMBER.fullmatch(plain[0])):
+    has_more = n_columns > len(POINT)
+    if has_more and (not is_prose or _are_counted(rows)):
+        raise _no_names(text, n_columns, path)
+    is_word_of_prose = POINT_NUMBER.fullmatch(plain[0]) and not _is_sure_number(plain[0])
+    if plain[0] and (_is_sure_number(plain[0]) or (is_word_of_prose and _are_whole(rows, 0))):
         raise _no_names(text, n_columns, path)
     for at in (0, -1):
         letters = "".join(name[at] for name in plain if name)
-        if letters != "xyz" and sorted(letters) == list("xyz"):
+        triples = [letters[k : k + 3] for k in range(len(letters) - 2)]
+        others = [three for three in triples if sorted(three) == list("xyz")]
+        if others and triples[0] != "xyz":
             raise _no_names(text, n_columns, path)
 
 
@@ -311,11 +447,19 @@ def _refuse_numbers_first(text: str, words: Sequence[str], rows: Sequence[str], 
 
 def _are_counted(rows: Sequence[str]) -> bool:
     """Whether rows begin with whole numbers that go up by one."""
-    first = [words_of(row)[0] for row in rows]
-    if not all(word.isdecimal() and len(word) < 16 for word in first):
+    if len(rows) < 2 or not _are_whole(rows, 0):
         return False
-    numbers = [int(word) for word in first]
-    return len(numbers) > 1 and numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    first = [float(_fields(row)[0]) for row in rows]
+    return all(after - before == 1.0 for before, after in pairwise(first))
+
+
+def _are_whole(rows: Sequence[str], k: int) -> bool:
+    """Whether column k holds whole numbers alone, however they are written, none below 0."""
+    words = [_fields(row)[k : k + 1] for row in rows]
+    return all(
+        word and reads_as_float(word[0]) and float(word[0]).is_integer() and float(word[0]) >= 0.0
+        for word in words
+    )
 
 
 def _refuse_units(words: Iterable[str], path: Path) -> None:
@@ -327,17 +471,34 @@ def _refuse_units(words: Iterable[str], path: Path) -> None:
     refuse_other_units(names, path_text(path))
 
 
-def _taken(text: str) -> tuple[str, ...]:
+def _taken(text: str, n_columns: int = 0) -> tuple[str, ...]:
+    """Of a line without the names of x, y and z, or without those of all of some columns."""
+    lacks = f"give one name to each of {n_columns} columns" if n_columns else "name x, y and z"
     return (
-        f"'{text[:LONGEST_SHOWN].strip()}' does not name x, y and z: the first three columns were "
-        "taken for these, in mm",
+        f"{_quoted(text)} does not {lacks}: the first three columns were taken for x, y and z, in "
+        "mm",
+    )
+
+
+def _quoted(text: str) -> str:
+    return f"'{text[:LONGEST_SHOWN].strip()}'"
+
+
+def _unclear(text: str, words: Sequence[str], n_columns: int, path: Path) -> FileFormatError:
+    """Of a comment that has as many words as there are columns, or another count."""
+    if len(words) != n_columns:
+        return _not_one_each(text, n_columns, path)
+    return FileFormatError(
+        f"{_quoted(text)} may be prose or the names of {n_columns} columns",
+        where=path_text(path),
+        remedy="write commas between the names, as 'id,x,y,z', or delete the line if the first "
+        "three columns are x, y and z",
     )
 
 
 def _no_names(text: str, n_columns: int, path: Path) -> FileFormatError:
     return FileFormatError(
-        f"'{text[:LONGEST_SHOWN].strip()}' does not say which of {n_columns} columns are x, y "
-        "and z",
+        f"{_quoted(text)} does not say which of {n_columns} columns are x, y and z",
         where=path_text(path),
         remedy=NAME_THEM,
     )
@@ -345,7 +506,7 @@ def _no_names(text: str, n_columns: int, path: Path) -> FileFormatError:
 
 def _not_one_each(text: str, n_columns: int, path: Path) -> FileFormatError:
     return FileFormatError(
-        f"'{text[:LONGEST_SHOWN].strip()}' does not give one name to each of {n_columns} columns",
+        f"{_quoted(text)} does not give one name to each of {n_columns} columns",
         where=path_text(path),
         remedy="name every column in that line, x, y and z among them",
     )
@@ -366,6 +527,11 @@ def _plain(name: str) -> str:
 
 def _names(text: str, counts: set[int]) -> list[str]:
     """Names in a heading, which may hold blanks where a separator gives each column its own."""
+    return _separated(text, counts) or words_of(text)
+
+
+def _separated(text: str, counts: set[int]) -> list[str]:
+    """Fields of a line between separators that give each column one; empty without."""
     text = UNIT_IN_BRACKETS.sub(r"\1_\2", text).strip(" \r\n")
     for separator in (",", ";", "\t"):
         fields = [field.strip() for field in text.split(separator)]
@@ -373,7 +539,12 @@ def _names(text: str, counts: set[int]) -> list[str]:
             fields.pop()
         if len(fields) > 1 and len(fields) in counts:
             return fields
-    return words_of(text)
+    return []
+
+
+def _fields(row: str) -> list[str]:
+    """Words of a row, of which missing ones are kept."""
+    return words_of(EMPTY_FIELD.sub(r"\1nan", row.strip()))
 
 
 def _counts(row: str) -> set[int]:

@@ -170,8 +170,9 @@ def test_the_offset_from_a_badly_touched_plate_is_as_uncertain_as_the_plate(
     found = report(capsys, *words, "--plate", plate)
     nominal = found["nominal"]
     assert isinstance(nominal, dict)
-    # over the middle of the touches: their scatter, 0.22 mm, over the root of six of them
-    assert 0.07 < nominal["offset_sigma_plate_mm"] < 0.15
+    # over the middle of the touches: their scatter, 0.22 mm or what is expected of it, over the
+    # root of six of them, and 0.4 of it by the tip
+    assert 0.1 < nominal["offset_sigma_plate_mm"] < 0.15
     assert nominal["offset"]["sigma_mm"] >= nominal["offset_sigma_plate_mm"]
     assert nominal["offset_u_mm"] == pytest.approx(2.0 * nominal["offset"]["sigma_mm"])
     for option, value, is_told in (("--plate", exact, True), ("--plane", "0,0,1,0", False)):

@@ -518,11 +518,12 @@ def _seen_by_all(
 
 def distance_by_plate(plate: PlateReference, points_mm: FloatArray) -> FloatArray:
     """(N, 3) derivative of distances by independent errors of the probed plane, one sigma each."""
-    if plate.covariance is None:
+    covariance = plate.covariance_with_tip
+    if covariance is None:
         return np.zeros((len(points_mm), 0))
     away = (points_mm - plate.plane.point_mm) @ plate.plane.axes.T
     lever = np.column_stack([away[:, 0], away[:, 1], np.ones(len(away))])
-    values, vectors = np.linalg.eigh(plate.covariance)
+    values, vectors = np.linalg.eigh(covariance)
     return np.asarray(lever @ vectors * np.sqrt(np.maximum(values, 0.0)))
 
 

@@ -187,9 +187,9 @@ def verify_on_plate(
         by_standard=distance_by_plate(plate, points),
     )
     told, u, unknown = found, options.reference_u_mm, ("the plate's own uncertainty is not known",)
-    if plate.covariance is not None:
+    if (covariance := plate.covariance_with_tip) is not None:
         # not in the offset of the check, whose U holds it beside what the scan scatters by
-        told = with_reference_errors(found, plate.covariance)
+        told = with_reference_errors(found, covariance)
         u = max(u, COVERAGE * told.reference_sigma_mm)
     return _judged(
         _Evidence(
@@ -205,7 +205,7 @@ def verify_on_plate(
         ("height", "of the scanned plane over the probed one, at the middle of the points"),
         offset.value_mm,
         replace(options, reference_u_mm=u),
-        warnings=() if plate.covariance is not None else unknown,
+        warnings=() if covariance is not None else unknown,
     )
 
 

@@ -17,10 +17,10 @@ from armscan.calibration.hand_eye.noise import (
     estimate_noise,
     solve_linear,
 )
-from armscan.calibration.hand_eye.observations import HandEyeOptions
+from armscan.calibration.hand_eye.observations import TIP_SHARE, HandEyeOptions
 from armscan.calibration.hand_eye.probed_plate import ProbingOptions, fit_probed_plate
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.surface import TIP_SHARE, PlateSurface
+from armscan.calibration.hand_eye.surface import PlateSurface
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import N_DRAWS, normal_draws
@@ -156,6 +156,32 @@ def test_a_tip_is_known_as_from_twenty_touches() -> None:
     exact = replace(plate, covariance=None)
     assert PlateSurface(exact).prior(HandEyeOptions()) is None
     assert PlateSurface(plate).prior(HandEyeOptions(solve_plate=True)) is None
+
+
+def test_a_probed_plate_lies_as_far_off_as_is_stated_with_the_tip() -> None:
+    """Drawn 400 times: a tip from 20 touches of a sphere, then 20 touches of a plate at Z = -3 mm.
+
+    The touches alone state half of how far the plate lies off; 5 % by chance.
+    """
+    rng, errors, alone, stated = np.random.default_rng(21), [], [], []
+    sigma_mm = ProbingOptions().touch_sigma_mm
+    for _ in range(400):
+        way = rng.normal(size=(20, 3))
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        tip = np.linalg.lstsq(way, sigma_mm * rng.normal(size=20), rcond=None)[0]
+        height = tip[2] + sigma_mm * rng.normal(size=20)
+        points = np.column_stack([rng.uniform(-100.0, 100.0, (20, 2)), height])
+        probed = fit_probed_plate(ProbedPoints(points, 6.0), np.array([0.0, 0.0, 300.0]))
+        assert not isinstance(probed, FitFailure)
+        plate = probed.reference
+        assert plate.covariance is not None
+        assert plate.covariance_with_tip is not None
+        errors.append((plate.plane.point_mm[2] + 3.0) ** 2)
+        alone.append(plate.covariance[2, 2])
+        stated.append(plate.covariance_with_tip[2, 2])
+    rms = np.sqrt(np.mean(errors))
+    assert rms == pytest.approx(np.sqrt(np.mean(stated)), rel=0.1)
+    assert rms > 1.7 * np.sqrt(np.mean(alone))
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from armscan.inspection.results import PlaneInspection
 from armscan.models.calibration import ScannerCalibration
 from armscan.models.camera import CameraModel
 from armscan.pipeline.scan import ScanOptions, ScanReconstruction, measure_scan
-from armscan.pipeline.truth import distance_by_calibration
+from armscan.pipeline.truth import distance_by_calibration, distance_by_plate
 from armscan.pipeline.verify import Measured, VerifyOptions, verify_on_plate
 from armscan.reconstruction.labels import LabelledProfile
 from armscan.reconstruction.place import BaseTransform, merge_clouds, propagate_to_base
@@ -100,6 +100,17 @@ PLATE = PlateReference(
 )
 
 
+def test_distances_depend_on_the_plate_as_touches_and_tip_err() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [80.0, -60.0, 0.3]])
+    found = distance_by_plate(PLATE, points)
+    of_touches = 0.002**2 + 1e-10 * np.array([0.0, 80.0**2 + 60.0**2])
+    np.testing.assert_allclose((found**2).sum(axis=1), of_touches + 0.16 * 12.0 * 0.002**2)
+    exact = replace(PLATE, covariance=np.zeros((3, 3)), n_points=0)
+    assert not distance_by_plate(exact, points).any()
+    unknown = PlateReference(plane=PLATE.plane)
+    assert distance_by_plate(unknown, points).shape == (2, 0)
+
+
 def scanner_with(shift_mm: FloatArray) -> ScannerCalibration:
     """The fake's scanner with a hand-eye that is wrong by a shift in Tool."""
     true = scan_fake.scanner()
@@ -132,7 +143,9 @@ def test_a_head_that_has_moved_on_a_plate(
     assert isinstance(bare, PlaneInspection)
     assert told.offset is not None
     assert bare.offset is not None
-    assert told.reference_sigma_mm >= 0.002
+    # of touches 0.002 mm there, of the tip 0.4 of what one of the twelve scatters by
+    by_tip = 0.4 * np.sqrt(12.0) * 0.002
+    assert told.reference_sigma_mm == pytest.approx(np.hypot(0.002, by_tip), rel=0.05)
     both = np.hypot(bare.offset.sigma_mm, told.reference_sigma_mm)
     assert told.offset.sigma_mm == pytest.approx(both)
     assert place.uncertainty == pytest.approx(

@@ -44,6 +44,10 @@ SAME_POSTURE_RAD = float(np.radians(0.5))
 scatter by 0.06 mm, 30 mm from where its pose turns, is within it too. Other postures lie degrees
 apart."""
 STANDING_SIGMAS = 10.0
+TIP_SHARE = 0.4
+"""What the tip's own calibration errs by, over what touches scatter by: the root of 3/20, as of a
+centre (three unknowns) found by twenty touches. It is alike in all touches of the plate, which
+shift together."""
 N_PAIRS, MAX_COUNTED = 80, 400
 """Lines through so many pairs of points are tried, each counted on so many points."""
 LEAST_SIGMA_MM = 1e-4
@@ -173,7 +177,7 @@ class PlateReference(ArrayRecord):
         Plane in Base; its normal points to the side from which it was probed and is scanned.
     covariance
         (3, 3) of `armscan.geometry.shapes.PLANE_PARAMETERS` (rad, rad, mm) at ``plane.point_mm``,
-        without the arm's systematic part; None where it is not known, as of A, B, C, D alone.
+        as touches scatter; None where it is not known, as of A, B, C, D alone.
     rms_mm
         Root mean square distance of the probed points from the plane; None where not known.
     n_points
@@ -198,6 +202,18 @@ class PlateReference(ArrayRecord):
         if self.covariance is None or not self.n_points:
             return None
         return float(np.sqrt(self.n_points * self.covariance[2, 2]))
+
+    @property
+    def covariance_with_tip(self) -> FloatArray | None:
+        """(3, 3) as ``covariance``, with what the tip shifts all touches by; None as that is.
+
+        That is `TIP_SHARE` of `touch_sigma_mm`. What the arm errs alike in all touches is not in
+        it.
+        """
+        if self.covariance is None:
+            return None
+        tip_mm = TIP_SHARE * (self.touch_sigma_mm or 0.0)
+        return self.covariance + np.diag([0.0, 0.0, tip_mm**2])
 
 
 class Posed(Protocol):

@@ -23,10 +23,6 @@ from armscan.geometry.shapes import Plane
 from armscan.models.calibration import HandEyeMethod
 
 N_HAND_EYE = 6
-TIP_SHARE = 0.4
-"""What the tip's own calibration errs by, over what touches scatter by: the root of 3/20, as of a
-centre (three unknowns) found by twenty touches. It is alike in all touches of the plate, which
-shift together."""
 OWN_CENTRE_STEPS = 3
 NOISE_OVER_SHIFT = 0.01
 """Of a stripe on a sphere: its noise over what arm and sensor shift it by; a direction in which it
@@ -102,14 +98,9 @@ class PlateSurface:
     def prior(self, options: HandEyeOptions) -> FloatArray | None:
         """(K, K) covariance of parameters that are held; None where they are exact or solved.
 
-        Of probed ones that of the touches, and what the tip shifts them by: `TIP_SHARE` of what a
-        touch is taken to scatter by. What the arm errs alike in all of them is not in it.
+        Of probed ones that of the touches and of the tip.
         """
-        known = self.reference.covariance
-        if options.solve_plate or known is None:
-            return None
-        tip_mm = TIP_SHARE * (self.reference.touch_sigma_mm or 0.0)
-        return known + np.diag([0.0, 0.0, tip_mm**2])
+        return None if options.solve_plate else self.reference.covariance_with_tip
 
     def plane_at(self, parameters: FloatArray) -> Plane:
         """The plane of two tilts and an offset (3,)."""

@@ -74,7 +74,7 @@ def inspect_plane(
     found = plane_of(
         cloud,
         None if reference is None else reference.plane,
-        reference_covariance=None if reference is None else reference.covariance,
+        reference_covariance=None if reference is None else reference.covariance_with_tip,
         reference_text=text,
         region=box,
         options=options,

@@ -219,10 +219,11 @@ class _LitBoards:
             return self.stripes_of(pair, colour, less_print=less_print)
 
         found: list[BoardStripes | FitFailure] = []
+        n_pairs = len(self.pairs)
+        self.progress(ProgressEvent(STRIPES_STAGE, 0, n_pairs))
         for (exposure, _), shown in in_order(stripes, self.pairs, DETECTION_THREADS):
             found.append(shown)
-            event = ProgressEvent(STRIPES_STAGE, len(found), len(self.pairs), exposure.source)
-            self.progress(event)
+            self.progress(ProgressEvent(STRIPES_STAGE, len(found), n_pairs, exposure.source))
         if self.options.stripes.line_sigma_px is None:
             for k, sigma_px in _poor_images(found, cameras, sheets):
                 again = self.stripes_of(self.pairs[k], colour, sigma_px, less_print=less_print)

@@ -184,9 +184,9 @@ def test_laser_page_names_the_points_along_an_edge_and_gives_every_status_a_colo
 
 
 def test_laser_summary_has_the_sheet_with_its_sigmas() -> None:
-    fit = laser_fit()
+    fit = replace(laser_fit(), warnings=("odd",))
     written = (Path("s.json"), Path("s.npz"), Path("s.html"))
-    summary = sheets_summary(fit, written, ("odd",), is_simulated=True)
+    summary = sheets_summary(fit, written, is_simulated=True)
     (sheet,) = summary.data["sheets"]
     assert sheet["plane_sensor_a_b_c_d_mm"] == fit.sheets[0].sheet.plane.tolist()
     sigmas = np.sqrt(np.diag(fit.sheets[0].covariance))[:3]

@@ -146,6 +146,11 @@ class ArmFlag(IntFlag):
     INACCURATE = 8
 
 
+INACCURATE = "inaccurate as the arm itself says, their poses not used"
+AT_END_STOP = "at an end stop of the arm"
+"""How samples are called that bear these flags."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmSample:
     """One sample of an arm.

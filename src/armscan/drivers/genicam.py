@@ -12,12 +12,10 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
-from armscan.devices.clocks import ContinuedCount, ExposureInUse
 from armscan.devices.inbox import Inbox
 from armscan.devices.protocols import (
     Camera,
@@ -28,60 +26,31 @@ from armscan.devices.protocols import (
     TriggerMode,
 )
 from armscan.devices.registry import needed_package, split_place
+from armscan.drivers.raw_frames import (
+    FORMATS,
+    ContinuedCount,
+    ExposureInUse,
+    RawFrame,
+    first_told,
+    image_of,
+)
 from armscan.errors import ArmscanError, DeviceError, DeviceTakenError
-from armscan.geometry.arrays import ImageArray
 from armscan.records.exposure import SensorWindow, window_of_sensor
-from armscan.records.recording import CameraSetup, PixelColour
+from armscan.records.recording import CameraSetup
 
 _EXPOSURE = ("ExposureTime", "ExposureTimeAbs")
 _GAIN = ("Gain", "GainRaw")
 _RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
 _TELLING = {"ChunkModeActive": True, "ChunkSelector": "ExposureTime", "ChunkEnable": True}
 """Has each frame tell its own exposure time."""
-_FORMATS: dict[str, tuple[int, PixelColour]] = {
-    "Mono8": (8, "mono"),
-    "Mono10": (10, "mono"),
-    "Mono12": (12, "mono"),
-    "Mono16": (16, "mono"),
-    "BayerRG8": (8, "bayer_rggb"),
-    "BayerRG10": (10, "bayer_rggb"),
-    "BayerRG12": (12, "bayer_rggb"),
-    "RGB8": (8, "rgb"),
-    "RGB8Packed": (8, "rgb"),
-}
 _N_BUFFERS = 16
 _FETCH_S = 0.1
-_CHUNKS = ("ChunkExposureTime", "ChunkExposureTimeAbs")
-"""Where a frame bears its own exposure time in us, if the camera sends it along."""
 PYLON_INSTALL = "pip install 'armscan[pylon]'"
 _MOST_FRAMES = 32
 ARAVIS_INSTALL = (
     "install your system's packages, on Debian: apt install gir1.2-aravis-0.8 python3-gi; "
     "and in a virtual environment: pip install 'pygobject<3.51'"
 )
-
-
-@dataclass(frozen=True, slots=True)
-class RawFrame:
-    """What a library delivers.
-
-    Parameters
-    ----------
-    number
-        The camera's own count.
-    t_camera_ns
-        Its time at the start of the exposure; None for a camera without clock.
-    is_complete
-        False where packets were lost.
-    exposure_us
-        As the frame itself tells; None where it does not.
-    """
-
-    image: ImageArray
-    number: int
-    t_camera_ns: int | None
-    is_complete: bool
-    exposure_us: float | None = None
 
 
 class GenICamLibrary(Protocol):
@@ -143,7 +112,8 @@ class GenICamCamera:
         self._numbers = ContinuedCount()
         self._last_camera_ns: int | None = None
         self._exposure = ExposureInUse()
-        self._is_auto = False
+        self._is_auto = self._is_set_off = False
+        self._has_asked_window = False
         self._lock = threading.RLock()
         try:
             self._setup = self._read_setup()
@@ -169,6 +139,10 @@ class GenICamCamera:
         with self._lock:
             running = self._trigger
             is_resized = settings.window is not None or settings.size_px is not None
+            if is_resized:
+                # its own settings, which are set again, state a window only where one was asked for
+                wished = settings.window
+                self._has_asked_window = wished is None or wished.is_stated
             if running is not None and is_resized:
                 self._halt()
             if settings.exposure_us is not None:
@@ -261,15 +235,23 @@ class GenICamCamera:
             with suppress(Exception):
                 self._camera.set("ChunkModeActive", False)
             if self._has_own_control():
-                self._call(lambda: self._camera.set("ExposureAuto", "Off"))
+                self._call(lambda: self._switch("ExposureAuto", "Off"))
             self._settings = self._read_settings()
         self._exposure.settle(self._settings.exposure_us)
         self._is_auto = self._has_own_control()
 
     def _has_own_control(self) -> bool:
-        """Whether the camera changes its exposure time by itself."""
-        has = self._camera.has("ExposureAuto")
-        return has and str(self._call(lambda: self._camera.get("ExposureAuto"))) != "Off"
+        """Whether the camera changes its exposure time by itself.
+
+        What was switched off here is off, in whatever words a library tells of it.
+        """
+        if self._is_set_off or not self._camera.has("ExposureAuto"):
+            return False
+        return str(self._call(lambda: self._camera.get("ExposureAuto"))) != "Off"
+
+    def _switch(self, name: str, state: str | bool) -> None:
+        self._camera.set(name, state)
+        self._is_set_off |= (name, state) == ("ExposureAuto", "Off")
 
     def _set_trigger(self, trigger: TriggerMode) -> None:
         if self._camera.has("TriggerSelector"):
@@ -292,7 +274,7 @@ class GenICamCamera:
                 continue
             for switch, state in _SWITCHES.get(name, ()):
                 if self._camera.has(switch):
-                    self._camera.set(switch, state)
+                    self._switch(switch, state)
             self._camera.set(name, value)
 
     def _apply_window(self, settings: CameraSettings) -> None:
@@ -311,17 +293,18 @@ class GenICamCamera:
     def _read_setup(self) -> CameraSetup:
         def read() -> CameraSetup:
             camera = self._camera
-            if str(camera.get("PixelFormat")) not in _FORMATS:
+            if str(camera.get("PixelFormat")) not in FORMATS:
                 camera.set("PixelFormat", "Mono8")
-            bits, colour = _FORMATS[str(camera.get("PixelFormat"))]
+            bits, colour = FORMATS[str(camera.get("PixelFormat"))]
             step = int(camera.get("BinningHorizontal")) if camera.has("BinningHorizontal") else 1
             x, y = (
                 int(camera.get(name)) * step if camera.has(name) else 0
                 for name in ("OffsetX", "OffsetY")
             )
             size_px = int(camera.get("Width")), int(camera.get("Height"))
-            place = SensorWindow(x, y, step)
-            if camera.has("SensorWidth") and camera.has("SensorHeight"):
+            is_asked = self._has_asked_window or (x, y) != (0, 0)
+            place = SensorWindow(x, y, step, is_stated=is_asked)
+            if is_asked and camera.has("SensorWidth") and camera.has("SensorHeight"):
                 sensor_px = int(camera.get("SensorWidth")), int(camera.get("SensorHeight"))
                 place = window_of_sensor(place, size_px, sensor_px)
             return CameraSetup(
@@ -393,7 +376,7 @@ class GenICamCamera:
         )  # fmt: skip
 
 
-_SWITCHES = {
+_SWITCHES: dict[str, tuple[tuple[str, str | bool], ...]] = {
     "ExposureTime": (("ExposureAuto", "Off"),),
     "ExposureTimeAbs": (("ExposureAuto", "Off"),),
     "Gain": (("GainAuto", "Off"),),
@@ -401,31 +384,6 @@ _SWITCHES = {
     "AcquisitionFrameRate": (("AcquisitionFrameRateEnable", True),),
     "AcquisitionFrameRateAbs": (("AcquisitionFrameRateEnable", True),),
 }
-
-
-def image_of(data: bytes, width: int, height: int, form: str) -> ImageArray:
-    """An array of its own of (H, W) or (H, W, 3) pixels; missing bytes at the end are black."""
-    if form not in _FORMATS:
-        raise DeviceError(
-            f"pixels of the format {form} are not read",
-            remedy=f"set PixelFormat to one of {', '.join(_FORMATS)}",
-        )
-    bits, colour = _FORMATS[form]
-    dtype: Any = np.uint8 if bits == 8 else np.uint16
-    shape = (height, width, 3) if colour == "rgb" else (height, width)
-    flat = np.zeros(int(np.prod(shape)), dtype)
-    came = np.frombuffer(data, dtype, count=min(len(data) // flat.itemsize, len(flat)))
-    flat[: len(came)] = came
-    return np.asarray(flat.reshape(shape))
-
-
-def _first_told(read: Callable[[str], Any]) -> float | None:
-    """The exposure time that a frame bears; None where it bears none."""
-    for name in _CHUNKS:
-        # libraries raise whatever they like where a frame has no such part
-        with suppress(Exception):
-            return float(read(name))
-    return None
 
 
 class AravisLibrary:
@@ -459,14 +417,15 @@ class AravisLibrary:
         return bool(self._device.is_feature_available(feature))
 
     def get(self, feature: str) -> Any:
-        """Value of a feature, by its own type."""
+        """Value of a feature, by its own type: of an enumeration the name, not its number."""
+        # Aravis hands out an enumeration as an integer, too
+        if isinstance(self._device.get_feature(feature), self._aravis.GcEnumeration):
+            return self._device.get_string_feature_value(feature)
         for read in (
             self._device.get_integer_feature_value,
             self._device.get_float_feature_value,
             self._device.get_string_feature_value,
         ):
-            if feature == "PixelFormat":
-                return self._device.get_string_feature_value(feature)
             try:
                 return read(feature)
             except Exception as error:
@@ -520,7 +479,7 @@ class AravisLibrary:
             image = image_of(buffer.get_data(), *self._shape)
             stamp = int(buffer.get_timestamp())
             is_whole = state == status.SUCCESS
-            told = _first_told(lambda name: self._chunks.get_float_value(buffer, name))
+            told = first_told(lambda name: self._chunks.get_float_value(buffer, name))
             return RawFrame(image, int(buffer.get_frame_id()), stamp or None, is_whole, told)
         finally:
             self._stream.push_buffer(buffer)
@@ -610,7 +569,7 @@ class PylonLibrary:
             number = int(result.BlockID)
             if number in _NO_BLOCK:
                 return None
-            told = _first_told(lambda name: result.ChunkDataNodeMap.GetNode(name).GetValue())
+            told = first_told(lambda name: result.ChunkDataNodeMap.GetNode(name).GetValue())
             return RawFrame(image, number, t_ns, is_whole, told)
         finally:
             result.Release()

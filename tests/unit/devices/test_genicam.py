@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -19,7 +20,8 @@ import pytest
 from armscan.devices.contract import check_camera
 from armscan.devices.protocols import Camera, CameraSettings, Frame
 from armscan.devices.registry import open_device, survey_drivers
-from armscan.drivers.genicam import GenICamCamera, RawFrame, image_of
+from armscan.drivers.genicam import AravisLibrary, GenICamCamera
+from armscan.drivers.raw_frames import RawFrame, image_of
 from armscan.errors import DeviceError, DeviceTakenError
 from armscan.records.exposure import SensorWindow
 
@@ -338,12 +340,146 @@ def test_a_camera_that_tells_no_exposure_may_not_change_it_by_itself() -> None:
     assert frame.is_timed and middles_us([frame]) == [1000.0]
 
 
-@pytest.mark.parametrize(("height", "is_stated"), [(2, False), (1, True)])
-def test_a_part_of_the_sensor_is_stated_as_a_window(height: int, is_stated: bool) -> None:
+class Stubborn(TimedLibrary):
+    """Its word for the exposure control is not the standard's."""
+
+    def get(self, feature: str) -> Any:
+        found = super().get(feature)
+        return f"AE_{found}" if feature == "ExposureAuto" else found
+
+
+@pytest.mark.parametrize("wished_us", [None, 2000.0])
+def test_what_was_switched_off_counts_as_off_whatever_it_is_called(
+    wished_us: float | None,
+) -> None:
+    library = Stubborn(ExposureAuto="Continuous")
+    camera = GenICamCamera("fake stubborn", lambda: library, "Line1")
+    if wished_us is not None:
+        camera.configure(CameraSettings(exposure_us=wished_us))
+    camera.start()
+    library.expose(1)
+    (frame,) = frames_of(camera, 1)
+    camera.close()
+    assert library.features["ExposureAuto"] == "Off" and frame.is_timed
+
+
+class Buffer:
+    """One frame of the device below."""
+
+    def __init__(self, number: int) -> None:
+        self.get_frame_id = lambda: number
+        self.get_timestamp = lambda: 12_500_000 * number
+        self.get_status = lambda: "success"
+        self.get_data = lambda: bytes(8)
+
+
+class AravisDevice:
+    """A device, camera and stream as Aravis's: an enumeration is an integer, too."""
+
+    def __init__(self) -> None:
+        self.names = {"PixelFormat": ["Mono16", "Mono8"], "ExposureAuto": ["Off", "Continuous"]}
+        self.numbers: dict[str, float] = {
+            "PixelFormat": 1, "ExposureAuto": 1, "Width": 4, "Height": 2, "ExposureTime": 2000.0,
+        }  # fmt: skip
+        self.buffers = [Buffer(1), Buffer(2)]
+        self.connect = self.push_buffer = lambda *_: None
+        self.start_acquisition = self.stop_acquisition = lambda: None
+        self.get_payload = lambda: 8
+        self.get_device = lambda: self
+        self.create_stream = lambda *_: self
+        self.create_chunk_parser = lambda: self
+
+    def is_feature_available(self, name: str) -> bool:
+        return name in self.numbers
+
+    def get_feature(self, name: str) -> Any:
+        return Enumeration() if name in self.names else object()
+
+    def get_integer_feature_value(self, name: str) -> int:
+        if not isinstance(self.numbers[name], int):
+            raise TypeError(f"{name} is no integer")
+        return int(self.numbers[name])
+
+    def get_float_feature_value(self, name: str) -> float:
+        return self.numbers[name]
+
+    def get_string_feature_value(self, name: str) -> str:
+        return self.names[name][int(self.numbers[name])]
+
+    def set_string_feature_value(self, name: str, value: str) -> None:
+        self.numbers[name] = self.names[name].index(value)
+
+    def set_boolean_feature_value(self, name: str, value: bool) -> None:
+        if name not in self.numbers:
+            raise KeyError(name)
+
+    def timeout_pop_buffer(self, wait_us: int) -> Buffer | None:
+        return self.buffers.pop(0) if self.buffers else None
+
+
+class Enumeration:
+    """A node of that type."""
+
+
+def aravis_of(device: AravisDevice) -> Any:
+    """A module with what the driver takes of Aravis."""
+    cameras = SimpleNamespace(new=lambda _: device, is_gv_device=lambda _: False)
+    return SimpleNamespace(
+        Camera=cameras,
+        GcEnumeration=Enumeration,
+        update_device_list=lambda: None,
+        Buffer=SimpleNamespace(new_allocate=lambda _: None),
+        BufferStatus=SimpleNamespace(SUCCESS="success", CLEARED="cleared", ABORTED="aborted"),
+    )
+
+
+@pytest.mark.parametrize("control", ["Off", "Continuous"])
+def test_frames_of_aravis_have_times_whatever_controlled_the_exposure(control: str) -> None:
+    device = AravisDevice()
+    device.set_string_feature_value("ExposureAuto", control)
+    library = AravisLibrary(aravis_of(device), "fake")
+    assert library.get("ExposureAuto") == control and library.get("Width") == 4
+    assert library.get("ExposureTime") == 2000.0
+    camera = GenICamCamera("fake aravis", lambda: library, "Line1")
+    camera.start()
+    frames = frames_of(camera, 2)
+    assert library.get("ExposureAuto") == "Off"
+    camera.close()
+    assert all(one.is_timed for one in frames)
+    assert [one.exposure_ns for one in frames] == [2_000_000, 2_000_000]
+
+
+WHOLE = {"SensorWidth": 4, "SensorHeight": 2}
+OTHER = {"SensorWidth": 8, "SensorHeight": 6}
+
+
+@pytest.mark.parametrize(
+    ("features", "wished", "is_stated"),
+    [
+        # nobody asked for a window: what the camera says of its sensor may be of another size
+        (OTHER, None, False),
+        ({}, None, False),
+        ({"OffsetX": 2, "OffsetY": 0}, None, True),
+        (WHOLE, CameraSettings(window=SensorWindow(), size_px=(4, 2)), False),
+        (OTHER, CameraSettings(window=SensorWindow(), size_px=(4, 2)), True),
+        (WHOLE, CameraSettings(window=SensorWindow(), size_px=(4, 1)), True),
+        ({}, CameraSettings(size_px=(4, 1)), True),
+        (OTHER, CameraSettings(exposure_us=500.0), False),
+    ],
+)
+def test_a_window_is_stated_where_somebody_asked_for_one(
+    features: dict[str, int], wished: CameraSettings | None, is_stated: bool
+) -> None:
     library = Library()
-    library.features |= {"SensorWidth": 4, "SensorHeight": 2, "Height": height}
+    library.features |= features
     camera = GenICamCamera("fake window", lambda: library, "Line1")
+    own = camera.settings
+    if wished is not None:
+        camera.configure(wished)
     assert camera.setup.window.is_stated == is_stated
+    # as it was opened: nobody asks any more
+    camera.configure(own)
+    assert camera.setup.window.is_stated == ("OffsetX" in features)
     camera.close()
 
 

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from armscan.devices.clocks import AT_END_STOP, INACCURATE
+from armscan.devices.protocols import AT_END_STOP, INACCURATE
 from armscan.devices.registry import device_drivers, open_device
 from armscan.errors import DeviceError, OptionError, OutputError
 from armscan.jobs.live.recordings import SUFFIX

@@ -149,9 +149,10 @@ def pair_by_view(exposures: Sequence[Exposure]) -> list[ExposurePair]:
 
 
 WINDOW_REMEDY = (
-    "use images of the camera's full size; if the sensor read a window, say where it begins by "
-    "window_x_px and window_y_px under [[camera]] in session.toml; if they are whole, the "
-    "calibration is of another head: give that of the head that took them"
+    "use images of the camera's full size; if the sensor read a window, say so by is_window = true "
+    "under [[camera]] in session.toml, and where it begins by window_x_px and window_y_px, or, "
+    "before recording, by windows in rig.toml; if they are whole, the calibration is of another "
+    "head: give that of the head that took them"
 )
 
 

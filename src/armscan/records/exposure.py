@@ -61,7 +61,7 @@ def unstated_window() -> SensorWindow:
 def window_of_sensor(
     window: SensorWindow, size_px: tuple[int, int], sensor_px: tuple[int, int]
 ) -> SensorWindow:
-    """The window, stated as one only where it is less than the sensor.
+    """A window that somebody asked for, stated as one only where it is less than the sensor.
 
     So an image of a whole sensor is still told from one of a larger sensor's corner.
     """

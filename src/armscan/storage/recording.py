@@ -51,6 +51,7 @@ from armscan.storage.images import ImageOptions, read_exposure
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
     FLAGS,
+    IS_WINDOW,
     SESSION_FILE,
     WINDOW_KEYS,
     SessionFile,
@@ -543,7 +544,8 @@ def _cameras(
             setup = setup_of_image(folder / first.source, setup, lacking)
             values = ", ".join(f"{key} {getattr(setup, key)}" for key in lacking)
             facts.append(f"camera {number} has {values}, as {first.source}")
-        if first is not None and not lacking and not stated.issuperset(WINDOW_KEYS):
+        is_placed = IS_WINDOW in stated or stated.issuperset(WINDOW_KEYS)
+        if first is not None and not lacking and not is_placed:
             note = window_note(folder / first.source, setup)
             facts += [f"camera {number}: {note}"] if note else []
         cameras.append(setup)

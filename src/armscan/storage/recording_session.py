@@ -71,15 +71,16 @@ class _SessionKeys:
 
 
 WINDOW_KEYS = ("window_x_px", "window_y_px")
-"""Both say that an image is a window, also one in the sensor's corner."""
+IS_WINDOW = "is_window"
+"""True says that an image is a window, also one in the sensor's corner. Two zeros do not: files
+bear them of whole images, too."""
 WINDOW_PX = (0, LARGEST_SIZE_PX)
 LAYOUTS: Mapping[type, Layout] = {
     _SessionKeys: Layout(optional=("simulated", "stripe_band")),
     CameraSetup: Layout(flat=("window",), limits={"bits_used": (1, 16)}),
     SensorWindow: Layout(
-        keys={"x_px": WINDOW_KEYS[0], "y_px": WINDOW_KEYS[1]},
-        optional=("binning",),
-        given=("is_stated",),
+        keys={"x_px": WINDOW_KEYS[0], "y_px": WINDOW_KEYS[1], "is_stated": IS_WINDOW},
+        optional=("binning", "is_stated"),
         limits={"x_px": WINDOW_PX, "y_px": WINDOW_PX, "binning": (1, 1000)},
     ),
 }
@@ -108,7 +109,7 @@ def read_session_file(path: Path) -> SessionFile:
         raise FileFormatError(str(error), where=where, remedy=remedy) from error
     stated = frozenset(_stated(content))
     cameras = (
-        replace(one, window=replace(one.window, is_stated=_has_window(k, stated)))
+        one if f"camera.{k}.{IS_WINDOW}" in stated else replace(one, window=_by_corner(one.window))
         for k, one in enumerate(keys.camera)
     )
     session = Session(
@@ -125,8 +126,8 @@ def read_session_file(path: Path) -> SessionFile:
     return SessionFile(session, stated, odd)
 
 
-def _has_window(camera: int, stated: frozenset[str]) -> bool:
-    return all(f"camera.{camera}.{key}" in stated for key in WINDOW_KEYS)
+def _by_corner(window: SensorWindow) -> SensorWindow:
+    return replace(window, is_stated=(window.x_px, window.y_px) != (0, 0))
 
 
 def session_toml(session: Session) -> bytes:
@@ -147,7 +148,10 @@ def session_toml(session: Session) -> bytes:
     tree = RecordCodec(LAYOUTS).write(keys)
     for setup, table in zip(session.cameras, tree["camera"], strict=True):
         corner = setup.window.x_px, setup.window.y_px
-        if not setup.window.is_stated and corner == (0, 0):
+        table.pop(IS_WINDOW, None)
+        if setup.window.is_stated:
+            table[IS_WINDOW] = True
+        elif corner == (0, 0):
             for key in WINDOW_KEYS:
                 del table[key]
     return assumed.encode() + toml_bytes(tree)

@@ -200,6 +200,7 @@ def test_an_image_has_its_cameras_size_or_lies_inside_it(
         ((5, 4), "", True),
         ((5, 4), "window_x_px = 0\n", True),
         ((5, 4), "window_x_px = 0\nwindow_y_px = 0\n", False),
+        ((5, 4), "is_window = true\n", False),
         ((8, 6), "", False),
     ],
 )
@@ -216,7 +217,16 @@ def test_a_window_whose_place_nobody_said_is_noted(
 
 @pytest.mark.parametrize(
     ("window", "is_stated"),
-    [("", False), ("window_x_px = 0\n", False), ("window_x_px = 0\nwindow_y_px = 0\n", True)],
+    [
+        ("", False),
+        ("window_x_px = 0\n", False),
+        # all files once bore both, also of whole images
+        ("window_x_px = 0\nwindow_y_px = 0\n", False),
+        ("window_x_px = 0\nwindow_y_px = 0\nbinning = 1\nis_window = false\n", False),
+        ("window_x_px = 0\nwindow_y_px = 0\nis_window = true\n", True),
+        ("is_window = true\n", True),
+        ("window_x_px = 3\nwindow_y_px = 2\n", True),
+    ],
 )
 def test_a_window_in_the_corner_is_one_where_the_session_says_so(
     tmp_path: Path, window: str, is_stated: bool
@@ -227,13 +237,20 @@ def test_a_window_in_the_corner_is_one_where_the_session_says_so(
     write_recording(tmp_path / "again", scan)
     again = read_recording(tmp_path / "again")
     assert again.exposure(1).window.is_stated == is_stated and again.warnings == scan.warnings
+    assert ("is_window = true" in (tmp_path / "again" / "session.toml").read_text()) == is_stated
     # a larger sensor's corner, or another camera's whole image
     sensor = plain_camera(10.0, (5.0, 4.0), (16, 12))
     if is_stated:
         check_sizes([again.exposure(1)], sensor)
         return
-    with pytest.raises(InputError, match="window_x_px and window_y_px"):
+    with pytest.raises(InputError, match="is_window = true"):
         check_sizes([again.exposure(1)], sensor)
+
+
+def test_a_word_that_says_no_window_is_refused(tmp_path: Path) -> None:
+    folder = lab_folder(tmp_path, session=SESSION + 'is_window = "corner"\n')
+    with pytest.raises(FileFormatError, match="is_window"):
+        read_recording(folder)
 
 
 def test_high_aligned_bits_are_shifted_and_too_many_are_refused(tmp_path: Path) -> None:

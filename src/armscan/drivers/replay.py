@@ -37,7 +37,13 @@ from armscan.devices.registry import number_option, split_place
 from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError, DeviceError, OptionError
 from armscan.records.exposure import Exposure
-from armscan.records.recording import NO_TRIGGER, CameraSetup, PoseForm
+from armscan.records.recording import (
+    LASER_UNKNOWN,
+    NO_TRIGGER,
+    CameraSetup,
+    ExposureRow,
+    PoseForm,
+)
 from armscan.storage.recording import read_recording
 
 _MOST = {"camera": 64, "arm": 20_000, "lasers": 2_000}
@@ -95,6 +101,7 @@ class Playback:
             raise DeviceError("the recording holds no exposure", where=source.name)
         self.source = source
         self.sources = tuple(sorted({name for row in source.rows for name in row.lasers}))
+        self._are_lasers_told = _are_lasers_told(source.rows)
         ids = [row.trigger_id for row in source.rows if row.trigger_id is not None]
         self._ids_of_round = max(ids) - min(ids) + 1 if ids else 0
         self._is_loop = is_loop
@@ -121,7 +128,7 @@ class Playback:
                 spread_ns=0,
                 rng=np.random.default_rng(0),
             )
-            for name in (*names, *(["lasers"] if self.sources else []))
+            for name in (*names, *(["lasers"] if self._are_lasers_told else []))
         }
         self._clock = clock
         self.started: set[str] = set()
@@ -282,7 +289,8 @@ class Playback:
         seen = self._next_image()
         if isinstance(seen, Exposure):
             # where no row names a laser nobody knows, and it is taken to have been on
-            lasers = row.lasers if self.sources else None
+            is_known = self._are_lasers_told and LASER_UNKNOWN not in row.flags
+            lasers = row.lasers if is_known else None
             return Frame(seen.image, 0, 0, 0, trigger_id, lasers, seen.window)
         if seen is not None:
             self.lines[device].inbox.fail(DeviceError(seen.what, where=seen.where))
@@ -317,19 +325,25 @@ class Playback:
 
 
 def _plays(source: ScanSource) -> list[Play]:
-    """All exposures, instants of the lasers where any is named, and samples, by time from 0."""
+    """All exposures, instants of lasers that are known, and samples, by time from 0."""
     frames = [(row.t_ns, f"camera{row.camera}", k) for k, row in enumerate(source.rows)]
     lights, last = [], None
-    are_named = any(row.lasers for row in source.rows)
+    are_told = _are_lasers_told(source.rows)
     for k, row in enumerate(source.rows):
-        if are_named and (row.t_ns, row.trigger_id) != last:
+        moment = row.t_ns, row.trigger_id
+        if are_told and LASER_UNKNOWN not in row.flags and moment != last:
             lights.append((row.t_ns, "lasers", k))
-        last = row.t_ns, row.trigger_id
+            last = moment
     samples: list[tuple[int, str, int]] = []
     if source.arm is not None:
         samples = [(int(t_ns), "arm", k) for k, t_ns in enumerate(source.arm.t_ns)]
     every = list(merge(sorted(frames), sorted(lights), samples, key=lambda play: play[0]))
     return [(t_ns - every[0][0], device, what) for t_ns, device, what in every]
+
+
+def _are_lasers_told(rows: Sequence[ExposureRow]) -> bool:
+    """Whether a row without lasers was dark: others name some, or say that they are not known."""
+    return any(row.lasers or LASER_UNKNOWN in row.flags for row in rows)
 
 
 def _usual_step_ns(source: ScanSource) -> int:

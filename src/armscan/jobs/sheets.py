@@ -28,6 +28,7 @@ from armscan.pipeline.laser import (
     look_at_pairs,
 )
 from armscan.records.exposure import Exposure
+from armscan.records.recording import LASER_UNKNOWN
 from armscan.report.camera import bow_quantities
 from armscan.report.photographs import TriedImage, refused_page
 from armscan.report.quantity import (
@@ -259,7 +260,15 @@ def _read_scan(folder: Path, leave_out: Sequence[str], *, is_stereo: bool) -> _I
             where=str(folder),
             remedy="number a single camera 0 in the column 'camera' of exposures.csv",
         )
-    exposures = tuple(recording.exposure(k) for k in rows)
+    # neither lit nor the dark partner of a view
+    known = [k for k in rows if LASER_UNKNOWN not in recording.rows[k].flags]
+    doubtful: tuple[str, ...] = ()
+    if len(known) < len(rows):
+        doubtful = (
+            f"{len(rows) - len(known)} of {len(rows)} images are left out: it is not known what "
+            "lasers were on",
+        )
+    exposures = tuple(recording.exposure(k) for k in known)
     views = {one.view: None for one in exposures if one.view is not None}
     names = [*(one.source for one in exposures), *views]
     named = set(named_by(leave_out, names))
@@ -275,11 +284,11 @@ def _read_scan(folder: Path, leave_out: Sequence[str], *, is_stereo: bool) -> _I
         )
     return _Images(
         exposures,
-        tuple(folder / recording.rows[k].source for k in rows),
+        tuple(folder / recording.rows[k].source for k in known),
         pair_by_view([one for one in exposures if one.source not in gone]),
         _skipped([one for one in exposures if one.lasers], gone),
         recording_tables(folder),
-        (*recording.warnings, *recording.session.assumed, *alone),
+        (*recording.warnings, *recording.session.assumed, *alone, *doubtful),
     )
 
 

@@ -129,6 +129,32 @@ def test_a_row_without_lasers_among_others_was_dark(tmp_path: Path) -> None:
     camera.close()
 
 
+@pytest.mark.parametrize(
+    ("named", "lasers", "events"),
+    [
+        (("A", "", ""), [("A",), None, ()], [("A",), ()]),
+        # none is named, and yet one row says that it was dark
+        (("", "", ""), [None, None, ()], [()]),
+    ],
+)
+def test_lasers_that_were_not_known_are_not_known_where_they_are_played(
+    tmp_path: Path,
+    named: tuple[str, ...],
+    lasers: list[tuple[str, ...] | None],
+    events: list[tuple[str, ...]],
+) -> None:
+    flags = ["laser-unknown" if on is None else "" for on in lasers]
+    table = "index,t_ns,camera,file,lasers,trigger_id,flags\n" + "".join(
+        f"{k},{t},0,images/{k}.png,{named[k]},{k + 5},{flags[k]}\n" for k, t in enumerate(TIMES)
+    )
+    folder = lab_folder(tmp_path / "scan", exposures=table, arm=ARM)
+    frames, _, switched = played(str(folder), 3, 7, len(events))
+    assert [one.lasers for one in frames] == lasers
+    assert [one.lasers for one in switched] == events
+    known = [one.trigger_id for one in frames if one.lasers is not None]
+    assert [one.trigger_id for one in switched] == known
+
+
 def test_waits_while_everything_is_stopped(folder: Path) -> None:
     camera = open_device("camera", f"replay:{folder}?rate=50&loop=1")
     camera.start()

@@ -25,6 +25,7 @@ from armscan.jobs.sheets import _read_scan
 from armscan.vision.targets.target import TargetView
 from rigs.drawn_arm import draw_postures
 from rigs.fan_rig import STEREO_SIGMA, FanRig, fan_rig
+from rigs.recording_folders import lab_folder
 from rigs.sheet_rig import placed, project
 
 POSE: Pose[Sensor, Board] = placed(8.0, 28.0, 140.0, (18.75, 15.0))
@@ -158,3 +159,14 @@ def test_a_recording_of_one_camera_is_told_where_the_calibration_is_of_two(tmp_p
     draw_postures(folder)
     assert any("camera 0 alone" in text for text in _read_scan(folder, (), is_stereo=True).warnings)
     assert not _read_scan(folder, (), is_stereo=False).warnings
+
+
+def test_an_image_of_unknown_lasers_is_no_dark_partner(tmp_path: Path) -> None:
+    table = """index,t_ns,camera,file,lasers,view,flags
+0,1000,0,images/0.png,A,v,
+1,2000,0,images/1.png,,v,laser-unknown
+"""
+    read = _read_scan(lab_folder(tmp_path, exposures=table), (), is_stereo=False)
+    assert [(lit.source, dark) for lit, dark in read.pairs] == [("images/0.png", None)]
+    said = "1 of 2 images are left out: it is not known what lasers were on"
+    assert said in read.warnings and len(read.exposures) == len(read.paths) == 1

@@ -234,9 +234,49 @@ def test_a_recording_that_still_grows_is_not_replaced(
     monkeypatch.setattr(_Recording, "_watch", watched)
     record_scan(RecordRequest(str(rig), n_exposures=2), output, print)
     assert refused == ["another run writes this file"]
-    assert set_aside(output, is_overwriting=True) == rig.parent / ".scan.mcap.before"
+    aside = set_aside(output, is_overwriting=True)
+    assert aside is not None and aside.path == rig.parent / ".scan.mcap.before"
     with pytest.raises(OutputError, match=r"lies in \.scan\.mcap\.before"):
         set_aside(output, is_overwriting=True)
+
+
+def test_what_another_run_still_writes_is_kept_where_nothing_locks(
+    rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output, aside = rig.parent / "scan.mcap", rig.parent / ".scan.mcap.before"
+    output.write_bytes(EARLIER)
+    real = _Recording._watch
+
+    def watched(run: _Recording, request: RecordRequest, start: float) -> None:
+        with aside.open("ab") as growing:
+            growing.write(b" and a minute")
+        real(run, request, start)
+
+    monkeypatch.setattr(_Recording, "_watch", watched)
+    monkeypatch.setattr("armscan.storage.files.fcntl", None)
+    told: list[str] = []
+    record_scan(RecordRequest(str(rig), n_exposures=2), output, told.append, is_overwriting=True)
+    assert len(read_recording(output).rows) >= 2
+    assert aside.read_bytes() == EARLIER + b" and a minute"
+    assert any("lies in .scan.mcap.before and is not removed" in line for line in told)
+
+
+def test_a_run_without_an_image_removes_no_other_run_s_file(
+    rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.write_text(RIG.replace(f'lasers = "{TWIN}"\n', ""))
+    output = rig.parent / "scan.mcap"
+    real = _Recording._watch
+
+    def watched(run: _Recording, request: RecordRequest, start: float) -> None:
+        output.rename(rig.parent / "moved")
+        output.write_bytes(EARLIER)
+        real(run, request, start)
+
+    monkeypatch.setattr(_Recording, "_watch", watched)
+    with pytest.raises(DeviceError, match="no image came"):
+        record_scan(RecordRequest(str(rig), seconds=0.3), output, print)
+    assert output.read_bytes() == EARLIER
 
 
 def test_what_arrives_and_cannot_be_matched_is_no_success(

@@ -8,6 +8,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -15,9 +17,11 @@ from armscan.errors import FileFormatError, OutputError
 from armscan.storage.files import (
     check_new_folder,
     check_outputs,
+    locked,
     new_folder,
     path_text,
     read_bytes,
+    set_aside,
     write_files,
 )
 
@@ -206,3 +210,46 @@ def test_a_file_in_place_of_a_folder_is_called_a_file(tmp_path: Path) -> None:
     for check in (lambda path: check_outputs((path,)), check_new_folder):
         with pytest.raises(OutputError, match="this is a file, not a folder"):
             check(tmp_path / "note" / "plate.csv")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks files")
+def test_a_growing_file_is_known_where_exclusive_locks_need_the_right_to_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on NFS, by flock(2)."""
+    import fcntl
+
+    def flock(file: Any, how: int) -> None:
+        handle = file if isinstance(file, int) else file.fileno()
+        may_write = fcntl.fcntl(handle, fcntl.F_GETFL) & os.O_ACCMODE != os.O_RDONLY
+        if how & fcntl.LOCK_EX and not may_write:
+            raise OSError(errno.EBADF, "Bad file descriptor")
+        fcntl.flock(handle, how)
+
+    nfs = {name: getattr(fcntl, name) for name in ("LOCK_EX", "LOCK_SH", "LOCK_NB")}
+    monkeypatch.setattr("armscan.storage.files.fcntl", SimpleNamespace(flock=flock, **nfs))
+    path = tmp_path / "scan.mcap"
+    path.write_bytes(b"growing")
+    with locked(path), pytest.raises(OutputError, match="another run writes this file"):
+        set_aside(path, is_overwriting=True)
+    assert path.read_bytes() == b"growing"
+
+
+@pytest.mark.parametrize("is_other", [False, True])
+def test_what_was_set_aside_and_grew_since_is_not_removed(tmp_path: Path, is_other: bool) -> None:
+    path = tmp_path / "scan.mcap"
+    path.write_bytes(b"an hour")
+    aside = set_aside(path, is_overwriting=True)
+    assert aside is not None and not path.exists()
+    if is_other:
+        aside.path.rename(tmp_path / "kept")
+        aside.path.write_bytes(b"an hour")
+    else:
+        with aside.path.open("ab") as growing:
+            growing.write(b" more")
+    assert not aside.remove() and aside.path.exists()
+    aside.path.unlink()
+    assert aside.remove()
+    path.write_bytes(b"an hour")
+    again = set_aside(path, is_overwriting=True)
+    assert again is not None and again.remove() and not again.path.exists()

@@ -10,6 +10,7 @@ import stat
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 from uuid import uuid4
@@ -213,8 +214,41 @@ def check_aside(path: Path) -> None:
         )
 
 
-def set_aside(path: Path, *, is_overwriting: bool = False) -> Path | None:
+@dataclass(frozen=True, slots=True)
+class SetAside:
+    """A file that was given another name, and what it was then.
+
+    Parameters
+    ----------
+    path
+        Where it lies.
+    state
+        Which file it is, how long and when it was written last.
+    """
+
+    path: Path
+    state: tuple[int, ...]
+
+    def remove(self) -> bool:
+        """Remove it; False where it is another file, or grew since: it stays then."""
+        with suppress(OSError):
+            if _state(self.path) != self.state:
+                return False
+            self.path.unlink()
+        return not self.path.exists()
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    # opened, for a file system of a network may tell what it knew of it before
+    with path.open("rb") as file:
+        found = os.fstat(file.fileno())
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def set_aside(path: Path, *, is_overwriting: bool = False) -> SetAside | None:
     """Give a file another name until its successor is there; None where there is no file.
+
+    Where nothing can be locked a file that another run writes is not known: it only grows later.
 
     Raises
     ------
@@ -232,15 +266,16 @@ def set_aside(path: Path, *, is_overwriting: bool = False) -> Path | None:
             remedy="wait for its end, or choose another name",
         )
     with _refusing("the file cannot be replaced", path, "choose another name"):
+        state = _state(path)
         _rename(path, _aside(path))
-    return _aside(path)
+    return SetAside(_aside(path), state)
 
 
-def bring_back(aside: Path, path: Path) -> None:
+def bring_back(aside: SetAside, path: Path) -> None:
     """Undo `set_aside`; raises `OutputError` where another program took the name meanwhile."""
     remedy = "both files are whole: rename them as you like"
-    with _refusing(f"what was there before lies in {aside.name}", path, remedy):
-        _rename(aside, path)
+    with _refusing(f"what was there before lies in {aside.path.name}", path, remedy):
+        _rename(aside.path, path)
 
 
 def _rename(path: Path, free: Path) -> None:
@@ -512,13 +547,21 @@ def locked(part: Path) -> Iterator[None]:
     if fcntl is None:
         yield
         return
-    handle = os.open(part, os.O_RDONLY)
+    handle = _opened(part)
     try:
         with suppress(OSError):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
     finally:
         os.close(handle)
+
+
+def _opened(path: Path) -> int:
+    """A handle to lock: NFS gives an exclusive lock to those alone that may write."""
+    if not path.is_dir():
+        with suppress(OSError):
+            return os.open(path, os.O_RDWR)
+    return os.open(path, os.O_RDONLY)
 
 
 def _is_held(path: Path) -> bool:
@@ -550,7 +593,7 @@ def _rests(path: Path, *suffixes: str) -> list[Path]:
 def _is_abandoned(part: Path) -> bool:
     if fcntl is None:
         return time.time() - part.stat().st_mtime > STALE_SECONDS
-    handle = os.open(part, os.O_RDONLY)
+    handle = _opened(part)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 import shutil
 import signal
 import threading
@@ -25,7 +26,14 @@ from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
 from armscan.pipeline.simulate import TwinName
 from armscan.report.quantity import Quantity, Summary, plural
 from armscan.storage.documents import read_scanner_calibration
-from armscan.storage.files import bring_back, check_aside, check_outputs, locked, set_aside
+from armscan.storage.files import (
+    SetAside,
+    bring_back,
+    check_aside,
+    check_outputs,
+    locked,
+    set_aside,
+)
 from armscan.storage.recordings.write_mcap import WriterOptions, WriterStatus
 
 TOLD_EVERY_S = 1.0
@@ -207,8 +215,9 @@ class _Recording:
         self._end = WriterStatus(0, 0, 0.0, 0, 0)
         self._before = replace(self._end), 0.0
         self._is_interrupted = False
-        self._before_it: Path | None = None
+        self._before_it: SetAside | None = None
         self._held = ExitStack()
+        self._own_file: os.stat_result | None = None
         self._why_ended = ""
         self._is_over = False
         self._is_triggered = rig.description.is_common_trigger
@@ -220,6 +229,7 @@ class _Recording:
             self._wait_for_clocks()
             self._put_aside()
             self._recorder.begin()
+            self._own_file = self._output.stat()
             self._held.enter_context(locked(self._output))
             self._session.add_listener(self._recorder.hear)
             start = time.monotonic()
@@ -268,7 +278,8 @@ class _Recording:
         """What is to be replaced, until this recording has ended with an image."""
         self._before_it = set_aside(self._output, is_overwriting=self._is_overwriting)
         if self._before_it is not None:
-            self._tell(f"what was there lies in {self._before_it.name} until the recording ends")
+            name = self._before_it.path.name
+            self._tell(f"what was there lies in {name} until the recording ends")
 
     def _close(self) -> None:
         """The new file where it holds an image; else what was there before."""
@@ -277,17 +288,30 @@ class _Recording:
             self._end = self._recorder.close()
         finally:
             if self._recorder.is_begun:
-                # what another run made there meanwhile is not ours to remove
                 is_new = self._recorder.status().n_written > 0
-                if not is_new:
-                    self._output.unlink(missing_ok=True)
+                if not is_new and self._is_own_there():
+                    self._output.unlink()
             self._held.close()
             if self._before_it is not None and is_new:
-                self._before_it.unlink()
+                self._remove(self._before_it)
             elif self._before_it is not None:
                 self._bring_back(self._before_it)
 
-    def _bring_back(self, before: Path) -> None:
+    def _is_own_there(self) -> bool:
+        """Whether the name is still that of its own file: what another run made is not ours."""
+        with suppress(OSError):
+            own = self._own_file
+            return own is not None and os.path.samestat(own, self._output.stat())
+        return False
+
+    def _remove(self, before: SetAside) -> None:
+        if not before.remove():
+            self._tell(
+                f"warning: what was there before lies in {before.path.name} and is not removed: "
+                "another run wrote it meanwhile, or it may not be removed; rename it to keep it"
+            )
+
+    def _bring_back(self, before: SetAside) -> None:
         try:
             bring_back(before, self._output)
         except OutputError as error:

@@ -88,6 +88,8 @@ class MatchedInstant:
         Why not.
     number
         How many instants the matcher handed out before it.
+    are_lasers_mixed
+        True where its lasers are not known because events so near in time name several.
     """
 
     frames: tuple[Frame | None, ...]
@@ -97,6 +99,7 @@ class MatchedInstant:
     pose: Pose[Base, Tool] | None
     status: PoseStatus
     number: int = 0
+    are_lasers_mixed: bool = False
 
 
 @dataclass(slots=True)
@@ -107,6 +110,7 @@ class _Open:
     t_ns: int | None
     trigger_id: int | None
     is_passed: list[bool] = field(default_factory=list)
+    is_timed: bool = True
 
     @property
     def newest_host_ns(self) -> int:
@@ -214,8 +218,12 @@ class InstantMatcher:
             partner = _Open(frames, t_ns, frame.trigger_id, [False] * len(frames))
             self._open.append(partner)
         partner.frames[camera] = frame
-        if camera == 0 or partner.t_ns is None:
+        # where one frame's middle is not sure, the other's time is not that of both
+        partner.is_timed &= frame.is_timed
+        if t_ns is not None and (camera == 0 or partner.t_ns is None):
             partner.t_ns = t_ns
+        if not partner.is_timed:
+            partner.t_ns = None
         for earlier in self._open:
             if earlier is partner:
                 break
@@ -234,15 +242,17 @@ class InstantMatcher:
                 break
             self._open.popleft()
             pose, status = self._pose(first)
+            lasers, are_mixed = self._lasers(first)
             done.append(
                 MatchedInstant(
                     frames=tuple(first.frames),
                     t_ns=first.t_ns,
-                    lasers=self._lasers(first),
+                    lasers=lasers,
                     trigger_id=first.trigger_id,
                     pose=pose,
                     status=status,
                     number=self._n_taken,
+                    are_lasers_mixed=are_mixed,
                 )
             )
             self._n_taken += 1
@@ -365,17 +375,18 @@ class InstantMatcher:
             return True
         return bool(self._times) and self._times[-1] >= one.t_ns + self.latency_ns
 
-    def _lasers(self, one: _Open) -> tuple[str, ...] | None:
+    def _lasers(self, one: _Open) -> tuple[tuple[str, ...] | None, bool]:
+        """What was on, None where it is not known, and whether that is because several were."""
         told = {frame.lasers for frame in one.frames if frame is not None} - {None}
         if len(told) == 1:
-            return told.pop()
+            return told.pop(), False
         if one.trigger_id is not None and self._has_controller:
             switched = self._told(self._lasers_of, one)
-            return None if switched is None else switched.value
+            return None if switched is None else switched.value, False
         if one.t_ns is None:
-            return None
+            return None, False
         near = {on for t_ns, on in self._events if abs(t_ns - one.t_ns) <= LASER_BOUND_NS}
-        return near.pop() if len(near) == 1 else None
+        return near.pop() if len(near) == 1 else None, len(near) > 1
 
     def _pose(self, one: _Open) -> tuple[Pose[Base, Tool] | None, PoseStatus]:
         if self._is_triggered:

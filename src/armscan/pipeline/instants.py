@@ -443,8 +443,8 @@ class ScanInstants:
             raise InputError(
                 f"of none of {len(lit)} exposures is it known what lasers were on",
                 where=source.name,
-                remedy="record with a schedule of one step, fewer triggers a second, or images "
-                "that bear the controller's trigger ids",
+                remedy="see that the laser controller answers, and record with a schedule of one "
+                "step, fewer triggers a second, or images that bear its trigger ids",
             )
         is_named = any(lit) or bool(self.is_unknown.any())
         self.is_lit: BoolArray = np.array(lit if is_named else [True] * len(lit), dtype=np.bool_)

@@ -319,3 +319,47 @@ def test_poses_at_an_end_stop_are_used_and_counted():
         matcher.add_frame(Frame(IMAGE, k, t, t + 10**6))
     assert {one.status for one in matcher.take(10**12)[-10:]} == {PoseStatus.FOUND}
     assert matcher.arm.counts.words == "10 at an end stop of the arm"
+
+
+@pytest.mark.parametrize("untimed", [0, 1])
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_an_instant_with_an_image_of_unsure_time_has_none_whichever_came_first(order, untimed):
+    matcher = InstantMatcher(2, has_arm=False, has_controller=False)
+    for k in range(400):
+        t_ns = 12_500_000 * k
+        for camera in order:
+            is_timed = not (camera == untimed and k == 300)
+            host_ns = t_ns + 1_000_000
+            frame = Frame(IMAGE, k, t_ns, host_ns, trigger_id=k, is_timed=is_timed)
+            matcher.add_frame(frame, camera)
+    instants = {one.trigger_id: one for one in matcher.take(10**18)}
+    assert len(instants) == 400
+    assert instants[300].t_ns is None and instants[299].t_ns is not None
+    assert all(frame is not None for frame in instants[300].frames)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_an_image_of_an_unknown_clock_takes_the_time_of_the_other_camera(order):
+    matcher = InstantMatcher(2, has_arm=False, has_controller=False)
+    for k in range(400):
+        t_ns = 12_500_000 * k
+        for camera in order:
+            # the first camera's clock is not known at all: it shows one time
+            own_ns = t_ns if camera else 7
+            frame = Frame(IMAGE, k, own_ns, t_ns + 1_000_000, trigger_id=k)
+            matcher.add_frame(frame, camera)
+    instants = {one.trigger_id: one for one in matcher.take(10**18)}
+    assert instants[300].t_ns is not None
+
+
+def test_lasers_are_mixed_where_events_near_name_several_and_not_where_none_came():
+    for names, are_mixed in ((("A", "B"), True), ((), False)):
+        matcher = InstantMatcher(has_arm=False)
+        for k in range(400):
+            t_ns = 12_500_000 * k
+            if names:
+                event = LaserEvent(k, t_ns, t_ns + 1_000_000, (names[k % 2],))
+                matcher.add_events((event,))
+            matcher.add_frame(Frame(IMAGE, k, t_ns, t_ns + 1_000_000))
+        instant = matcher.take(10**18)[300]
+        assert instant.lasers is None and instant.are_lasers_mixed == are_mixed

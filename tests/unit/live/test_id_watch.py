@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -13,10 +14,12 @@ from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame
 from armscan.pipeline.live.acquire import (
     FRAMES_WITHOUT,
-    LASERS_UNKNOWN,
+    LASERS_MIXED,
+    LASERS_UNTOLD,
     SAMPLES_WITHOUT,
     WATCHED_NS,
     IdWatch,
+    LiveEvent,
 )
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.live.session import LiveSession
@@ -71,8 +74,66 @@ def test_lasers_that_are_never_known_are_told_of() -> None:
 
     # no time is known yet
     assert not any(see(k, t_ns=None) for k in range(20))
-    assert [see(k) for k in range(20, 26)] == [""] * 5 + [LASERS_UNKNOWN]
+    mixed = {"are_lasers_mixed": True}
+    assert [see(k, **mixed) for k in range(20, 26)] == [""] * 5 + [LASERS_MIXED]
     assert see(26, lasers=("A",)) == "" and see(27) == ""
+    # a controller that is silent, or idle, is no matter of its schedule
+    assert [see(k) for k in range(28, 33)] == [""] * 4 + [LASERS_UNTOLD]
+    assert "schedule" not in LASERS_UNTOLD and see(33, **mixed) == LASERS_MIXED
+
+
+class Dated(Device):
+    """What it hands out arrived when it says, so that no test waits for two seconds."""
+
+    sources = ("A",)
+
+    def read(self, timeout_s: float) -> Any:
+        return self.elements.pop(0) if self.elements else super().read(timeout_s)
+
+
+def told_of(
+    frames: list[Frame], samples: list[ArmSample] | None = None, *, has_lasers: bool = False
+) -> set[tuple[str, str]]:
+    """Warnings of a session that reads frames, then samples of the arm."""
+    arm = None if samples is None else Dated("arm", [])
+    lasers = Dated("lasers", []) if has_lasers else None
+    description = RigDescription(("c",), is_common_trigger=arm is not None)
+    rig: Any = Rig([Dated("camera 0", list(frames))], arm, lasers, description)  # type: ignore[list-item, arg-type]
+    session = LiveSession(rig, options=ALL)
+    told: list[LiveEvent] = []
+    session.add_listener(told.append)
+    session.open()
+    waited(lambda: session.stream_counts[0].n_elements == len(frames))
+    if arm is not None and samples:
+        arm.elements = [(one,) for one in samples]
+        waited(lambda: session.stream_counts[1].n_elements == len(samples))
+    session.stop()
+    return {(one.text, one.device) for one in told if one.kind == "warning"}
+
+
+def times_ns(n: int) -> list[int]:
+    """Half a second apart, the last one now."""
+    now_ns = time.monotonic_ns()
+    return [now_ns - STEP_NS * (n - 1 - k) for k in range(n)]
+
+
+def test_a_session_tells_of_a_camera_without_ids() -> None:
+    frames = [Frame(IMAGE, k, t_ns, t_ns) for k, t_ns in enumerate(times_ns(10))]
+    assert told_of(frames, []) == {(FRAMES_WITHOUT, "camera 0")}
+    assert told_of([replace(one, trigger_id=one.number) for one in frames], []) == set()
+
+
+def test_a_session_tells_of_an_arm_without_ids() -> None:
+    when = times_ns(10)
+    frames = [Frame(IMAGE, k, t_ns, t_ns, trigger_id=k) for k, t_ns in enumerate(when[:1])]
+    samples = [ArmSample(k, t_ns, t_ns) for k, t_ns in enumerate(when)]
+    assert told_of(frames, samples) == {(SAMPLES_WITHOUT, "arm")}
+    assert told_of(frames, [replace(one, trigger_id=one.number) for one in samples]) == set()
+
+
+def test_a_session_tells_of_a_laser_controller_that_is_silent() -> None:
+    frames = [Frame(IMAGE, k, t_ns, t_ns) for k, t_ns in enumerate(times_ns(100))]
+    assert told_of(frames, has_lasers=True) == {(LASERS_UNTOLD, "lasers")}
 
 
 @pytest.mark.parametrize(

@@ -57,10 +57,15 @@ SAMPLES_WITHOUT = (
     "images bear triggers' ids, and none of its samples does: no image gets a pose; let the arm "
     "send a sample with the id at each trigger, or leave is_common_trigger out"
 )
-LASERS_UNKNOWN = (
+LASERS_MIXED = (
     "what lasers were on is not known: the images bear no trigger's id, and the lasers change "
     f"within {LASER_BOUND_NS / 1e6:g} ms; such images are kept and not measured: use a schedule "
     "of one step, or fewer than 10 triggers a second"
+)
+LASERS_UNTOLD = (
+    "what lasers were on is not known: the images bear no trigger's id, and within "
+    f"{LASER_BOUND_NS / 1e6:g} ms of them it told nothing whose time is known; such images are "
+    "kept and not measured: see that it triggers and answers"
 )
 STRAINED = {
     ArmFlag.INACCURATE: "it says of itself that its poses are inaccurate: they are not used",
@@ -194,7 +199,9 @@ class IdWatch:
             return ""
         if self._unknown_ns is None:
             self._unknown_ns = instant.t_ns
-        return LASERS_UNKNOWN if instant.t_ns > self._unknown_ns + WATCHED_NS else ""
+        if instant.t_ns <= self._unknown_ns + WATCHED_NS:
+            return ""
+        return LASERS_MIXED if instant.are_lasers_mixed else LASERS_UNTOLD
 
 
 class Acquisition:

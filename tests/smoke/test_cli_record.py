@@ -18,10 +18,12 @@ from typing import Any
 import pytest
 
 from armscan.cli import main
+from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import ArmFlag, ArmSample, LaserEvent
 from armscan.errors import DeviceError, DeviceStoppedError, OutputError
 from armscan.jobs.live.record import RecordRequest, _Recording, record_scan
 from armscan.pipeline.live.acquire import BEHIND, JUMPED, MATCHING, LiveEvent
+from armscan.pipeline.live.recorder import LiveRecorder
 from armscan.simulation.live import TwinArm, TwinLasers
 from armscan.storage.files import set_aside
 from armscan.storage.recording import read_recording
@@ -277,6 +279,30 @@ def test_a_run_without_an_image_removes_no_other_run_s_file(
     with pytest.raises(DeviceError, match="no image came"):
         record_scan(RecordRequest(str(rig), seconds=0.3), output, print)
     assert output.read_bytes() == EARLIER
+
+
+@pytest.mark.parametrize(
+    ("lacking", "words"),
+    [
+        ("lasers", "it is not known what lasers were on; see that the laser controller answers"),
+        ("trigger_id", "they bear no trigger's id, and ids alone give poses; let the cameras tell"),
+    ],
+)
+def test_a_recording_of_which_nothing_can_be_used_is_no_success(
+    lacking: str, words: str, rig: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    real, output = LiveRecorder.add_instant, rig.parent / "scan.mcap"
+
+    def without(recorder: LiveRecorder, instant: MatchedInstant) -> None:
+        frames = tuple(one and replace(one, **{lacking: None}) for one in instant.frames)
+        real(recorder, replace(instant, frames=frames, **{lacking: None}))
+
+    monkeypatch.setattr(LiveRecorder, "add_instant", without)
+    assert main(["record", str(rig), "--exposures", "3", "-o", str(output)]) == 2
+    told = capsys.readouterr().err
+    assert re.search("none of [0-9]+ exposures can be used: " + re.escape(words), told)
+    assert "the file keeps them" in told and len(read_recording(output).rows) >= 3
 
 
 def test_what_arrives_and_cannot_be_matched_is_no_success(

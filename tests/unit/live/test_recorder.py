@@ -95,7 +95,7 @@ def test_frames_that_no_table_places_are_kept_and_set_aside(tmp_path: Path) -> N
     recorder.hear(LiveEvent("button", "2", "arm"))
     recorder.add_events((LaserEvent(4, 10**15, 9, ("A", "B")),))
     assert recorder.close().n_written == 5
-    assert recorder.n_aside == 3
+    assert (recorder.n_aside, recorder.n_usable) == (3, 2)
     said = "1 lack parts, 1 have no time that is known, 1 came after newer ones"
     note = f"3 of 5 exposures in the file are set aside: {said}"
     # no word of the column of marks, which is our own
@@ -220,7 +220,7 @@ def test_frames_before_the_first_trigger_are_listed_and_get_no_pose(tmp_path: Pa
         sample = ArmSample(k, 1, 5_000_000_000 + 10**7 * k, pose, trigger_id=k if k > 1 else None)
         recorder.add_samples((TimedSample(sample, None, ElementStatus.USABLE, pose),))
     recorder.close()
-    assert (recorder.n_untriggered, recorder.n_aside) == (2, 0)
+    assert (recorder.n_untriggered, recorder.n_aside, recorder.n_usable) == (2, 0, 3)
     recorded = read_recording(tmp_path / "scan.mcap")
     assert recorded.exposure_columns["flags"] == ("no-trigger", "no-trigger", "", "", "")
     poses = exposure_poses(recorded.rows, recorded.arm, recorded.session.clock)
@@ -262,7 +262,7 @@ def test_images_whose_lasers_are_not_known_are_marked_and_counted(tmp_path: Path
     recorder.add_instant(replace(instant(4, None), lasers=None))
     recorder.close()
     # the last has no time either: it is set aside, and counted there
-    assert (recorder.n_laser_unknown, recorder.n_aside) == (2, 1)
+    assert (recorder.n_laser_unknown, recorder.n_aside, recorder.n_usable) == (2, 1, 2)
     recorded = read_recording(tmp_path / "scan.mcap")
     assert [row.flags for row in recorded.rows] == [(), (LASER_UNKNOWN,), (), (LASER_UNKNOWN,)]
     assert [row.is_dark for row in recorded.rows] == [False, False, True, False]

@@ -259,20 +259,45 @@ class _Recording:
                 + (f"; {self._why_ended}" if self._why_ended else ""),
                 remedy="check camera and trigger; `armscan devices` lists what answers",
             )
-        if self._recorder.n_aside == self._end.n_written:
-            raise DeviceError(
-                f"none of {self._end.n_written} exposures can be used: parts of them were lost, or "
-                "their clock was not known",
-                where=str(self._output),
-                remedy="record longer or at a higher rate, or say that one trigger takes image and "
-                "pose (--common-trigger); the file keeps them",
-            )
+        if not self._recorder.n_usable:
+            raise self._useless()
         if not is_kept:
             raise DeviceError(
                 f"after {self._seconds:.1f} s {self._why_ended}",
                 where=str(self._output),
                 remedy="what came before is whole",
             )
+
+    def _useless(self) -> DeviceError:
+        """Says why no reader can measure or place any exposure, by what most of them lack."""
+        recorder = self._recorder
+        n_untriggered = recorder.n_untriggered if self._has_arm else 0
+        reasons = (
+            (
+                recorder.n_aside,
+                "parts of them were lost, or their clock was not known",
+                "record longer or at a higher rate, or say that one trigger takes image and "
+                "pose (--common-trigger)",
+            ),
+            (
+                n_untriggered,
+                "they bear no trigger's id, and ids alone give poses",
+                "let the cameras tell the id, or record without is_common_trigger",
+            ),
+            (
+                recorder.n_laser_unknown,
+                "it is not known what lasers were on",
+                "see that the laser controller answers, and use a schedule of one step or fewer "
+                "triggers a second",
+            ),
+        )
+        _, fact, remedy = max(reasons, key=lambda reason: reason[0])
+        return DeviceError(
+            f"none of {self._end.n_written} exposures can be used: {fact}"
+            + (f"; {self._why_ended}" if self._why_ended else ""),
+            where=str(self._output),
+            remedy=f"{remedy}; the file keeps them",
+        )
 
     def _put_aside(self) -> None:
         """What is to be replaced, until this recording has ended with an image."""
@@ -375,7 +400,7 @@ class _Recording:
     @property
     def _n_unusable(self) -> int:
         """Exposures that are kept, and that no reader places or measures."""
-        return self._recorder.n_aside + self._recorder.n_laser_unknown
+        return self._recorder.n_exposures - self._recorder.n_usable
 
     def _losses(self) -> tuple[int, int]:
         """Elements of all streams that never came, and that came after newer ones."""

@@ -58,6 +58,8 @@ class LiveRecorder:
 
     Attributes
     ----------
+    n_usable
+        Frames that a reader can measure and, where there is an arm, place: none of the following.
     n_aside
         Frames that are kept and that no table places.
     n_untriggered
@@ -70,7 +72,7 @@ class LiveRecorder:
     """
 
     def __init__(self, path: Path, rig: Rig, *, options: WriterOptions | None = None) -> None:
-        self.n_aside = self.n_untriggered = self.n_laser_unknown = 0
+        self.n_usable = self.n_aside = self.n_untriggered = self.n_laser_unknown = 0
         self.n_samples = self.n_posed = 0
         self._writer = RecordingWriter(path, options)
         self._rig, self._is_triggered = rig, rig.description.is_common_trigger
@@ -195,7 +197,10 @@ class LiveRecorder:
             if instant.lasers is None and self._rig.lasers is not None:
                 flags.append(LASER_UNKNOWN)
                 self.n_laser_unknown += is_usable
-            self._add(camera, frame, t_ns if is_usable else None, instant.lasers or (), flags)
+            spoiled = {LASER_UNKNOWN, UNTRIGGERED} if self._rig.arm is not None else {LASER_UNKNOWN}
+            lasers = instant.lasers or ()
+            is_listed = self._add(camera, frame, t_ns if is_usable else None, lasers, flags)
+            self.n_usable += is_listed and spoiled.isdisjoint(flags)
 
     def _add(
         self,
@@ -204,7 +209,8 @@ class LiveRecorder:
         t_ns: int | None,
         lasers: tuple[str, ...],
         flags: Sequence[str],
-    ) -> None:
+    ) -> bool:
+        """Write a frame; whether a table lists it."""
         last_ns = self._last_ns[camera]
         if t_ns is not None and t_ns <= last_ns:
             # a clock that was related anew; by time such a frame belongs nowhere
@@ -221,6 +227,7 @@ class LiveRecorder:
         self._writer.add_exposure(row, frame.image, flags)
         self._index += 1
         self._last_ns[camera] = max(row.t_ns, last_ns)
+        return t_ns is not None
 
     def _write_samples(self) -> None:
         samples, self._samples = self._samples, []

@@ -66,7 +66,8 @@ def moved_far(bends: list[float], monkeypatch: pytest.MonkeyPatch) -> tuple[Hand
 def test_a_refusal_beside_the_moved_sensor_is_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first solution rests on derivatives that do not hold: it is not written in its place."""
     fit, inputs = moved_far([10.0 * STRAIGHT], monkeypatch)
-    rounds = iter([fit, REFUSED])
+    answers: list[HandEyeFit | FitFailure] = [fit, REFUSED]
+    rounds = iter(answers)
     found, _ = solved_where_it_moves(lambda _: next(rounds), inputs)
     assert isinstance(found, FitFailure)
     assert REFUSED.reason in found.reason and "where the stripes move it" in found.reason

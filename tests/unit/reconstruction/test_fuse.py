@@ -197,10 +197,10 @@ def test_what_two_cameras_err_is_alike_in_points_of_two_sheets(
     errors = errors_of_calibration(scanner, np.eye(3)[None])
     assert errors is not None
     none = np.zeros(3, dtype=np.int64)
-    seen = PointsSeen(
+    at_points = PointsSeen(
         points_mm=points, seen_from_mm=np.zeros((3, 3)), exposure=none, sheet=np.array(list(beside))
     )
-    along = [errors.moves_along_mm(seen, np.tile(axis, (3, 1))) for axis in np.eye(3)]
+    along = [errors.moves_along_mm(at_points, np.tile(axis, (3, 1))) for axis in np.eye(3)]
     told = np.stack(along, axis=2).reshape(-1, 9).T
     assert told.shape[1] == place.MOST_MODES or not is_cut
     size = np.sqrt(np.diag(expected))

@@ -107,7 +107,7 @@ class CalibrationErrors(ArrayRecord):
         for rows, turn, powers, modes in self._parts(seen):
             along = np.einsum("nji,nj->ni", turn, directions[rows])
             products = (powers[:, :, None] * along[:, None, :]).reshape(len(rows), -1)
-            found[:, rows] = modes.reshape(-1, len(found)).T @ products.T
+            found[:, rows] = modes.reshape(products.shape[1], len(found)).T @ products.T
         return found
 
     def covariance_mm2(self, seen: PointsSeen) -> FloatArray:

@@ -124,3 +124,14 @@ def test_a_spot_is_known_no_better_than_the_calibration() -> None:
     cloud, _ = scanned_box(0.004)
     found = compared(cloud, align_none(cloud))
     assert min(face.u_spot_mm for face in found.faces) > 2.0 * 0.95 * ALONG_MM
+
+
+def test_a_calibration_that_is_known_for_certain_moves_nothing() -> None:
+    cloud, _ = scanned_box(0.004)
+    errors = cloud.calibration_errors
+    assert errors is not None
+    none = replace(errors, modes_mm=errors.modes_mm[..., :0])
+    certain = compared(replace(cloud, calibration_errors=none), align_none(cloud))
+    untold = compared(replace(cloud, calibration_errors=None), align_none(cloud))
+    np.testing.assert_array_equal(certain.u_mm, untold.u_mm)
+    assert [one.u_mean_mm for one in certain.faces] == [one.u_mean_mm for one in untold.faces]

@@ -52,11 +52,14 @@ from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures, source_names
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording, recording_tables
-from armscan.storage.recordings.robot_poses import other_table_readings, read_robot_poses
+from armscan.storage.recordings.robot_poses import (
+    USUAL_EULER,
+    other_table_readings,
+    read_robot_poses,
+)
 from armscan.vision.targets.detect import settle_target
 from armscan.vision.targets.target import Target, describe_target, format_target, parse_target
 
-EULER: EulerConvention = "extrinsic-xyz"
 MOST_ROWS = 2 * MAX_LOOKS
 """Of a longer recording, the target is looked for in so many exposures, evenly spread."""
 
@@ -71,7 +74,7 @@ class LookSource:
     poses
         Table of the robot's poses, one a photograph.
     euler
-        What angles in ``poses`` mean; None for ``extrinsic-xyz``.
+        What angles in ``poses`` mean; None for `USUAL_EULER`.
     arm
         ``arm.toml`` for a recording of joint angles; None to look for it in the recording.
     camera, sensor
@@ -205,7 +208,7 @@ def _photographs(source: LookSource, image_options: ImageOptions) -> _Views:
     if source.poses is None:
         raise OptionError("photographs need a table of poses", remedy="give --poses")
     paths = expand_paths(source.images)
-    poses = read_robot_poses(source.poses, source.euler or EULER, paths)
+    poses = read_robot_poses(source.poses, source.euler or USUAL_EULER, paths)
     if len(poses) != len(paths):
         raise InputError(
             f"{len(paths)} photographs but {len(poses)} poses",
@@ -320,7 +323,7 @@ def _readings(looks: Sequence[BoardLook], source: LookSource, views: _Views) -> 
     sources = [exposure.source for exposure in views.exposures]
     row_of = dict(zip(sources, views.rows, strict=True))
     rows = [row_of[look.source] for look in looks]
-    paths, euler = expand_paths(source.images), source.euler or EULER
+    paths, euler = expand_paths(source.images), source.euler or USUAL_EULER
     for words, remedy, turns, shifts in other_table_readings(source.poses, euler, paths):
         yield words, remedy, turns[rows], shifts[rows]
     plainly = sorted(range(len(paths)), key=lambda k: paths[k].as_posix())

@@ -58,6 +58,35 @@ def test_two_clouds_become_one(
     assert "why" in output.with_suffix(".html").read_text()
 
 
+def test_how_the_clouds_of_others_were_read_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Numbers of points that stand before x, and a plate in metres, in text and as binary PLY."""
+    plate = np.stack(np.meshgrid(np.arange(8) / 20.0, np.arange(6) / 20.0, [1.0]), axis=-1)
+    points = plate.reshape(-1, 3)
+    numbered = np.column_stack([np.arange(1, 49), 1000.0 * points])
+    np.savetxt(tmp_path / "numbered.txt", numbered, fmt="%.9g")
+    np.savetxt(tmp_path / "metres.xyz", points, fmt="%.9g")
+    properties = "".join(f"property double {axis}\n" for axis in "xyz")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 48\n{properties}end_header\n"
+    (tmp_path / "metres.ply").write_bytes(header.encode() + points.tobytes())
+    wanted = {
+        "numbered.txt": "counts the lines",
+        "metres.xyz": "look like metres",
+        "metres.ply": "look like metres",
+    }
+    for name, words in wanted.items():
+        output = tmp_path / f"{name}-fused.ply"
+        command = ["fuse", str(tmp_path / name), "--voxel", "1", "-o", str(output)]
+        assert main(command) == 0
+        told = capsys.readouterr()
+        assert re.search(rf"{name}:.*{words}", re.sub(r"\s+", " ", told.out + told.err))
+        assert words in output.with_suffix(".html").read_text(encoding="utf-8")
+        assert main(["convert", str(tmp_path / name), str(tmp_path / f"{name}.obj")]) == 0
+        told = capsys.readouterr()
+        assert words in re.sub(r"\s+", " ", told.out + told.err)
+
+
 def test_a_sigma_that_is_not_known_is_no_zero_on_the_page(folder: Path) -> None:
     for name in ("a", "b"):
         assert main(["convert", str(folder / f"{name}.ply"), str(folder / f"{name}.xyz")]) == 0

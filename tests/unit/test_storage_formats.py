@@ -511,7 +511,7 @@ def test_a_scan_of_very_many_exposures_is_read_again(tmp_path: Path, suffix: str
     assert found.seen_from_mm is not None
     assert np.array_equal(found.seen_from_mm, places)
     (piece,) = read_cloud_pieces(path)
-    assert piece.exposure_sources == long.exposure_sources
+    assert piece.cloud.exposure_sources == long.exposure_sources
 
 
 def test_a_header_that_could_not_be_read_is_not_written(

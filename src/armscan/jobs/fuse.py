@@ -14,6 +14,7 @@ from armscan.fusion.digest import CloudDigest, percentiles
 from armscan.fusion.point_spool import PointSpool
 from armscan.fusion.voxel_map import VoxelMap
 from armscan.jobs.job import Job
+from armscan.models.calibration import Provenance
 from armscan.pipeline.progress import ProgressEvent
 from armscan.records.cloud import FUSED, PointCloud
 from armscan.report.cloud import FusedCloud, fused_page, fused_quantities
@@ -38,18 +39,22 @@ def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
     """Put clouds of one frame together, one point a voxel of edge ``size_mm``."""
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",), reads=paths)
     _refuse_twice(paths)
+    remarks: list[str] = []
     with scratch_folder(places[0]) as scratch:
         voxels = VoxelMap(size_mm, scratch)
         try:
             for k, path in enumerate(paths):
                 job.progress(ProgressEvent(STAGE, k, len(paths), path.name))
-                for cloud in read_cloud_pieces(path):
+                for piece in read_cloud_pieces(path):
+                    remarks += (f"{path.name}: {remark}" for remark in piece.remarks)
                     with told_of(str(path)):
-                        voxels.add(cloud)
+                        voxels.add(piece.cloud)
             job.progress(ProgressEvent(STAGE, len(paths), len(paths)))
             if voxels.n_points == 0:
                 raise InputError("the clouds hold no point", where=", ".join(map(str, paths)))
-            return _written(job, paths, places, voxels, scratch)
+            warnings = (*remarks, *(() if voxels.has_covariance else (NOT_KNOWN,)))
+            provenance = job.provenance(paths, (), warnings=warnings, forced=voxels.forced)
+            return _written(job, places, voxels, scratch, provenance)
         finally:
             voxels.close()
 
@@ -89,7 +94,7 @@ def _refuse_twice(paths: Sequence[Path]) -> None:
 
 
 def _written(
-    job: Job, paths: Sequence[Path], places: Sequence[Path], voxels: VoxelMap, scratch: Path
+    job: Job, places: Sequence[Path], voxels: VoxelMap, scratch: Path, provenance: Provenance
 ) -> Summary:
     with PointSpool(voxels.frame or "Part", (FUSED,), scratch) as points:
         for piece in voxels.fused():
@@ -105,8 +110,7 @@ def _written(
         float(private[0]),
         has_covariance=voxels.has_covariance,
     )
-    warnings = () if voxels.has_covariance else (NOT_KNOWN,)
-    provenance = job.provenance(paths, (), warnings=warnings, forced=voxels.forced)
+    warnings = provenance.warnings
     content = cloud_parts(places[0], marks, n_points, fused_pieces(voxels), is_fused=True)
     written = job.write({places[0]: content, places[1]: fused_page(result, provenance, warnings)})
     losses = cloud_losses(marks, places[0])

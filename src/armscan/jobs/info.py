@@ -30,7 +30,7 @@ from armscan.records.cloud import PointCloud, largest_eigenvalue
 from armscan.records.recording import LASER_UNKNOWN, NO_TRIGGER, ArmTrack, CameraSetup
 from armscan.report.quantity import Summary, fact, plural, with_sigma
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
-from armscan.storage.clouds import BY_SUFFIX, parse_ply, read_cloud, read_ply
+from armscan.storage.clouds import BY_SUFFIX, CloudFile, parse_ply, read_cloud_file, read_ply
 from armscan.storage.codec import parse_json
 from armscan.storage.documents import (
     REGISTRATION_SCHEMA,
@@ -428,7 +428,7 @@ def _file(path: Path) -> dict[str, Any]:
             **_ranges(part.vertices_mm.T),
         }
     if path.suffix.lower() in CLOUDS or _is_table_of_points(data):
-        return _cloud(read_cloud(path))
+        return _cloud(read_cloud_file(path))
     return _text(path, data)
 
 
@@ -471,7 +471,7 @@ def _text(path: Path, data: bytes) -> dict[str, Any]:
         return _camera(read_camera_calibration(path), "camera calibration of another program")
     if path.suffix.lower() == ".txt":
         with suppress(FileFormatError):
-            return _cloud(read_cloud(path))
+            return _cloud(read_cloud_file(path))
     raise FileFormatError(
         "armscan does not know this kind of file",
         where=str(path),
@@ -522,11 +522,13 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
     return content
 
 
-def _cloud(cloud: PointCloud) -> dict[str, Any]:
+def _cloud(found: CloudFile) -> dict[str, Any]:
+    cloud = found.cloud
     return {
         "what": f"point cloud, {len(cloud)} points",
         **_carried(cloud),
         **_ranges(cloud.points_mm.T),
+        **_notes((), found.remarks),
     }
 
 

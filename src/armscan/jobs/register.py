@@ -53,7 +53,7 @@ from armscan.report.quantity import (
     significant,
     with_sigma,
 )
-from armscan.storage.clouds import FOREIGN_FRAME, ply_bytes, read_cloud
+from armscan.storage.clouds import FOREIGN_FRAME, ply_bytes, read_cloud_file
 from armscan.storage.documents import (
     CODEC,
     MarkerResidual,
@@ -82,6 +82,7 @@ class _NamedCloud:
     name: str
     path: Path
     cloud: PointCloud
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +124,9 @@ def register(
         joined = _join_views(job, lists, options)
     else:
         joined = _join_place(lists[0], moved, clouds, options)
-    report, carried = joined.report, joined.carried
+    carried = joined.carried
+    read = (f"{item.path.name}: {remark}" for item in carried for remark in item.remarks)
+    report = replace(joined.report, warnings=(*joined.report.warnings, *read))
     inputs = [*(item.path for item in joined.lists), *(item.path for item in carried)]
     marks = (
         *(item.is_simulated for item in joined.lists),
@@ -212,14 +215,15 @@ def _cloud_beside(path: Path) -> Path | None:
 
 def _read_cloud(path: Path, name: str, markers: MarkerList) -> _NamedCloud:
     """The cloud of a list of markers, which must be in its frame."""
-    cloud = read_cloud(path)
+    found = read_cloud_file(path)
+    cloud = found.cloud
     if cloud.frame not in (markers.markers.frame, FOREIGN_FRAME):
         raise InputError(
             f"the cloud is in {cloud.frame}, its markers are in {markers.markers.frame}",
             where=f"{path} and {markers.path}",
             remedy="measure both in one frame, or correct '# frame =' in the list",
         )
-    return _NamedCloud(f"{name}.ply", path, cloud)
+    return _NamedCloud(f"{name}.ply", path, cloud, found.remarks)
 
 
 def _different_names(paths: Sequence[Path]) -> tuple[str, ...]:

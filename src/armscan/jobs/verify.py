@@ -48,7 +48,7 @@ from armscan.report.quantity import (
     values,
 )
 from armscan.storage.arm import read_arm_model
-from armscan.storage.clouds import read_cloud
+from armscan.storage.clouds import read_cloud_file
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.files import holds_files, path_text
 from armscan.storage.image_paths import are_simulated
@@ -124,11 +124,11 @@ def verify(
     job.places(".html")
     table = scan / EXPOSURES_FILE if holds_files(scan) else scan
     inputs = [path for path in (table, scanner, standard.plate, arm) if path is not None]
-    measured, is_simulated = _measured(scan, scanner, arm, job.progress)
+    measured, is_simulated, remarks = _measured(scan, scanner, arm, job.progress)
     is_simulated = is_simulated or are_simulated(inputs)
     unsaid = () if measured.scan is not None else _of_scanner(measured.cloud, scan, scanner)
     result = _verified(measured, standard, box, options, inspection)
-    result = replace(result, warnings=(*unsaid, *result.warnings))
+    result = replace(result, warnings=(*remarks, *unsaid, *result.warnings))
     report = _report(scan.name, result, measured)
     forced = measured.cloud.forced
     written: tuple[Path, ...] = ()
@@ -173,10 +173,11 @@ def verify(
 
 def _measured(
     scan: Path, scanner: Path | None, arm: Path | None, progress: Progress
-) -> tuple[Measured, bool]:
-    """The points, and whether they are of rendered images."""
+) -> tuple[Measured, bool, tuple[str, ...]]:
+    """The points, whether they are of rendered images, and what to know of a cloud's reading."""
     if not holds_files(scan) or scanner is None:
-        cloud = read_cloud(scan)
+        found = read_cloud_file(scan)
+        cloud = found.cloud
         if cloud.frame == "Sensor":
             raise OptionError(
                 "the cloud is in the Sensor frame, where hand-eye and arm took no part",
@@ -185,13 +186,13 @@ def _measured(
             )
         if arm is not None:
             raise OptionError("a cloud in Base takes no arm", where="--arm", remedy="leave it out")
-        return Measured(cloud), cloud.is_simulated
+        return Measured(cloud), cloud.is_simulated, found.remarks
     source = read_recording(scan, None if arm is None else read_arm_model(arm))
     calibration = read_scanner_calibration(scanner)
-    found = measure_scan(source, calibration, ScanOptions(has_normals=False), progress=progress)
-    warnings = (*source.warnings, *source.session.assumed, *found.warnings)
-    found = replace(found, warnings=warnings)
-    return Measured(found.cloud, found, calibration), source.is_simulated
+    measured = measure_scan(source, calibration, ScanOptions(has_normals=False), progress=progress)
+    warnings = (*source.warnings, *source.session.assumed, *measured.warnings)
+    measured = replace(measured, warnings=warnings)
+    return Measured(measured.cloud, measured, calibration), source.is_simulated, ()
 
 
 def _of_scanner(cloud: PointCloud, path: Path, scanner: Path | None) -> tuple[str, ...]:

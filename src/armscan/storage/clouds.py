@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from armscan.errors import FileFormatError, OptionError, OutputError, listed
 from armscan.geometry.arrays import IntArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import SMALLEST_EXTENT_MM, PointCloud
 from armscan.storage.documents import (
     SCANNER_SCHEMA,
     document_schema,
@@ -153,8 +155,27 @@ def read_cloud_file(path: Path) -> CloudFile:
             remedy=f"give a file {', '.join(BY_SUFFIX)} with x y z in mm",
         )
     found = known.read(data, path)
+    return _as_read(found, path)
+
+
+def _as_read(found: CloudColumns, path: Path) -> CloudFile:
+    cloud = cloud_of_columns(found, path)
     counts = found.columns.get(N_POINTS) if found.is_own else None
-    return CloudFile(cloud_of_columns(found, path), found.remarks, dropped_columns(found), counts)
+    remarks = (*found.remarks, *(() if found.is_own else _of_units(cloud)))
+    return CloudFile(cloud, remarks, dropped_columns(found), counts)
+
+
+def _of_units(cloud: PointCloud) -> tuple[str, ...]:
+    """A doubt that points of another program are in mm, where they all lie in one place."""
+    if len(cloud) < LEAST_POINTS:
+        return ()
+    extent = float(np.linalg.norm(np.ptp(cloud.points_mm, axis=0)))
+    if extent == 0.0 or extent >= SMALLEST_EXTENT_MM:
+        return ()
+    return (
+        f"all {len(cloud):,} points lie within {extent:.3g} mm: these look like metres; if they "
+        "are, multiply the coordinates by 1000",
+    )
 
 
 def cloud_bytes(points: PointCloud | CloudPiece, path: Path) -> bytes:
@@ -204,6 +225,8 @@ def cloud_parts(
         yield cloud_bytes(replace(whole, cloud=marked), path)
 
 
+LEAST_POINTS = 3
+"""Points of a cloud of which the extent says something."""
 MOST_NAMED = 12
 """Columns that are named, of a file that may have a thousand."""
 NO_SIGMA = "the source tells no covariance of its points: it stays zero, which stands for not known"
@@ -211,14 +234,16 @@ PIECE_POINTS = 200_000
 """Points of a file that are read at a time: 60 MB with all that is made of them."""
 
 
-def read_cloud_pieces(path: Path) -> Iterator[PointCloud]:
-    """As `read_cloud`, a binary PLY file piece by piece."""
+def read_cloud_pieces(path: Path) -> Iterator[CloudFile]:
+    """As `read_cloud_file`, a binary PLY file piece by piece; remarks come with the first."""
     pieces = ply_pieces(path, PIECE_POINTS) if is_file(path) else None
     if pieces is None:
-        yield read_cloud(path)
+        yield read_cloud_file(path)
         return
-    for found in pieces:
-        yield cloud_of_columns(found, path)
+    for k, found in enumerate(pieces):
+        piece = _as_read(found, path)
+        # the few points of a last piece may well lie in one place
+        yield replace(piece, remarks=piece.remarks if k == 0 else ())
 
 
 def cloud_losses(cloud: PointCloud, path: Path, dropped: Sequence[str] = ()) -> tuple[str, ...]:

@@ -134,5 +134,18 @@ def test_a_recording_is_converted_to_its_band(
     assert "--stripe-band: a stripe band is for recordings" in capsys.readouterr().err
 
 
+def test_a_recording_is_not_replaced_by_its_band(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, WriterOptions()) as writer:
+        writer.begin(Session(cameras=(CameraSetup(SIZE[1], SIZE[0]),)))
+        writer.add_exposure(row(0), lit_image(0))
+    before = path.read_bytes()
+    assert main(["convert", str(path), str(path), "--stripe-band", "--force"]) == 2
+    assert "a.mcap is read, and would be replaced" in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
 def session_text() -> str:
     return f"[[camera]]\nwidth_px = {SIZE[1]}\nheight_px = {SIZE[0]}\n"

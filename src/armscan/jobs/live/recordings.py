@@ -90,6 +90,12 @@ def convert_recording(
             remedy=f"end the new name in {SUFFIX}, or leave it out",
         )
     _refuse_points(output, source)
+    if output.exists() and source.exists() and output.samefile(source):
+        raise OutputError(
+            f"{output.name} is read, and would be replaced",
+            where=str(output),
+            remedy="give another name",
+        )
     if source.suffix.lower() == SUFFIX and output.suffix.lower() != SUFFIX:
         return _summary("Converted: recording to a folder.", extract_recording(source, output),
                         output)  # fmt: skip

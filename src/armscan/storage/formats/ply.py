@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +98,7 @@ def parse_ply(data: bytes, where: str) -> PlyVertices:
         )
     try:
         text = data[:end].decode("latin-1")
-        order, count, kind, comments = _header(text)
+        order, count, kind, vertices = _header(text)
     except (ValueError, KeyError, IndexError) as error:
         raise FileFormatError(
             "the PLY header is not understood", where=where, remedy=DAMAGED
@@ -113,12 +113,14 @@ def parse_ply(data: bytes, where: str) -> PlyVertices:
             where=where,
             remedy="copy the file again",
         )
-    faces = re.search(r"^element face (\d{1,15})\b", text, re.MULTILINE)
-    return PlyVertices(table, comments, int(faces[1]) if faces is not None else 0)
+    return replace(vertices, table=table)
 
 
-def _header(text: str) -> tuple[str, int, np.dtype[Any], tuple[str, ...]]:
-    """Format, count and type of the vertices, and comments; `ValueError` for what is no header."""
+def _header(text: str) -> tuple[str, int, np.dtype[Any], PlyVertices]:
+    """Format, count and type of the vertices, and these with none read yet.
+
+    `ValueError` for what is no header.
+    """
     order, count, element = "", -1, ""
     fields: list[tuple[str, str]] = []
     comments: list[str] = []
@@ -138,8 +140,11 @@ def _header(text: str) -> tuple[str, int, np.dtype[Any], tuple[str, ...]]:
             fields.append((words[2], BYTE_ORDERS[order] + TYPES[words[1]]))
     if count < 0 or not 0 < len(fields) <= MOST_PROPERTIES:
         raise ValueError("the header names no vertices")
+    faces = re.search(r"^element face (\d{1,15})\b", text, re.MULTILINE)
     # a name that occurs twice is a ValueError of numpy
-    return order, count, np.dtype(fields), tuple(comments)
+    kind = np.dtype(fields)
+    none = PlyVertices(np.zeros(0, kind), tuple(comments), int(faces[1]) if faces else 0)
+    return order, count, kind, none
 
 
 def _ascii_table(body: bytes, kind: np.dtype[Any], count: int, where: str) -> NDArray[Any]:
@@ -192,7 +197,10 @@ def ply_parts(
 
 def ply_columns(data: bytes, path: Path) -> CloudColumns:
     """What the vertices of any PLY file carry."""
-    vertices = parse_ply(data, path_text(path))
+    return _columns(parse_ply(data, path_text(path)))
+
+
+def _columns(vertices: PlyVertices) -> CloudColumns:
     remarks = (vertices_remark(vertices.n_faces),) if vertices.n_faces else ()
     return CloudColumns(columns_of(vertices.table), vertices.comments, remarks=remarks)
 
@@ -212,11 +220,10 @@ def ply_pieces(path: Path, most_points: int) -> Iterator[CloudColumns] | None:
     if not (is_binary and END_HEADER.fullmatch(line)):
         return None
     try:
-        _, count, kind, comments, *_ = _header(start.decode("latin-1"))
+        _, count, _, empty = _header(start.decode("latin-1"))
     except (ValueError, KeyError, IndexError):
         # what is wrong with a header is said by the reader of whole files
         return None
-    empty = PlyVertices(np.zeros(0, kind), comments)
     return _pieces(path, len(start), count, empty, most_points)
 
 
@@ -236,7 +243,7 @@ def _pieces(
                     where=path_text(path),
                     remedy="copy the file again",
                 )
-            yield CloudColumns(columns_of(np.frombuffer(data, kind, asked)), empty.comments)
+            yield _columns(replace(empty, table=np.frombuffer(data, kind, asked)))
 
 
 def vertices_remark(n_triangles: int) -> str:

@@ -188,7 +188,11 @@ HEADERS = (
 """Headers that are understood, without units and case."""
 METRES = re.compile(r"^x[_ (\[]*m\b", re.IGNORECASE)
 """The first word of a header whose positions are in metres."""
-METRES_COMMENT = re.compile(rb"^[ \t]*#.*\bmet(re|er)s\b", re.IGNORECASE | re.MULTILINE)
+METRES_COMMENT = re.compile(
+    rb"^[ \t]*(?!.*(?:mm\b|millimet))#(?:.*(?:\bin|\bare|\bis|[:=(\[]))?[ \t]*met(?:re|er)s\b",
+    re.IGNORECASE | re.MULTILINE,
+)
+"""A comment which says that positions are in metres; others tell of metres beside the subject."""
 NAME_TITLES = {"file", "filename", "file_name", "image", "image_name", "img", "name", "photo"}
 """What the column of files' names is called, before those of the poses."""
 OF_MATRIX = re.compile(r"^[a-z]+_?[0-4]_?[0-4]$", re.IGNORECASE)
@@ -220,7 +224,8 @@ def read_robot_poses(
     ``extrinsic-xyz``), or a rotation vector in rad, or as a header's ``a_rad`` or ``rx [deg]``
     says; or the matrix of ``base_from_tool``, 3 x 4 or 4 x 4, in one line or one line
     a row; or x, y, z and a quaternion, whose order the header says. Positions are in metres under a
-    header that begins with ``x_m`` or ``x [m]``, and where a comment says ``metres``.
+    header that begins with ``x_m`` or ``x [m]``, and where no header states a unit and a comment
+    says ``metres``, ``in metres`` or ``unit: metres``, and nothing of millimetres.
 
     Where a line begins with the name of a file, poses are given to ``files`` by their names, and
     come in the order of these; other lines are left. Else they come as they stand.
@@ -406,7 +411,7 @@ def _from_json(data: bytes, where: str) -> _PoseTable:
         )
     places = [f"{where}, pose {k}" for k in range(1, len(rows) + 1)]
     flat = [_numbers(_flat(row), place) for row, place in zip(rows, places, strict=True)]
-    return _PoseTable([], flat, places, bool(METRES_COMMENT.search(data)), [])
+    return _PoseTable([], flat, places, False, [])
 
 
 def _flat(row: Any) -> list[Any]:
@@ -453,8 +458,14 @@ def _from_text(data: bytes, where: str) -> _PoseTable:
         rows.append(_numbers(_words(line), place))
     if rows and not names and all(len(row) == 4 for row in rows):
         rows, places = _joined(rows, places)
-    is_metres = bool(header and METRES.match(header[0])) or bool(METRES_COMMENT.search(data))
-    return _PoseTable(header, rows, places, is_metres, names)
+    return _PoseTable(header, rows, places, _is_in_metres(header, data), names)
+
+
+def _is_in_metres(header: Sequence[str], data: bytes) -> bool:
+    """Whether positions are in metres: a header that states a unit goes before any comment."""
+    if header and UNIT.search(header[0]):
+        return METRES.match(header[0]) is not None
+    return METRES_COMMENT.search(data) is not None
 
 
 def _words(line: str) -> list[str]:

@@ -83,6 +83,9 @@ def test_a_bundle_says_what_is_inside_and_keeps_secrets(
     assert "the file exists" in capsys.readouterr().err
     assert main(["doctor", "--with", str(log)]) == 2
     assert main(["doctor", "--bundle", str(tmp_path / "q.tar")]) == 2
+    assert main(["doctor", "--bundle", str(tmp_path / "new.zip"), "--warm"]) == 2
+    assert main(["doctor", "--force"]) == 2
+    assert not (tmp_path / "new.zip").exists()
 
 
 def test_a_recording_that_cannot_be_read_goes_in_as_it_is(

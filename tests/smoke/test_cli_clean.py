@@ -36,6 +36,22 @@ def test_a_cleaned_cloud_with_its_page(block: Path, capsys: pytest.CaptureFixtur
     assert 'class="scene"' in text
 
 
+def test_the_page_tells_what_the_terminal_does(
+    block: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """How the cloud of another program was read, and what the new file does not hold."""
+    path, output = block.with_name("named.txt"), block.with_name("left.ply")
+    points = np.random.default_rng(1).normal(size=(30, 3)) * 9.0
+    table = np.column_stack([np.arange(1, 31), points, np.ones(30)])
+    np.savetxt(path, table, header="number X Y Z extra", fmt="%.6g")
+    assert main(["clean", str(path), "-o", str(output), "--isolated", "50"]) == 0
+    said = capsys.readouterr().out
+    page = output.with_suffix(".html").read_text(encoding="utf-8")
+    for words in ("y and z are columns 2, 3 and 4", "does not hold: the columns number, extra"):
+        assert words in said
+        assert words in page
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

@@ -47,6 +47,9 @@ def test_a_cylinder_with_its_page(
 
 def test_a_relation(part: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["cylinder:diameter=12:region=10,30,5,25,-9,-1", "plane:seed=5,5,0"]
+    assert main(["inspect", "relation", str(part), *words]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "statistic cylinder" in told and "against its fit (second)" in told
     assert main(["inspect", "relation", str(part), *words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["angle"]["value_deg"] == pytest.approx(90.0, abs=0.2)

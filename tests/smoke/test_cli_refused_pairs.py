@@ -94,6 +94,8 @@ def test_what_cameras_are_given_for_is_checked_without_them(tmp_path: Path, fail
     assert "intrinsics 'foo' is not known" in fails(*words, "--intrinsics", "foo", writes=tmp_path)
     fixed = fails(*words, "--intrinsics", "fixed", writes=tmp_path)
     assert "give --left and --right" in fixed
+    prior = fails(*words, "--intrinsics", "prior", writes=tmp_path)
+    assert "no calibration is given to count beside the images" in prior
 
 
 def test_what_would_do_nothing_beside_given_cameras_is_refused(

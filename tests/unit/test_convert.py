@@ -63,7 +63,8 @@ def test_no_such_way(tmp_path: Path) -> None:
 def test_the_camera_of_a_scanner_is_that_of_its_sensor(tmp_path: Path) -> None:
     scanner = tmp_path / "scanner.json"
     scanner.write_bytes(scanner_document(scanner_calibration(has_sensor=True)))
-    convert_file(scanner, tmp_path / "camera.yaml")
+    conversion = convert_file(scanner, tmp_path / "camera.yaml")
+    assert {"light sheets", "hand-eye"} <= {*conversion.losses}
     found = read_camera_calibration(tmp_path / "camera.yaml").camera
     sensor = read_scanner_calibration(scanner).sensor
     assert sensor is not None

@@ -82,6 +82,8 @@ def test_ros_camera_info(tmp_path: Path) -> None:
     assert camera.fx_px == 438.783367
     assert camera.cy_px == 243.738352
     assert camera.distortion.tolist() == [-0.361976, 0.110510, 0.001014, 0.000505, 0.0]
+    path.write_bytes(b"\xef\xbb\xbf---\r\n" + ROS.replace("\n", "\r\n").encode())
+    assert np.array_equal(read_foreign_camera(path).camera.parameters, camera.parameters)
 
 
 def test_ros_export_reads_back_exactly(tmp_path: Path) -> None:

@@ -524,6 +524,19 @@ def test_a_header_that_could_not_be_read_is_not_written(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_covariances_that_are_none_are_refused(tmp_path: Path) -> None:
+    """A correlation of 5 between x and y."""
+    path, one = tmp_path / "cloud.csv", cloud(3)
+    covariance = np.tile(np.eye(3), (3, 1, 1))
+    write_cloud(path, replace(one, covariance_mm2=covariance))
+    assert np.array_equal(read_cloud(path).covariance_mm2, covariance)
+    covariance[1, 0, 1] = covariance[1, 1, 0] = 5.0
+    path.unlink()
+    write_cloud(path, replace(one, covariance_mm2=covariance))
+    with pytest.raises(FileFormatError, match="covariances of point 2 are none"):
+        read_cloud(path)
+
+
 def test_a_part_and_a_cloud_of_an_stl_have_the_same_corners(tmp_path: Path) -> None:
     """A binary file whose header begins with "solid", and an indented text in capitals."""
     box = trimesh.creation.box((3, 4, 5))

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -168,8 +167,12 @@ def stereo(
         Path | None, typer.Option("--right", help="Calibration of the right camera by itself.")
     ] = None,
     intrinsics: Annotated[
-        str, typer.Option(help="What these are for: prior (beside the images) or fixed (held).")
-    ] = "prior",
+        str | None,
+        typer.Option(
+            help="What these are for: prior (beside the images, the default) or fixed (held).",
+            show_default=False,
+        ),
+    ] = None,
     leave_out: Annotated[
         list[str] | None,
         typer.Option(
@@ -192,22 +195,24 @@ def stereo(
 
     cameras = (left_camera, right_camera)
     is_given = any(path is not None for path in cameras)
-    if intrinsics == "fixed" and not is_given:
-        raise OptionError(
-            "there is nothing to hold", where="--intrinsics fixed", remedy="give --left and --right"
-        )
     if is_given:
         what = "the lens and what is solved of it are those of --left and --right"
         refuse_vain({"--distortion": distortion}, what)
     options = given(
         StereoOptions,
         camera=given(CameraOptions, distortion=distortion),
-        intrinsics=intrinsics,
+        intrinsics=intrinsics or ("prior" if is_given else "free"),
         leave_out=tuple(leave_out or ()),
         leave_out_misfits=auto_leave_out,
     )
-    if not is_given:
-        options = replace(options, intrinsics="free")
+    if options.intrinsics != "free" and not is_given:
+        raise OptionError(
+            "there is nothing to hold"
+            if options.intrinsics == "fixed"
+            else "no calibration is given to count beside the images",
+            where=f"--intrinsics {options.intrinsics}",
+            remedy="give --left and --right",
+        )
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     return lambda job: calibrate_stereo(
         job,

@@ -63,7 +63,8 @@ def convert(
         Path,
         typer.Argument(
             help="A cloud: the same but .stl; of a model (.stl, .ply, .obj, .step) its triangles, "
-            ".stl; of a calibration .yaml (ROS camera_info); of a recording .mcap or a new folder.",
+            ".stl; of a camera's, sensor's or scanner's calibration .yaml (ROS camera_info of its "
+            "left or only camera); of a recording .mcap or a new folder.",
             show_default=False,
         ),
     ],
@@ -139,9 +140,11 @@ def doctor(
     from armscan.jobs.live.doctor import examine_installation, pack_bundle
 
     if bundle is not None:
+        refuse_vain({"--warm": warm}, "nothing is compiled for a bundle")
         show(pack_bundle(bundle, having or (), is_overwriting=force), as_json=as_json)
         return
-    refuse_vain({"--with": having}, "there is no bundle", "give --bundle, or leave out")
+    vain = {"--with": having, "--force": force}
+    refuse_vain(vain, "there is no bundle", "give --bundle, or leave out")
     summary = examine_installation(warm=warm)
     show(summary, as_json=as_json)
     if summary.warnings:

@@ -187,7 +187,9 @@ def calibrate_hand_eye_on_board(
         is_simulated=views.is_simulated,
     )
     scanner = fit.scanner(sensor, provenance)
-    page = board_hand_eye_page(fit, scanner, plate, by_source, is_simulated=views.is_simulated)
+    page = board_hand_eye_page(
+        replace(fit, warnings=warnings), scanner, plate, by_source, is_simulated=views.is_simulated
+    )
     observations = pack_observations([pose.view for pose in fit.chosen], (), {})
     document = scanner_document(scanner, (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))

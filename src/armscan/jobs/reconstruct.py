@@ -613,7 +613,8 @@ def _check_own_images(paths: StillPaths) -> None:
 def read_stills(paths: StillPaths, options: ImageOptions, n_cameras: int) -> StillImages:
     """Read images of files and folders, or the exposures of one recording."""
     folder = Path(paths.images[0]) if len(paths.images) == 1 else None
-    if folder is not None and is_recording(folder) and not (paths.background or paths.right):
+    others = (*paths.background, *paths.right, *paths.right_background)
+    if folder is not None and is_recording(folder) and not others:
         return _stills_of_recording(folder, n_cameras)
     names = (paths.images, paths.background, paths.right, paths.right_background)
     groups = [expand_paths(given) if given else () for given in names]

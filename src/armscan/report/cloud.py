@@ -543,7 +543,7 @@ def cleaning_page(
                 for step in found.steps
             ),
         ),
-        warnings=found.warnings,
+        warnings=provenance.warnings,
         is_simulated=is_simulated,
     )
 

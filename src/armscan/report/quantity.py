@@ -241,7 +241,9 @@ def significant(value: float, unit: str = "", digits: int = 3) -> str:
 
 
 def share_text(percent: float) -> str:
-    """A share with two decimals that never reads 100 if something is outside."""
+    """A share with two decimals that never reads 100 or 0 if it is neither."""
+    if 0.0 < percent < 0.005:
+        return "below 0.01 %"
     return "above 99.99 %" if 99.995 <= percent < 100.0 else f"{percent:.2f} %"
 
 

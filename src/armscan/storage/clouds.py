@@ -12,8 +12,7 @@ import numpy as np
 
 from armscan.errors import FileFormatError, OptionError, OutputError, listed
 from armscan.geometry.arrays import IntArray
-from armscan.models.calibration import SensorCalibration
-from armscan.models.camera import CameraModel
+from armscan.models.calibration import CameraCalibration, SensorCalibration
 from armscan.records.cloud import SMALLEST_EXTENT_MM, PointCloud
 from armscan.storage.documents import (
     SCANNER_SCHEMA,
@@ -329,9 +328,11 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         without = (NO_SIGMA,) if holds_sigma and not cloud.covariance_mm2.any() else ()
         conversion = Conversion(what, losses, (*found.remarks, *without), cloud.forced)
     else:
-        camera, forced = _camera(source)
-        content = camera_info_yaml(camera, forced).encode()
-        conversion = Conversion("camera to ROS camera_info", YAML_LOSES, (), forced)
+        calibration, losses = _camera(source)
+        forced = calibration.provenance.forced
+        content = camera_info_yaml(calibration.camera, forced).encode()
+        losses = (*losses, *YAML_LOSES)
+        conversion = Conversion("camera to ROS camera_info", losses, (), forced)
     write_files({output: content}, is_overwriting=is_overwriting)
     return conversion
 
@@ -365,7 +366,8 @@ def _convert_model(source: Path, output: Path, *, is_overwriting: bool) -> Conve
     return Conversion("model to STL", losses, (*part.notes, *(drawn if is_step else ())))
 
 
-def _camera(path: Path) -> tuple[CameraModel, tuple[str, ...]]:
+def _camera(path: Path) -> tuple[CameraCalibration, tuple[str, ...]]:
+    """The (left) camera of a calibration, and what else that holds, in words."""
     schema = document_schema(path)
     if schema == SCANNER_SCHEMA:
         sensor = read_scanner_calibration(path).sensor
@@ -375,9 +377,14 @@ def _camera(path: Path) -> tuple[CameraModel, tuple[str, ...]]:
                 where=str(path),
                 remedy="give a calibration with a camera",
             )
-        return sensor.camera.camera, sensor.camera.provenance.forced
+        return sensor.camera, (*_beside_camera(sensor), "hand-eye")
     is_own = schema is not None
     calibration = read_calibration(path) if is_own else read_camera_calibration(path)
     if isinstance(calibration, SensorCalibration):
-        return calibration.camera.camera, calibration.camera.provenance.forced
-    return calibration.camera, calibration.provenance.forced
+        return calibration.camera, _beside_camera(calibration)
+    return calibration, ()
+
+
+def _beside_camera(sensor: SensorCalibration) -> tuple[str, ...]:
+    right = () if sensor.second is None else ("the right camera",)
+    return (*right, "light sheets")

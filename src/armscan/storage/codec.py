@@ -40,6 +40,8 @@ NOT_NEGATIVE = ("n_", "rms_", "sigma_", "degrees_of_freedom")
 MAY_LACK = ("rms_", "sigma_")
 """Figures that calibrations of other programs do not bring."""
 SYMMETRY_TOLERANCE = 1e-9
+INDEFINITE_TOLERANCE = 1e-6
+"""How far a correlation's eigenvalue may lie below 0 by rounding."""
 
 
 def json_bytes(value: Any) -> bytes:
@@ -487,6 +489,10 @@ def symmetric(matrix: FloatArray, key: str) -> FloatArray:
     is_even = np.abs(matrix - matrix.T) <= SYMMETRY_TOLERANCE * (scale + np.abs(matrix))
     if variances.min(initial=0.0) < 0.0 or not is_even.all():
         raise MismatchError(key, "is not symmetric with a positive diagonal")
+    correlation = np.divide(matrix, scale, out=np.zeros_like(matrix), where=scale > 0.0)
+    least = float(np.linalg.eigvalsh(correlation).min(initial=0.0))
+    if least < -INDEFINITE_TOLERANCE or bool(matrix[scale == 0.0].any()):
+        raise MismatchError(key, "is no covariance: it makes some variance negative")
     return matrix
 
 

@@ -6,6 +6,7 @@ and written.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -110,7 +111,7 @@ def _read_tree(data: bytes, where: str) -> Mapping[str, Any]:
 
 def _with_yaml_header(text: str) -> str:
     """OpenCV 4 takes a text for YAML by its first line only, which ROS does not write."""
-    start = text.lstrip("\ufeff \t\r\n").removeprefix("---\n")
+    start = re.sub(r"\A[\ufeff\s]*(---\s*\n)?", "", text)
     return text if start.startswith(("%YAML", "<?xml", "<opencv")) else f"%YAML:1.0\n---\n{start}"
 
 

@@ -128,14 +128,23 @@ def _probed(table: CsvTable) -> ProbedPoints:
         )
 
 
+MEANS_TIP = re.compile(r"\btip[ _-]*(?:diam|rad|cent)", re.IGNORECASE)
+"""What a comment would hold that tells of the tip, however it is written."""
+
+
 def _tip(table: CsvTable) -> tuple[float, bool]:
     """Diameter that a comment gives, 0 for none; whether the points are on the surface."""
     stated: dict[str, str] = {}
     for comment in table.comments:
-        stated |= {
-            key: value.strip()
-            for key, value in re.findall(r"(point|tip_diameter_mm)\s*=\s*([^,;]+)", comment)
-        }
+        found = re.findall(r"(point|tip_diameter_mm)\s*=\s*([^,;]+)", comment)
+        stated |= {key: value.strip() for key, value in found}
+        if not found and MEANS_TIP.search(comment):
+            raise FileFormatError(
+                f"the comment '{comment.strip()}' speaks of a tip and is not understood",
+                where=table.where,
+                remedy="write '# point = tip-centre, tip_diameter_mm = 6', or with surface where "
+                "the tip's radius is taken off; else leave the comment out",
+            )
     kind = stated.get("point", "tip-centre" if "tip_diameter_mm" in stated else "surface")
     is_surface = kind == "surface"
     if is_surface and "tip_diameter_mm" not in stated:

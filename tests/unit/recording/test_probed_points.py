@@ -64,6 +64,9 @@ def test_columns_are_found_by_name_and_marks_of_other_systems_do_no_harm(tmp_pat
     ("text", "said"),
     [
         ("# point = tip-centre\n" + TABLE, "diameter is not given"),
+        ("# point: tip-centre, tip_diameter_mm: 6\n" + TABLE, "is not understood"),
+        ("# Tip diameter = 6\n" + TABLE, "is not understood"),
+        ("# tip_radius_mm = 3\n" + TABLE, "is not understood"),
         ("# point = tip-centre, tip_diameter_mm = -6\n" + TABLE, "diameter is not given"),
         ("# point = surface, tip_diameter_mm = six\n" + TABLE, "diameter is not given"),
         ("# point = middle\n" + TABLE, "'point = middle' is not known"),

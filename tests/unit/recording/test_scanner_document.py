@@ -96,6 +96,10 @@ def set_value(*path: Any) -> Callable[[Any], None]:
         (set_value("hand_eye", "plate", "normal_base", [0, 0, 2]), "hand_eye.plate"),
         (set_value("hand_eye", "covariance", "parameter_names", 0, "x"), "parameter names"),
         (set_value("hand_eye", "covariance", "matrix", 0, 0, -1), "positive diagonal"),
+        (
+            set_value("hand_eye", "covariance", "matrix", (5.0 - 4.0 * np.eye(6)).tolist()),
+            "'hand_eye.covariance' is no covariance",
+        ),
         (set_value("hand_eye", "sensor_coupling", "column_names", 0, "x"), "sensor's parameters"),
         (set_value("hand_eye", "sensor_coupling", "matrix", [[1.0]]), "6 x 25"),
         (set_value("sensor", None), "sensor's parameters"),

@@ -19,6 +19,7 @@ from armscan.report.quantity import (
     for_people,
     only,
     sentence,
+    share_text,
     significant,
     summary_json,
     summary_text,
@@ -26,6 +27,12 @@ from armscan.report.quantity import (
     values,
     with_sigma,
 )
+
+
+def test_a_share_reads_none_or_all_only_where_it_is() -> None:
+    shares = (0.0, 0.0003, 0.005, 50.0, 99.9994, 100.0)
+    told = ("0.00 %", "below 0.01 %", "0.01 %", "50.00 %", "above 99.99 %", "100.00 %")
+    assert tuple(map(share_text, shares)) == told
 
 
 @pytest.mark.parametrize(

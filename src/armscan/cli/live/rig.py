@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 
 from armscan.cli.delivery import show
-from armscan.cli.options import AsJson, DefaultOf, Force, given
+from armscan.cli.options import AsJson, Force, given
 
-RIG = "armscan.pipeline.live.rig:RigDescription."
 RECORD_EXAMPLE = (
     "\b\nExamples:\n"
     "  armscan record rig.toml -o scan.mcap\n"
@@ -39,8 +38,8 @@ def record(
     rate: Annotated[
         float | None,
         typer.Option(
-            help="Triggers a second of the controller, whatever rig.toml says.",
-            show_default=DefaultOf(RIG + "rate_hz"),
+            help="Triggers a second of the controller; left out, those of rig.toml, else 80.",
+            show_default=False,
         ),
     ] = None,
     common_trigger: Annotated[

@@ -162,15 +162,16 @@ def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
     lost = (f"the new file does not hold: {', '.join(losses)}",) if losses else ()
     warnings = (*source.remarks, *found.warnings, *lost)
     provenance = job.provenance((path,), (options,), warnings=warnings, forced=cloud.forced)
-    page = cleaning_page(found, cloud.points_mm, provenance, is_simulated=cloud.is_simulated)
+    is_simulated = cloud.is_simulated or are_simulated((path,))
+    page = cleaning_page(found, cloud.points_mm, provenance, is_simulated=is_simulated)
     written = job.write({places[0]: cloud_bytes(found.cloud, job.output), places[1]: page})
     return Summary(
-        title="Cloud cleaned" + (" (simulated data)." if cloud.is_simulated else "."),
+        title="Cloud cleaned" + (" (simulated data)." if is_simulated else "."),
         quantities=cleaning_quantities(found),
         tables=(cleaning_table(found),),
         warnings=sentences(warnings),
         written=written,
         next_step=f"open {places[1]}",
         forced=cloud.forced,
-        extra={"kind": "cleaning", "simulated": cloud.is_simulated, "frame": cloud.frame},
+        extra={"kind": "cleaning", "simulated": is_simulated, "frame": cloud.frame},
     )

@@ -186,7 +186,10 @@ def _verdict_quantities(found: CadComparison) -> list[Quantity]:
         Quantity("verdict_rule", "", RULE),
         Quantity(
             "points.percent_pass_undecided_fail", "Points", shares.tolist(),
-            shown=f"{shares[0]:.2f} % pass, {shares[1]:.2f} % undecided, {shares[2]:.2f} % fail",
+            shown=", ".join(
+                f"{share_text(share)} {word}"
+                for share, word in zip(shares, ("pass", "undecided", "fail"), strict=True)
+            ),
         ),
         Quantity("points.fraction_within_tolerance", "", share_within(found)),
     ]  # fmt: skip

@@ -116,7 +116,9 @@ class InspectionReport:
             (name, *(_value(deviations, k) for _, deviations in self.references))
             for k, name in enumerate(names)
         )
-        heads = tuple(f"{deviations.reference} reference" for _, deviations in self.references)
+        heads = [f"{deviations.reference} reference" for _, deviations in self.references]
+        if len(set(heads)) < len(heads):
+            heads = [heading for heading, _ in self.references]
         return Table(("statistic", *heads), rows)
 
 

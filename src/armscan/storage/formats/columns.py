@@ -296,6 +296,7 @@ def own_cloud(found: CloudColumns, where: str) -> PointCloud:
     for name, (i, j) in COVARIANCE.items():
         covariance[:, i, j] = covariance[:, j, i] = columns[name]
     covariance.setflags(write=False)
+    _refuse_impossible(covariance, where)
     points = _joined(columns, POINT)
     refuse_beyond_reach(points, where)
     _refuse_gaps(points, where)
@@ -319,6 +320,29 @@ def own_cloud(found: CloudColumns, where: str) -> PointCloud:
             is_simulated=named.is_simulated,
             forced=named.forced,
             calibrations=named.calibrations,
+        )
+
+
+INDEFINITE_TOLERANCE = 1e-6
+"""How far a minor of a covariance may lie below 0 by rounding, in parts of its diagonal."""
+
+
+def _refuse_impossible(covariance: FloatArray, where: str) -> None:
+    """Raise if the (N, 3, 3) make the variance of some direction negative."""
+    xx, yy, zz = (covariance[:, k, k] for k in range(3))
+    xy, xz, yz = (covariance[:, i, j] for i, j in ((0, 1), (0, 2), (1, 2)))
+    least = -INDEFINITE_TOLERANCE
+    is_possible = (xx >= 0.0) & (yy >= 0.0) & (zz >= 0.0)
+    for one, other, both in ((xx, yy, xy), (xx, zz, xz), (yy, zz, yz)):
+        is_possible &= one * other - both**2 >= least * one * other
+    whole = xx * yy * zz + 2.0 * xy * xz * yz - xx * yz**2 - yy * xz**2 - zz * xy**2
+    is_possible &= whole >= least * xx * yy * zz
+    if not is_possible.all():
+        raise FileFormatError(
+            f"the six covariances of point {int(np.argmin(is_possible)) + 1} are none: they make "
+            "some variance negative",
+            where=where,
+            remedy=DAMAGED,
         )
 
 

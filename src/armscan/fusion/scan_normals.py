@@ -193,16 +193,14 @@ class ScanNormals:
         """Means of the cells, block by block, and where each block begins."""
         blocks: list[IntArray] = []
         starts: list[IntArray] = []
-        written = 0
+        written, last = 0, -1
         for keys, found in sums.merged():
             self._file.write((found[:, :3] / found[:, 3:]).tobytes())
             number = keys >> IN_BLOCK_BITS
-            first = np.flatnonzero(np.concatenate([[True], number[1:] != number[:-1]]))
-            if blocks and len(blocks[-1]) and number[0] == blocks[-1][-1]:
-                first = first[1:]
+            first = np.flatnonzero(np.diff(number, prepend=last))
             blocks.append(number[first])
             starts.append(first + written)
-            written += len(keys)
+            written, last = written + len(keys), int(number[-1])
         self._blocks = np.concatenate(blocks)
         self._starts = np.concatenate([*starts, [written]])
 

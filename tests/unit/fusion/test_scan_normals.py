@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.fusion import point_spool, scan_normals
+from armscan.fusion import cell_sums, point_spool, scan_normals
 from armscan.fusion.cell_sums import AXIS_CELLS, CellSums, cell_numbers, cells_of, numbers_at
 from armscan.fusion.point_spool import PointSpool
 from armscan.fusion.scan_normals import ScanNormals, choose_scan_radius_mm
@@ -46,6 +47,21 @@ def test_they_are_those_of_the_cloud_in_memory(
     true = whole.points_mm / RADIUS_MM
     assert np.median(np.abs(np.einsum("ni,ni->n", found, true))) > 0.9999
     assert not any(tmp_path.iterdir())
+
+
+def test_they_are_the_same_from_cells_on_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two runs over one surface: pieces of them end within blocks, some in one that was begun."""
+    clouds = [*stripes(60), *stripes(60)]
+    with spool_of(clouds, tmp_path) as spool:
+        radius_mm = choose_scan_radius_mm(spool)
+        wanted = normals_of(spool, radius_mm)
+        monkeypatch.setattr(cell_sums, "FEWEST_ROWS", 8)
+        monkeypatch.setattr(scan_normals, "CellSums", partial(CellSums, most_bytes=20_000))
+        found = normals_of(spool, radius_mm)
+    assert (np.linalg.norm(found, axis=1) > 0.5).tolist() == wanted.any(axis=1).tolist()
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
 def test_a_radius_of_a_part_of_the_cells_is_nearly_that_of_all(

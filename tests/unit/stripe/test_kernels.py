@@ -324,7 +324,7 @@ def test_section_is_what_the_fit_leaves() -> None:
     reach = np.full(40, 2.7)
     fit_profiles(*images, *arguments, start, reach, fits)
     said, pixels = np.zeros((40, 8)), np.zeros((3, 40 * 31))
-    weigh_section(*images, sides, fits, noise, start, 15, said, pixels)
+    weigh_section(*images, *arguments[:2], fits, noise, start, 15, said, pixels)
     for i in (0, 17, 39):
         _, amplitude, sigma = fits[i, [CENTRE, AMPLITUDE, SIGMA]]
         u = (np.arange(41) - fits[i, CENTRE]) / sigma
@@ -350,7 +350,7 @@ def test_section_is_what_the_fit_leaves() -> None:
     assert np.all(np.abs(start[2:] + common - [c3, c4]) < 4.0 * 1.6 * sigma)
     true, fits = np.array([0.0, 0.0, c3, c4]), np.zeros((40, FIT_COLUMNS))
     fit_profiles(*images, *arguments, true, reach, fits)
-    count = weigh_section(*images, sides, fits, noise, true, 15, said, pixels)
+    count = weigh_section(*images, *arguments[:2], fits, noise, true, 15, said, pixels)
     # the freedom that each fit took is given back
     assert np.std(pixels[2, :count]) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * count))
 
@@ -365,7 +365,8 @@ def test_a_narrow_section_is_told_however_far_is_looked() -> None:
     told = []
     for reach in (12, 190):
         said, pixels = np.zeros((1, 8)), np.zeros((3, 2 * reach + 1))
-        given = (image, none, EVEN, points, np.full((1, 2), 5.0), fits, noise, section)
+        beside = np.full(1, 0.6), np.full((1, 2), 5.0)
+        given = (image, none, EVEN, points, *beside, fits, noise, section)
         n = weigh_section(*given, reach, said, pixels)
         told.append((said, pixels[:, :n]))
     for near, far in zip(*told, strict=True):
@@ -396,7 +397,7 @@ def test_clipped_cores_say_nothing_of_the_section() -> None:
     clipped[4, 25] = 1  # two sigmas beside it
     images, arguments = (image, clipped, EVEN, points), (np.full(40, 2.5), sides, noise)
     fit_profiles(*images, *arguments, np.zeros(4), np.full(40, 2.7), fits)
-    weigh_section(*images, sides, fits, noise, np.zeros(4), 15, said, pixels)
+    weigh_section(*images, *arguments[:2], fits, noise, np.zeros(4), 15, said, pixels)
     assert np.flatnonzero(said[:, 5] == 0.0).tolist() == [4]
 
 

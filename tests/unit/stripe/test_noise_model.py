@@ -8,6 +8,7 @@ import pytest
 
 import armscan.vision.stripe.fit
 from armscan.geometry.arrays import FloatArray
+from armscan.kernels.stripe.profile_fit import CENTRE, FIT_COLUMNS, fit_profiles, read_sides
 from armscan.kernels.stripe.section import weigh_section
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.fit import estimate_noise, start_noise
@@ -81,7 +82,8 @@ def test_residuals_are_widened_by_what_the_fit_took_of_each_pixel(line_sigma: fl
     fits = np.array([[20.3, 100.0, line_sigma, 0.1, 0.0, 1.0, 0.0, 0.0]])
     none, even = np.zeros((1, 1), np.uint8), np.ones((1, 1), np.float32)
     pixels = np.zeros((3, 31))
-    given = (image, none, even, points, np.full((1, 2), 5.0), fits, noise, np.zeros(4))
+    beside = np.full(1, line_sigma), np.full((1, 2), 5.0)
+    given = (image, none, even, points, *beside, fits, noise, np.zeros(4))
     n = weigh_section(*given, 15, np.zeros((0, 8)), pixels)
     near = np.abs(u) < 2.7
     weight = 1.0 / np.sqrt(noise[0] * light**2 + noise[1] * (light + 5.0) + noise[2])[near]
@@ -91,3 +93,35 @@ def test_residuals_are_widened_by_what_the_fit_took_of_each_pixel(line_sigma: fl
     assert (left < 0.2).any() == (line_sigma < 1.0)
     is_line = pixels[0, :n] > 100.0 * np.exp(-0.5 * 2.7**2)
     assert pixels[2, :n][is_line] == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("line_sigma", "start_sigma", "slope"), [(0.7, 0.7, 3.0), (2.0, 3.5, 1.0), (3.0, 3.0, 0.5)]
+)
+def test_ground_that_brightens_to_one_side_moves_nothing(
+    line_sigma: float, start_sigma: float, slope: float
+) -> None:
+    """The same ramp under the fit, which begins with whatever width, and under what it leaves."""
+    rng, n, noise = np.random.default_rng(4), 400, np.array([0.0, 0.0, 0.49])
+    centre = 30.0 + rng.uniform(-0.5, 0.5, (n, 1))
+    u = (np.arange(61) - centre) / line_sigma
+    level = 100.0 + slope * (np.arange(61) - 30.0) + 150.0 * np.exp(-0.5 * u * u)
+    image = (level + rng.normal(0.0, 0.7, level.shape)).astype(np.float32)
+    points = np.zeros((n, 6))
+    points[:, 0], points[:, 1], points[:, 2], points[:, 5] = centre[:, 0], np.arange(n), 1.0, 1.0
+    sigma, none, raw = np.full(n, start_sigma), np.zeros((1, 1), np.uint8), np.zeros((n, 4))
+    read_sides(image, points, sigma, raw)
+    sides, fits = np.tile(raw[:, ::2].mean(axis=0), (n, 1)), np.zeros((n, FIT_COLUMNS))
+    # places of the pixels of a side differ from row to row by up to half a pixel
+    sides += slope * (centre - centre.mean())
+    even = np.ones((1, 1), np.float32)
+    given = (image, none, even, points, sigma, sides)
+    fit_profiles(*given, noise, np.zeros(4), np.full(n, 2.7), fits)
+    off = fits[:, CENTRE] - centre[:, 0]
+    assert abs(off.mean()) < 4.0 * off.std() / np.sqrt(n)
+    pixels = np.zeros((3, n * 31))
+    count = weigh_section(*given, fits, noise, np.zeros(4), 15, np.zeros((0, 8)), pixels)
+    own, _, left = pixels[:, :count]
+    beside = np.abs(own) < 3.0
+    for chosen in (beside, ~beside):
+        assert np.std(left[chosen]) == pytest.approx(0.7, rel=0.1)

@@ -27,7 +27,8 @@ REACH_SIGMAS = 2.7
 SIDE_NEAR = 3.3
 SIDE_FAR = 5.3
 """The background is read between these multiples of sigma on both sides."""
-SIDE_SPAN = SIDE_NEAR + SIDE_FAR
+LEAST_SIDE_PX = 2.0
+"""Width of a side, however narrow the line."""
 ITERATIONS = 12
 LEAST_PIXELS = 5
 LEAST_HALF_PX = 2.5
@@ -80,6 +81,12 @@ def begin_fits(
 
 
 @compiled()
+def side_span(sigma_px: float) -> float:
+    """Distance between the middles of the two sides that `read_sides` reads with a sigma."""
+    return max((SIDE_NEAR + SIDE_FAR) * sigma_px, 2.0 * SIDE_NEAR * sigma_px + LEAST_SIDE_PX)
+
+
+@compiled()
 def read_sides(image: Image, points: Table, sigma_px: Floats, sides: TableOut) -> None:
     """Mean grey level beside the line, on the side of smaller and of larger coordinate.
 
@@ -94,7 +101,7 @@ def read_sides(image: Image, points: Table, sigma_px: Floats, sides: TableOut) -
         line = int(points[i, 0] if is_column else points[i, 1])
         size = height if is_column else width
         near = SIDE_NEAR * sigma_px[i]
-        far = max(SIDE_FAR * sigma_px[i], near + 2.0)
+        far = max(SIDE_FAR * sigma_px[i], near + LEAST_SIDE_PX)
         for side in range(2):
             if side == 0:
                 first = math.ceil(centre - far)
@@ -549,7 +556,7 @@ def fit_profiles(
             place[STRIDE * LANES + k] = width if is_column else 1
             place[N_PIXELS * LANES + k] = stop - from_ + 1
             capacity = max(capacity, stop - from_ + 1)
-            ramp = (sides[i, 1] - sides[i, 0]) / (SIDE_SPAN * sigma_px[i])
+            ramp = (sides[i, 1] - sides[i, 0]) / side_span(sigma_px[i])
             ground[SLOPE * LANES + k] = ramp
             ground[OFFSET * LANES + k] = 0.5 * (sides[i, 0] + sides[i, 1]) + ramp * (from_ - start)
             state[START * LANES + k] = start - from_

@@ -30,12 +30,12 @@ from armscan.kernels.stripe.profile_fit import (
     PROFILE_ROWS,
     REACH_SIGMAS,
     REFLECTANCE,
-    SIDE_SPAN,
     SIGMA,
     SKEW,
     SKEW_NORM,
     VARIANCE,
     exponential,
+    side_span,
 )
 
 NORMAL_00, NORMAL_01, NORMAL_11, SCORE_0, SCORE_1, HAS_CORE, BLACK_NORMAL, BLACK_SCORE = range(8)
@@ -177,13 +177,14 @@ def read_profile(
     reflectance: Image,
     point: Floats,
     side: Floats,
-    sigma: float,
+    span_px: float,
     first: int,
     n: int,
     lane: FloatsOut,
 ) -> None:
     """Copy ``n`` pixels from ``first`` on of a point's column or row, less their background.
 
+    ``span_px``: Distance between the two sides.
     ``lane``: From the lane's first number on: pixels as for `add_pixel`. The others: One point's of
     `weigh_section`.
     """
@@ -193,7 +194,7 @@ def read_profile(
     has_clipped = clipped.shape[0] == image.shape[0] and clipped.shape[1] == image.shape[1]
     has_ground = reflectance.shape[0] == image.shape[0] and reflectance.shape[1] == image.shape[1]
     middle = 0.5 * (side[0] + side[1])
-    ramp = (side[1] - side[0]) / (SIDE_SPAN * sigma)
+    ramp = (side[1] - side[0]) / span_px
     for k in range(n):
         at = first + k
         own = k * PROFILE_ROWS * LANES
@@ -306,6 +307,7 @@ def weigh_section(
     clipped: Mask,
     reflectance: Image,
     points: Table,
+    sigma_px: Floats,
     sides: Table,
     fits: Table,
     noise: Floats,
@@ -319,13 +321,13 @@ def weigh_section(
     Of the terms of third and fourth order of `accumulate`, only what centre, amplitude and width
     do not take up counts.
 
-    ``image``, ``clipped``, ``reflectance``, ``points``, ``sides``, ``noise``, ``section``: As for
-    `fit_profiles`, which gave ``fits`` (N, 9). ``reach``: Pixels looked at on both sides. ``said``:
-    (N, 8) output: normal matrix of the two terms as 00 01 11, their right-hand side, 1 where no
-    pixel beyond the core is clipped, and both for what the reflectance is too large by; (0, 8) if
-    not asked for. ``pixels``: (3, >= N (2 reach + 1)) output: the line's own grey level, the same
-    with the background, and the residual, widened by what the fit took of it under ``noise``, of
-    pixels of the lines and of those beside them; (3, 0) if not asked for.
+    ``image``, ``clipped``, ``reflectance``, ``points``, ``sigma_px``, ``sides``, ``noise``,
+    ``section``: As for `fit_profiles`, which gave ``fits`` (N, 9). ``reach``: Pixels looked at on
+    both sides. ``said``: (N, 8) output: normal matrix of the two terms as 00 01 11, their
+    right-hand side, 1 where no pixel beyond the core is clipped, and both for what the reflectance
+    is too large by; (0, 8) if not asked for. ``pixels``: (3, >= N (2 reach + 1)) output: the line's
+    own grey level, the same with the background, and the residual, widened by what the fit took of
+    it under ``noise``, of pixels of the lines and of those beside them; (3, 0) if not asked for.
 
     Returns count of pixels.
     """
@@ -348,8 +350,8 @@ def weigh_section(
             start = points[i, 1] if is_column else points[i, 0]
             first = max(int(np.rint(start)) - reach, 0)
             n = min(int(np.rint(start)) + reach + 1, height if is_column else width) - first
-            sigma, lane = fits[i, SIGMA], seen[k:]
-            read_profile(image, clipped, reflectance, points[i], sides[i], sigma, first, n, lane)
+            sigma, span, lane = fits[i, SIGMA], side_span(sigma_px[i]), seen[k:]
+            read_profile(image, clipped, reflectance, points[i], sides[i], span, first, n, lane)
             lanes[AT_CENTRE * LANES + k] = fits[i, CENTRE] - first
             lanes[STEP * LANES + k] = 1.0 / fits[i, SIGMA]
             lanes[AT_AMPLITUDE * LANES + k] = fits[i, AMPLITUDE]

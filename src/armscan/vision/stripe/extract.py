@@ -275,7 +275,7 @@ def to_profile(
     usable = (flags & int(REJECTING | StripeFlag.PULLED)) == 0
     # beyond a crossing a chain may follow the other line: nothing is averaged across it
     is_new = (np.diff(chain) != 0) | (np.diff(near) != 0)
-    stretch = np.concatenate([[0], np.cumsum(is_new)])
+    stretch = np.concatenate([[0], np.cumsum(is_new, dtype=np.int64)])
     alike = sigma**2 * fits.values[:, ALIKE]
     course = straighten(Polyline(points, normals, sigma, stretch, usable), fits)
     smoothed = smooth(course, options.smoothing_px)

@@ -20,13 +20,13 @@ from armscan.kernels.stripe.profile_fit import (
     FOOT_SIGMAS,
     REACH_SIGMAS,
     SIDE_FAR,
-    SIDE_SPAN,
     SIGMA,
     VARIANCE,
     average_sides,
     begin_fits,
     fit_profiles,
     read_sides,
+    side_span,
 )
 from armscan.kernels.stripe.section import (
     BIN_MEANS,
@@ -278,7 +278,7 @@ def fit_ridge(
         if good.sum() < LEAST_PER_BIN:
             continue
         at = pick[good]
-        fitted = _Sample.of(plane, table[at], sides[at], sample[good])
+        fitted = _Sample.of(plane, table[at], sigma[at], sides[at], sample[good])
         peak = _nearly_largest(fitted.fits[:, AMPLITUDE])
         noise = estimate_noise(*fitted.left(noise, section), peak, noise)
         said = fitted.said(noise, section)
@@ -414,17 +414,23 @@ class _Sample:
 
     plane: StripePlane
     points: FloatArray
+    sigma_px: FloatArray
     sides: FloatArray
     fits: FloatArray
     reach: int
 
     @classmethod
     def of(
-        cls, plane: StripePlane, points: FloatArray, sides: FloatArray, fits: FloatArray
+        cls,
+        plane: StripePlane,
+        points: FloatArray,
+        sigma_px: FloatArray,
+        sides: FloatArray,
+        fits: FloatArray,
     ) -> _Sample:
         """The profiles, looked at as far as the background beside most of them is read."""
-        reach = math.ceil(_nearly_largest(fits[:, SIGMA]) * SIDE_SPAN / 2.0)
-        return cls(plane, points, sides, fits, reach)
+        reach = math.ceil(side_span(_nearly_largest(fits[:, SIGMA])) / 2.0)
+        return cls(plane, points, sigma_px, sides, fits, reach)
 
     def left(self, noise: FloatArray, section: FloatArray) -> tuple[FloatArray, int]:
         """(3, >= n) pixels of `weigh_section`, and n."""
@@ -442,7 +448,7 @@ class _Sample:
         self, noise: FloatArray, section: FloatArray, said: FloatArray, pixels: FloatArray
     ) -> int:
         images = (self.plane.image, self.plane.clipped, self.plane.reflectance)
-        fitted = (self.points, self.sides, self.fits)
+        fitted = (self.points, self.sigma_px, self.sides, self.fits)
         return weigh_section(*images, *fitted, noise, section, self.reach, said, pixels)
 
 

@@ -23,9 +23,9 @@ from armscan.pipeline.measure import (
     MeasureOptions,
     cameras_of,
     labeller_for,
+    laser_warnings,
     measure_instants,
     summarised,
-    unknown_lasers,
 )
 from armscan.pipeline.progress import Progress, silent
 from armscan.reconstruction.labels import LabelledProfile, PointStatus
@@ -130,9 +130,11 @@ def observe_stripes(
     without_stripe: dict[int, str] = {}
     weak: list[str] = []
     # Each still is labelled by itself: where the sensor is on the arm is not known yet.
+    labeller = labeller_for(sensor, options)
+    of_lasers = laser_warnings([row.lasers for row in rows], labeller, sensor, options)
     measured = measure_instants(
         scan.read(chosen, STAGE, progress),
-        labeller_for(sensor, options),
+        labeller,
         sensor,
         options,
         is_pass=False,
@@ -172,7 +174,7 @@ def observe_stripes(
     not_used = tuple((source.rows[row].source, reason) for row, reason in reasons.items())
     warnings = (
         *poses.warnings,
-        *unknown_lasers(source.rows, sensor, options),
+        *of_lasers,
         *_left_out(len(chosen), int(has_pose.sum()), not_used),
         *merged,
         *summarised(weak),

@@ -7,6 +7,7 @@ Still images, hand-eye calibration, scans and scans that choose their lasers mea
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -42,6 +43,7 @@ from armscan.reconstruction.labels import (
     SingleLabeller,
     StripeCounts,
     StripeLabeller,
+    without_sheet,
 )
 from armscan.reconstruction.place import merge_clouds
 from armscan.reconstruction.points import MeasuredProfile, measure_points, points_again
@@ -55,7 +57,6 @@ from armscan.reconstruction.triangulate import (
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
-from armscan.records.recording import ExposureRow
 from armscan.storage.detection_cache import DetectionCache, detection_key
 from armscan.thesis.row_rule import RowLabeller
 from armscan.vision.stripe.extract import extract_stripes
@@ -102,7 +103,8 @@ class MeasureOptions:
         Depths that are accepted; points outside are left out and counted. None for those that the
         head's own rule takes.
     sheet
-        Name of the sheet that drew all stripes; empty to find it. For one camera only.
+        Name of the sheet that drew all stripes; empty to find it. For one camera only. Exposures
+        that name other calibrated lasers are left out.
     is_by_thesis
         Tell crossed sheets by the printed rule of rows (eqs. 3.1 to 3.7).
     """
@@ -449,6 +451,7 @@ def reconstruct(
     clouds: list[PointCloud] = []
     weak: list[str] = []
     labeller = labeller_for(sensor, options)
+    of_lasers = laser_warnings([one.lasers for one in exposures], labeller, sensor, options)
     stripes, about = stripes_as_seen(len(left), left.__getitem__, sensor, options.stripes, cache)
     options = replace(options, stripes=stripes)
     for instant in measure_instants(
@@ -466,7 +469,7 @@ def reconstruct(
     depths = SheetDepths.of(sensor)
     SheetDepths.add(depths, cloud.sheet, cloud.points_mm[:, 2])
     counts = [image.counts for image in images]
-    said = [about] if about else []
+    said = (about, *of_lasers) if about else of_lasers
     warnings = (*said, *measurement_warnings(counts, depths, sensor), *summarised(weak))
     return Reconstruction(cloud, tuple(images), warnings)
 
@@ -630,18 +633,44 @@ def measurement_warnings(
     return tuple(warnings)
 
 
-def unknown_lasers(
-    rows: Sequence[ExposureRow], sensor: SensorCalibration, options: MeasureOptions
+def laser_warnings(
+    lasers: Iterable[tuple[str, ...]],
+    labeller: StripeLabeller,
+    sensor: SensorCalibration,
+    options: MeasureOptions,
 ) -> tuple[str, ...]:
-    """Warn of lasers that exposures name but the calibration has no sheet of."""
-    sheets = [sheet.name for sheet in sensor.sheets]
-    known = {*sheets, *(name.partition(".")[0] for name in sheets)}
-    named = {laser for row in rows for laser in row.lasers}
-    if options.sheet or not named - known:
-        return ()
-    lasers, names = ", ".join(sorted(named - known)), ", ".join(sheets)
-    return (
-        f"exposures name the laser {lasers}, of which the calibration has no sheet: their stripes "
-        f"were measured as if they were of {names}. If one of these is it under another name, "
-        "`armscan reconstruct` takes that by --sheet; else the calibration is of another head",
-    )
+    """Warn of exposures that name other lasers than the calibrated ones, or than the one chosen.
+
+    Parameters
+    ----------
+    lasers
+        Sources that were on in each exposure; empty if unknown.
+    labeller, sensor, options
+        With which they are measured.
+
+    Raises
+    ------
+    InputError
+        If the labeller leaves all exposures out.
+    """
+    named = Counter(lasers)
+    why = {on: labeller.left_out(on) for on in named}
+    if named and all(why.values()):
+        raise InputError(
+            f"no exposure can be measured: {next(iter(why.values()))}",
+            remedy="leave --sheet out, or name the sheet of the laser that was on"
+            if options.sheet
+            else "give the calibration of this head; a laser that was calibrated under another "
+            "name is taken for it by --sheet",
+        )
+    warnings = [f"{named[on]} exposures were left out: {text}" for on, text in why.items() if text]
+    unknown = {one for on, text in why.items() if not text for one in without_sheet(sensor, on)}
+    if unknown and not options.sheet:
+        names = ", ".join(sheet.name for sheet in sensor.sheets)
+        warnings.append(
+            f"exposures name the laser {', '.join(sorted(unknown))}, of which the calibration has "
+            f"no sheet: their stripes were measured as if they were of {names}. If one of these is "
+            "it under another name, `armscan reconstruct` takes that by --sheet; else the "
+            "calibration is of another head"
+        )
+    return tuple(warnings)

@@ -33,12 +33,12 @@ from armscan.pipeline.measure import (
     SheetDepths,
     cameras_of,
     labeller_for,
+    laser_warnings,
     measure_instants,
     measurement_warnings,
     nothing_measured,
     scan_as_seen,
     summarised,
-    unknown_lasers,
 )
 from armscan.pipeline.progress import (
     Progress,
@@ -349,6 +349,8 @@ def measure_long_scan(
     wanted = [one for one in scan.lit if poses.has_pose[list(one.rows)].all()]
     transform = BaseTransform.of(scanner)
     labeller = labeller_for(sensor, options.measure, is_scan=True)
+    named = [source.rows[one.rows[0]].lasers for one in wanted]
+    of_lasers = laser_warnings(named, labeller, sensor, options.measure)
     found = _Measured(SheetDepths.of(sensor))
     shown = _shown_rows(wanted, most_images)
     at = sensor_poses(poses, scanner)
@@ -400,7 +402,7 @@ def measure_long_scan(
             *measurement_warnings(counts, found.depths, sensor),
             *extra,
             *doubt.warnings,
-            *unknown_lasers(source.rows, sensor, options.measure),
+            *of_lasers,
             *summarised(found.weak),
         ),
         doubt=doubt,

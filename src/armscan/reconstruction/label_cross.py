@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Base, Points, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
@@ -19,6 +18,9 @@ from armscan.reconstruction.labels import (
     LabelledInstant,
     LabelledProfile,
     PointStatus,
+    given_to_none,
+    sheets_of,
+    without_sheet,
 )
 from armscan.reconstruction.segments import Pieces, cut_pieces
 from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange, intersect_sheets
@@ -493,6 +495,12 @@ class CrossLabeller:
         """One laser alone at the start of a pass and when labels are in doubt, else all."""
         return self._next
 
+    def left_out(self, lasers: tuple[str, ...]) -> str:
+        """Sources without a sheet, whose stripes would be taken for those of others."""
+        unknown = without_sheet(self._sensor, lasers)
+        names = " and ".join(unknown)
+        return f"of {names}, which was on, the calibration has no sheet" if unknown else ""
+
     def label(
         self,
         profiles: Sequence[Profile],
@@ -500,27 +508,14 @@ class CrossLabeller:
         base_from_sensor: Pose[Base, Sensor] | None = None,
         t_ns: int = 0,
     ) -> LabelledInstant:
-        """Label the points of the next exposure; see `StripeLabeller`.
-
-        Raises
-        ------
-        InputError
-            If the calibration has no sheet of any laser that was on.
-        """
+        """Label the points of the next exposure; see `StripeLabeller`."""
         (profile,) = profiles
         if self._last_ns is not None and t_ns - self._last_ns > PASS_GAP_NS:
             self.reset()
         self._last_ns = t_ns
-        possible = tuple(
-            k for k, source in enumerate(self._source_of) if not lasers or source in lasers
-        )
-        if not possible:
-            raise InputError(
-                f"the laser that was on is {' and '.join(lasers)}, the calibration has "
-                f"{', '.join(self._sources)}",
-                where=profile.source,
-                remedy="give a calibration of this head",
-            )
+        if why := self.left_out(lasers):
+            return given_to_none(profile, why)
+        possible = sheets_of(self._sensor, lasers or self._sources)
         found = self._assign(profile, possible, base_from_sensor)
         self._learn(profile, found, base_from_sensor)
         self._plan(found, possible)

@@ -440,6 +440,10 @@ class StereoLabeller:
         """Those of the recording."""
         return ()
 
+    def left_out(self, lasers: tuple[str, ...]) -> str:
+        """No exposure: what is on no calibrated sheet has no partner in the other camera."""
+        return ""
+
     def reset(self) -> None:
         """Nothing is remembered."""
 

@@ -182,8 +182,28 @@ class StripeLabeller(Protocol):
     def next_lasers(self) -> tuple[str, ...]:
         """Sources that should be on in the next exposure; empty for those of the recording."""
 
+    def left_out(self, lasers: tuple[str, ...]) -> str:
+        """Why no stripe is given to a sheet where these sources were on; empty if they may be."""
+
     def reset(self) -> None:
         """Forget the past: the next exposure begins a new pass."""
+
+
+def sheets_of(sensor: SensorCalibration, lasers: Sequence[str]) -> tuple[int, ...]:
+    """Sheets that these sources draw: those of their name, or of it up to the dot."""
+    names = [sheet.name for sheet in sensor.sheets]
+    return tuple(k for k, one in enumerate(names) if {one, one.partition(".")[0]} & {*lasers})
+
+
+def without_sheet(sensor: SensorCalibration, lasers: Sequence[str]) -> tuple[str, ...]:
+    """Those of these sources of which the calibration has no sheet."""
+    return tuple(laser for laser in lasers if not sheets_of(sensor, (laser,)))
+
+
+def given_to_none(profile: Profile, reason: str) -> LabelledInstant:
+    """No stripe of the exposure has a sheet."""
+    n = len(profile)
+    return _labelled(profile, np.full(n, -1), np.full(n, PointStatus.STRAY), reason)
 
 
 MIN_INSIDE = 0.9
@@ -196,10 +216,11 @@ MAX_INSIDE_OTHERS = 0.1
 class SingleLabeller:
     """Labels each exposure of one camera by itself; a `StripeLabeller`.
 
-    In this order: the user's word; the only sheet there is; the exposure's only laser; and else,
-    segment by segment, the one sheet that puts the segment into the depths accepted, if no other
-    sheet reaches it. A surface may lie outside the depths in which its own line was calibrated and
-    inside those of another line: what others reach only beyond their depths is dropped, too.
+    In this order: the user's word, but not against lasers that the exposure names; the only sheet
+    there is; the only one of the lasers that were on; and else, segment by segment, the one sheet
+    that puts the segment into the depths accepted, if no other sheet reaches it. A surface may lie
+    outside the depths in which its own line was calibrated and inside those of another line: what
+    others reach only beyond their depths is dropped, too.
 
     Parameters
     ----------
@@ -243,15 +264,17 @@ class SingleLabeller:
         """
         (profile,) = profiles
         names = [sheet.name for sheet in self.sensor.sheets]
-        known = [names.index(name) for name in lasers if name in names]
+        if why := self.left_out(lasers):
+            return given_to_none(profile, why)
+        known = sheets_of(self.sensor, lasers)
         if self.sheet_name:
             k, why = names.index(self.sheet_name), "as asked for"
         elif len(names) == 1:
             k, why = 0, "the only one calibrated"
-        elif len(lasers) == 1 and known:
+        elif len(known) == 1:
             k, why = known[0], "the laser that was on"
         else:
-            return self._by_depth(profile, known or list(range(len(names))))
+            return self._by_depth(profile, known or tuple(range(len(names))))
         sheet, status = np.full(len(profile), k), np.full(len(profile), PointStatus.MEASURED)
         return _labelled(profile, sheet, status, f"sheet {names[k]}, {why}")
 
@@ -259,10 +282,20 @@ class SingleLabeller:
         """Those of the recording."""
         return ()
 
+    def left_out(self, lasers: tuple[str, ...]) -> str:
+        """What contradicts the user's word, or may be taken for a calibrated sheet's stripe."""
+        known, unknown = sheets_of(self.sensor, lasers), without_sheet(self.sensor, lasers)
+        if known and unknown:
+            return f"of {' and '.join(unknown)}, which was on, too, the calibration has no sheet"
+        asked = [k for k in known if self.sensor.sheets[k].name == self.sheet_name]
+        if known and self.sheet_name and (len(lasers) > 1 or not asked):
+            return f"{' and '.join(lasers)} was on, not {self.sheet_name} alone (--sheet)"
+        return ""
+
     def reset(self) -> None:
         """Nothing is remembered."""
 
-    def _by_depth(self, profile: Profile, possible: list[int]) -> LabelledInstant:
+    def _by_depth(self, profile: Profile, possible: Sequence[int]) -> LabelledInstant:
         sheet = np.full(len(profile), -1)
         status = np.full(len(profile), PointStatus.OUT_OF_DEPTH)
         inside = {k: self._is_inside(profile, self.depths, k) for k in possible}

@@ -99,6 +99,10 @@ class RowLabeller:
         """What the schedule says."""
         return self._options.schedule.lasers(self._exposure)
 
+    def left_out(self, lasers: tuple[str, ...]) -> str:
+        """The printed rule leaves no exposure out."""
+        return ""
+
     def label(
         self,
         profiles: Sequence[Profile],

@@ -106,6 +106,9 @@ class Counting:
     def next_lasers(self) -> tuple[str, ...]:
         return ("A",) if self.n_since_reset == 0 else BOTH
 
+    def left_out(self, lasers: tuple[str, ...]) -> str:
+        return ""
+
     def reset(self) -> None:
         self.n_since_reset = 0
 

@@ -158,6 +158,17 @@ def test_an_image_whose_lasers_are_not_known_is_counted_and_not_measured(
     assert told.startswith("2 of 6 images were not measured")
 
 
+def test_an_image_of_a_calibrated_laser_beside_another_one_is_counted_and_left_out(
+    device: ScannerCalibration,
+) -> None:
+    scan = with_rows(fake_scan(3), [{}, {"lasers": ("A", "C")}, {"lasers": ("C",)}])
+    result = measure_scan(as_source(scan), device)
+    assert np.unique(result.cloud.exposure).tolist() == [0, 2]
+    told = "1 exposures were left out: of C, which was on, too, the calibration has no sheet"
+    assert told in result.warnings
+    assert any(one.startswith("exposures name the laser C, of which") for one in result.warnings)
+
+
 def test_where_no_row_names_a_laser_a_row_of_unknown_lasers_makes_none_lit(
     device: ScannerCalibration,
 ) -> None:

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which sheet drew a stripe on an object."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from armscan.errors import EstimationError, OptionError
+from armscan.errors import EstimationError, InputError, OptionError
 from armscan.models.calibration import SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.pipeline.measure import MeasureOptions, labeller_for
+from armscan.pipeline.measure import MeasureOptions, labeller_for, laser_warnings
 from armscan.reconstruction.labels import LabelledProfile, PointStatus, SingleLabeller
 from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.profile import Profile, StripeFlag
@@ -90,6 +92,51 @@ def test_the_users_word_comes_first() -> None:
     assert "as asked" in choice.reason
     with pytest.raises(OptionError, match="left, right"):
         labelled(stripes(0.0), two_sheets(), DepthRange(), sheet_name="middle")
+
+
+@pytest.mark.parametrize("lasers", [("left",), ("left", "right"), ("right", "C"), ("left", "C")])
+def test_the_users_word_gives_way_to_calibrated_lasers_that_were_on(
+    lasers: tuple[str, ...],
+) -> None:
+    sensor = two_sheets()
+    choice = labelled(stripes(0.0), sensor, DepthRange(), sheet_name="right", lasers=lasers)
+    assert choice.count(PointStatus.STRAY) == len(choice.profile)
+    assert set(choice.sheet.tolist()) == {-1}
+    options = MeasureOptions(sheet="right")
+    labeller = labeller_for(sensor, options)
+    (told,) = laser_warnings([("right",), lasers, lasers], labeller, sensor, options)
+    assert told == f"2 exposures were left out: {choice.reason}"
+    with pytest.raises(InputError, match="no exposure can be measured: ") as caught:
+        laser_warnings([lasers], labeller, sensor, options)
+    assert "leave --sheet out" in str(caught.value.remedy)
+
+
+def test_the_users_word_names_a_laser_that_the_calibration_does_not_know() -> None:
+    sensor, options = two_sheets(), MeasureOptions(sheet="right")
+    for lasers in ((), ("right",), ("red",)):
+        choice = labelled(stripes(0.0), sensor, DepthRange(), sheet_name="right", lasers=lasers)
+        assert set(choice.sheet.tolist()) == {1}
+        assert not laser_warnings([lasers], labeller_for(sensor, options), sensor, options)
+
+
+def test_a_laser_without_sheet_beside_a_calibrated_one_is_not_taken_for_it() -> None:
+    choice = labelled(stripes(0.13), two_sheets(), DepthRange(1.0), lasers=("left", "C"))
+    assert choice.reason == "of C, which was on, too, the calibration has no sheet"
+    assert set(choice.sheet.tolist()) == {-1}
+
+
+def test_sheets_of_one_source_are_known_by_its_name() -> None:
+    """Without the name the third sheet, as the first, would explain the stripe."""
+    sensor = two_sheets((262.0, 284.0))
+    names = ("A.1", "A.2", "B")
+    three = zip(names, (*sensor.sheets, sensor.sheets[0]), strict=True)
+    named = replace(
+        sensor,
+        sheets=tuple(replace(sheet, name=name) for name, sheet in three),
+        covariance=np.zeros((33, 33)),
+    )
+    choice = labelled(stripes(IN_LEFT), named, DepthRange(0.0), lasers=("A",))
+    assert set(choice.sheet.tolist()) == {0}
 
 
 def test_the_only_laser_that_was_on() -> None:

@@ -616,7 +616,9 @@ class LiveSession:
                     is_pass=True, reads_ahead=False,
                 ):  # fmt: skip
                     self._choose_lasers()
-                    if self._now is not None:
+                    if why := self._labeller.left_out(one.images.lasers):
+                        self._fail(why, f"images are not measured: {why}")
+                    elif self._now is not None:
                         self._place(one, self._now, transform)
                 return
             except ArmscanError as error:

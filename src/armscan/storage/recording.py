@@ -375,14 +375,15 @@ def is_recording(folder: Path) -> bool:
 
 
 def recording_tables(folder: Path) -> tuple[Path, ...]:
-    """Its list of exposures, its arm's samples and its session, those that there are."""
-    places = (folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE))
+    """Its list of exposures, its arm's samples and geometry and its session, if there are any."""
+    places = (folder / name for name in (EXPOSURES_FILE, ARM_FILE, ARM_MODEL_FILE, SESSION_FILE))
     return tuple(path for path in places if is_file(path))
 
 
 def camera_tables(folder: Path) -> tuple[Path, ...]:
     """Those of `recording_tables` that say something of the images."""
-    return tuple(path for path in recording_tables(folder) if path.name != ARM_FILE)
+    of_arm = {ARM_FILE, ARM_MODEL_FILE}
+    return tuple(path for path in recording_tables(folder) if path.name not in of_arm)
 
 
 def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording:

@@ -10,9 +10,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from armscan.errors import FileFormatError
+from armscan.jobs.live.recordings import recording_mark
 from armscan.models.arm import ArmModel, forward, thesis_arm
 from armscan.storage.arm import arm_model_toml, read_arm_model
-from armscan.storage.recording import FolderRecording, read_recording
+from armscan.storage.recording import (
+    FolderRecording,
+    camera_tables,
+    read_recording,
+    recording_tables,
+)
 from rigs.recording_folders import ARM, POSITION, SESSION, lab_folder, refusal, table
 
 NO_SESSION = SESSION.replace('form = "quaternion"\n', "")
@@ -77,6 +83,20 @@ def test_joints_go_through_the_arms_geometry(tmp_path: Path) -> None:
         np.testing.assert_array_equal(scan.arm.joints_rad, joints)
         np.testing.assert_allclose(scan.arm.rotations, rotations, atol=1e-12)
         np.testing.assert_allclose(scan.arm.translations_mm, positions, atol=1e-9)
+
+
+def test_what_a_recording_gives_follows_from_its_arms_geometry_too(tmp_path: Path) -> None:
+    folder = lab_folder(tmp_path)
+    assert camera_tables(folder) == tuple(
+        p for p in recording_tables(folder) if "arm" not in p.name
+    )
+    before = recording_mark(folder, "")
+    (folder / "arm.toml").write_text("name = 'x'\n")
+    assert folder / "arm.toml" in recording_tables(folder)
+    assert folder / "arm.toml" not in camera_tables(folder)
+    between = recording_mark(folder, "")
+    (folder / "arm.toml").write_text("name = 'y'\n")
+    assert len({before, between, recording_mark(folder, "")}) == 3
 
 
 def _with_model(folder: Path, model: ArmModel) -> FolderRecording:

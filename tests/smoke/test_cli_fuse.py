@@ -198,6 +198,7 @@ def test_a_scan_thinned_as_it_is_written_is_its_cloud_fused(
     found, wanted = read_ply(thin), read_ply(fused)
     assert told["n_points"] == n_points > 2 * told["n_fused"]
     assert told["n_fused"] == len(found) == len(wanted)
+    assert found.calibrations == wanted.calibrations != ()
     # the file of the whole cloud holds its numbers in single precision
     np.testing.assert_allclose(found.points_mm, wanted.points_mm, atol=1e-5)
     np.testing.assert_allclose(found.covariance_mm2, wanted.covariance_mm2, rtol=1e-4, atol=1e-9)

@@ -37,6 +37,7 @@ from armscan.pipeline.measure import (
 from armscan.pipeline.measure import reconstruct as reconstruct_images
 from armscan.pipeline.progress import StageClock
 from armscan.pipeline.scan import (
+    ExposureStatus,
     ScanOptions,
     ScanReconstruction,
     measure_long_scan,
@@ -579,7 +580,12 @@ def _writing(
             for piece in points.pieces():
                 voxels.add(piece.cloud)
             n_fused = sum(len(part.cloud) for part in voxels.fused())
-        own = replace(fused_marks(voxels), is_simulated=marks.is_simulated, forced=marks.forced)
+        own = replace(
+            fused_marks(voxels),
+            is_simulated=marks.is_simulated,
+            forced=marks.forced,
+            calibrations=marks.calibrations,
+        )
         meaning = f"in the cloud, one a voxel of {voxel_mm:g} mm; all else is told of all points"
         told = (
             Quantity("n_fused", "Fused points", n_fused, meaning=meaning),
@@ -634,7 +640,7 @@ def _stills_of_recording(folder: Path, n_cameras: int) -> StillImages:
     recording = read_recording(folder)
     scan = ScanInstants(recording, n_cameras)
     cameras = []
-    warnings = list(_alone(recording, scan))
+    warnings = [*recording.warnings, *recording.session.assumed, *_not_used(recording, scan)]
     for camera in range(n_cameras):
         pairs = [scan.pair(one.rows[camera]) for one in scan.lit]
         dark = [background for _, background in pairs if background is not None]
@@ -652,9 +658,14 @@ def _stills_of_recording(folder: Path, n_cameras: int) -> StillImages:
     return StillImages(tuple(files), left, right, tuple(warnings))
 
 
-def _alone(recording: FolderRecording, scan: ScanInstants) -> tuple[str, ...]:
-    names = [recording.rows[row].source for row in scan.without_partner]
-    if not names:
-        return ()
-    named = ", ".join(names[:LISTED])
-    return (f"{len(names)} images were not used, {PARTNER_MISSING}: {named}",)
+def _not_used(recording: FolderRecording, scan: ScanInstants) -> Iterator[str]:
+    """What a person should know of a recording's rows, as of those of a scan."""
+    if names := [recording.rows[row].source for row in scan.without_partner]:
+        named = ", ".join(names[:LISTED])
+        yield f"{len(names)} images were not used, {PARTNER_MISSING}: {named}"
+    n_unknown = int(scan.is_unknown.sum())
+    if n_unknown:
+        why = ExposureStatus.LASER_UNKNOWN.value
+        yield f"{n_unknown} of {len(recording.rows)} images were not measured: {why}"
+    elif not any(row.lasers for row in recording.rows):
+        yield "no exposure names its lasers: the laser was taken to be on in all"

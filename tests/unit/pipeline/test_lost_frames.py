@@ -14,9 +14,9 @@ from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.hand_eye import observe_stripes
 from armscan.pipeline.instants import PARTNER_MISSING, SAME_TIME_NS, ScanInstants, group_instants
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
-from armscan.records.recording import ExposureRow
+from armscan.records.recording import LASER_UNKNOWN, ExposureRow
 from armscan.storage.images import ImageOptions
-from armscan.storage.recording import write_recording
+from armscan.storage.recording import read_recording, write_recording
 from rigs.two_camera_scan import (
     PERIOD_NS,
     SeenAs,
@@ -141,8 +141,30 @@ def test_stills_leave_the_image_without_partner_out(tmp_path: Path) -> None:
     paths = stills_of(two_camera_scan(3, lost=LOST), tmp_path / "scan")
     found = read_stills(paths, ImageOptions(), 2)
     assert len(found.left.lit) == len(found.right.lit) == 2
-    (warning,) = found.warnings
+    warning = found.warnings[-1]
     assert warning.startswith(f"1 images were not used, {PARTNER_MISSING}: ")
+
+
+def test_stills_of_a_recording_tell_what_a_scan_tells(tmp_path: Path) -> None:
+    scan = two_camera_scan(2)
+    rows = (
+        *scan.rows[:2],
+        *(replace(row, lasers=(), flags=(LASER_UNKNOWN,)) for row in scan.rows[2:]),
+    )
+    paths = stills_of(replace(scan, rows=rows), tmp_path / "scan")
+    table = tmp_path / "scan" / "exposures.csv"
+    lines = table.read_text().splitlines()
+    odd = [f"{line},{'operator' if k == 0 else 'me'}" for k, line in enumerate(lines)]
+    table.write_text("\n".join(odd) + "\n")
+    (tmp_path / "scan" / "session.toml").unlink()
+    found = read_stills(paths, ImageOptions(), 2)
+    told = read_recording(tmp_path / "scan")
+    assert told.warnings and told.session.assumed
+    assert found.warnings == (
+        *told.warnings,
+        *told.session.assumed,
+        "2 of 4 images were not measured: what laser was on is not known",
+    )
 
 
 def test_no_complete_instant_is_refused_in_words(
@@ -169,5 +191,5 @@ def test_a_background_that_one_view_lacks_is_not_dropped_in_silence(tmp_path: Pa
     scan = replace(two_camera_scan(5), rows=(*lit, *dark))
     found = read_stills(stills_of(scan, tmp_path / "scan"), ImageOptions(), 2)
     assert (len(found.left.dark), len(found.right.dark)) == (2, 0)
-    (warning,) = found.warnings
+    warning = found.warnings[-1]
     assert warning.startswith("1 of 2 images of camera 1 have no image without laser")

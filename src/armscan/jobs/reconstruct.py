@@ -117,13 +117,15 @@ class CameraImages:
 class StillImages:
     """Images of one camera or two, and the files that they came from: with laser, then without.
 
-    ``right`` is empty where there is one camera only.
+    ``right`` is empty where there is one camera only; ``are_paired`` is True where the views of a
+    recording say which images belong together.
     """
 
     paths: tuple[Path, ...]
     left: CameraImages
     right: CameraImages
     warnings: tuple[str, ...] = ()
+    are_paired: bool = False
 
     @property
     def exposures(self) -> tuple[Exposure, ...]:
@@ -308,6 +310,7 @@ def _stills(
         backgrounds=read.left.dark,
         rights=read.right.lit,
         right_backgrounds=read.right.dark,
+        are_paired=read.are_paired,
         options=options,
         progress=job.progress,
         cache=job.cache,
@@ -655,7 +658,7 @@ def _stills_of_recording(folder: Path, n_cameras: int) -> StillImages:
     left, right = (*cameras, CameraImages())[:2]
     used = (*left.lit, *right.lit, *left.dark, *right.dark)
     files = dict.fromkeys(folder / exposure.source for exposure in used)
-    return StillImages(tuple(files), left, right, tuple(warnings))
+    return StillImages(tuple(files), left, right, tuple(warnings), are_paired=True)
 
 
 def _not_used(recording: FolderRecording, scan: ScanInstants) -> Iterator[str]:

@@ -70,7 +70,19 @@ def pair_exposures(
     if not backgrounds:
         return [(exposure, None) for exposure in exposures]
     chosen = pair_sources([e.source for e in exposures], [b.source for b in backgrounds])
-    partners = [backgrounds[k] for k in chosen]
+    return checked_pairs(exposures, [backgrounds[k] for k in chosen])
+
+
+def checked_pairs(
+    exposures: Sequence[Exposure], partners: Sequence[Exposure]
+) -> list[ExposurePair]:
+    """Exposures with the partners that they have, several perhaps the same one.
+
+    Raises
+    ------
+    InputError
+        As `pair_exposures`, of counts apart.
+    """
     for exposure, partner in zip(exposures, partners, strict=True):
         _check_pair(exposure, partner)
     _check_order(exposures, partners)
@@ -126,7 +138,7 @@ def pair_by_view(exposures: Sequence[Exposure]) -> list[ExposurePair]:
     Raises
     ------
     InputError
-        If no exposure has a laser on, or as `pair_exposures`.
+        If no exposure has a laser on, or as `checked_pairs`.
     """
     lit = [exposure for exposure in exposures if exposure.lasers]
     if not lit:
@@ -143,7 +155,7 @@ def pair_by_view(exposures: Sequence[Exposure]) -> list[ExposurePair]:
         partners = [dark.get((camera, exposure.view)) for exposure in own]
         both = [(e, p) for e, p in zip(own, partners, strict=True) if p is not None]
         if both:
-            pairs += pair_exposures([e for e, _ in both], [p for _, p in both])
+            pairs += checked_pairs([e for e, _ in both], [p for _, p in both])
         pairs += [(e, None) for e, p in zip(own, partners, strict=True) if p is None]
     return pairs
 

@@ -25,6 +25,7 @@ from armscan.pipeline.instants import (
     InstantImages,
     ScanInstants,
     check_sizes,
+    checked_pairs,
     pair_exposures,
 )
 from armscan.pipeline.progress import (
@@ -411,6 +412,7 @@ def reconstruct(
     backgrounds: Sequence[Exposure] = (),
     rights: Sequence[Exposure] = (),
     right_backgrounds: Sequence[Exposure] = (),
+    are_paired: bool = False,
     options: MeasureOptions | None = None,
     progress: Progress = silent,
     cache: DetectionCache | None = None,
@@ -428,6 +430,9 @@ def reconstruct(
     rights, right_backgrounds
         The right camera's exposures of the same instants, in the same order, and theirs without
         laser; for a sensor of two cameras.
+    are_paired
+        True if the backgrounds are those of the exposures' views, in their order; else they are
+        paired by file name where the names agree.
     options
         Defaults if None.
     progress
@@ -444,9 +449,13 @@ def reconstruct(
         If the sheet of a stripe is ambiguous, or nothing was measured at all.
     """
     options = options or MeasureOptions()
-    left = pair_exposures(exposures, backgrounds)
+
+    def paired(lit: Sequence[Exposure], dark: Sequence[Exposure]) -> list[ExposurePair]:
+        return (checked_pairs if are_paired and dark else pair_exposures)(lit, dark)
+
+    left = paired(exposures, backgrounds)
     _check_cameras(sensor, len(left), len(rights))
-    cameras = [left] if sensor.second is None else [left, pair_exposures(rights, right_backgrounds)]
+    cameras = [left] if sensor.second is None else [left, paired(rights, right_backgrounds)]
     images: list[LabelledProfile] = []
     clouds: list[PointCloud] = []
     weak: list[str] = []

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images with laser find their partners without, or a sentence says why not."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.pipeline.instants import _reduced, check_sizes, pair_exposures
+from armscan.pipeline.instants import _reduced, check_sizes, pair_by_view, pair_exposures
 from armscan.records.exposure import Exposure, SensorWindow
 from rigs.plain_scanner import plain_camera
 
 CAMERA = plain_camera(100.0, (20.0, 15.0), (40, 30))
 
 
-def image(source: str, shape: tuple[int, int] = (30, 40), **more: SensorWindow) -> Exposure:
+def image(source: str, shape: tuple[int, int] = (30, 40), **more: Any) -> Exposure:
     return Exposure(np.zeros(shape, dtype=np.uint8), source, **more)
 
 
@@ -28,6 +30,14 @@ def test_by_name_when_the_names_are_the_same() -> None:
     on = [image("on/1.png"), image("on/2.png")]
     off = [image("off/2.png"), image("off/1.png")]
     assert [b.source if b else "" for _, b in pair_exposures(on, off)] == ["off/1.png", "off/2.png"]
+
+
+def test_views_pair_also_against_the_names_and_two_images_share_one_without_laser() -> None:
+    """By name ``on/0.png`` and ``on/1.png`` would be exchanged, or the set refused."""
+    on = [image(f"on/{k}.png", lasers=("A",), view=v) for k, v in ((0, "b"), (1, "a"), (2, "b"))]
+    off = [image("off/0.png", view="a"), image("off/1.png", view="b")]
+    assert pair_by_view([*on, *off]) == [(on[0], off[1]), (on[1], off[0]), (on[2], off[1])]
+    assert pair_by_view([on[0], on[1], *off]) == [(on[0], off[1]), (on[1], off[0])]
 
 
 def test_no_backgrounds_is_fine_and_no_images_is_not() -> None:

@@ -13,10 +13,12 @@ from armscan.jobs.reconstruct import StillPaths, read_stills
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.hand_eye import observe_stripes
 from armscan.pipeline.instants import PARTNER_MISSING, SAME_TIME_NS, ScanInstants, group_instants
+from armscan.pipeline.measure import reconstruct
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
 from armscan.records.recording import LASER_UNKNOWN, ExposureRow
 from armscan.storage.images import ImageOptions
 from armscan.storage.recording import read_recording, write_recording
+from rigs.scan_fake import as_source, fake_scan, scanner, with_rows
 from rigs.two_camera_scan import (
     PERIOD_NS,
     SeenAs,
@@ -165,6 +167,23 @@ def test_stills_of_a_recording_tell_what_a_scan_tells(tmp_path: Path) -> None:
         *told.session.assumed,
         "2 of 4 images were not measured: what laser was on is not known",
     )
+
+
+def test_stills_of_a_recording_keep_the_partners_of_their_views(tmp_path: Path) -> None:
+    """By file name they would be other ones, which were refused."""
+    lit = [("b", "on/0.png"), ("a", "on/1.png"), ("b", "on/2.png")]
+    dark = [("a", "off/0.png"), ("b", "off/1.png")]
+    views = [{"view": view, "source": source} for view, source in lit]
+    views += [{"view": view, "source": source, "lasers": ()} for view, source in dark]
+    write_recording(tmp_path / "scan", as_source(with_rows(fake_scan(5), views)))
+    read = read_stills(StillPaths((str(tmp_path / "scan"),)), ImageOptions(), 1)
+    sensor = scanner().sensor
+    assert sensor is not None
+    found = reconstruct(
+        read.left.lit, sensor, backgrounds=read.left.dark, are_paired=read.are_paired
+    )
+    assert [one.profile.source for one in found.images] == [source for _, source in lit]
+    assert [one.source for one in read.left.dark] == ["off/1.png", "off/0.png", "off/1.png"]
 
 
 def test_no_complete_instant_is_refused_in_words(

@@ -131,7 +131,7 @@ def observe_stripes(
     weak: list[str] = []
     # Each still is labelled by itself: where the sensor is on the arm is not known yet.
     labeller = labeller_for(sensor, options)
-    of_lasers = laser_warnings([row.lasers for row in rows], labeller, sensor, options)
+    of_lasers = laser_warnings([one.lasers for one in chosen], labeller, sensor, options)
     measured = measure_instants(
         scan.read(chosen, STAGE, progress),
         labeller,

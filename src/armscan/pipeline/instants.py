@@ -329,10 +329,13 @@ class Instant:
         Rows of the recording, one a camera, in the order of the cameras.
     t_ns
         Mid-exposure time of the first.
+    lasers
+        Sources that were on, of which the row of one camera is enough; empty if none is named.
     """
 
     rows: tuple[int, ...]
     t_ns: int
+    lasers: tuple[str, ...] = ()
 
 
 def group_instants(rows: Sequence[ExposureRow], where: str) -> tuple[Instant, ...]:
@@ -341,7 +344,7 @@ def group_instants(rows: Sequence[ExposureRow], where: str) -> tuple[Instant, ..
     Raises
     ------
     InputError
-        If a camera took two exposures at one instant.
+        If a camera took two exposures at one instant, or its cameras name different lasers.
     """
     groups: dict[tuple[str, int], list[int]] = {}
     untriggered = []
@@ -363,7 +366,15 @@ def group_instants(rows: Sequence[ExposureRow], where: str) -> tuple[Instant, ..
                 remedy="give each exposure of a camera its own time and trigger_id",
             )
         ordered = tuple(sorted(members, key=lambda k: rows[k].camera))
-        instants.append(Instant(ordered, rows[ordered[0]].t_ns))
+        named = [rows[k].lasers for k in ordered if rows[k].lasers]
+        if len({frozenset(lasers) for lasers in named}) > 1:
+            raise InputError(
+                "the cameras of one instant name different lasers, "
+                f"{' and '.join('+'.join(lasers) for lasers in named)} ({kind} {value})",
+                where=where,
+                remedy="name in the column 'lasers' what was on, alike for all cameras",
+            )
+        instants.append(Instant(ordered, rows[ordered[0]].t_ns, named[0] if named else ()))
     return tuple(sorted(instants, key=lambda instant: instant.t_ns))
 
 
@@ -397,21 +408,20 @@ class InstantImages:
         Where the sensor was; None if unknown.
     instant
         Its rows and time in a scan; of still images there are none.
-    profiles, named_lasers
-        Stripes of each camera and sources that were on, where these were extracted elsewhere and
-        ``pairs`` is empty.
+    profiles
+        Stripes of each camera, where these were extracted elsewhere and ``pairs`` is empty.
     """
 
     pairs: tuple[ExposurePair, ...]
     base_from_sensor: Pose[Base, Sensor] | None = None
     instant: Instant = Instant((), 0)
     profiles: tuple[Profile, ...] = ()
-    named_lasers: tuple[str, ...] = ()
 
     @property
     def lasers(self) -> tuple[str, ...]:
         """Sources that were on; empty if unknown."""
-        return self.pairs[0][0].lasers if self.pairs else self.named_lasers
+        named = (self.instant.lasers, *(lit.lasers for lit, _ in self.pairs))
+        return next(filter(None, named), ())
 
     @property
     def t_ns(self) -> int:
@@ -425,17 +435,17 @@ class ScanInstants:
     Parameters
     ----------
     source
-        The scan. If any of its rows names a laser, rows without are taken with the laser off and
-        are the background of the exposures of their view and camera; else all have it on. A row
-        of which it is not known is neither.
+        The scan. If any of its rows names a laser, instants without are taken with the laser off
+        and are the background of the exposures of their view and camera; else all have it on. A
+        row of which it is not known is neither.
     n_cameras
         Cameras that the scanner has.
 
     Raises
     ------
     InputError
-        If the scan's cameras are not the scanner's, it is of no row known what lasers were on, or
-        none of its instants with the laser on has the images of all of them.
+        If the scan's cameras are not the scanner's, it is of no row known what lasers were on, none
+        of its instants with the laser on has the images of all of them, or as `group_instants`.
     """
 
     def __init__(self, source: ScanSource, n_cameras: int) -> None:
@@ -448,18 +458,19 @@ class ScanInstants:
                 where=source.name,
                 remedy="the scanner's document is of another head: give the one of this scan",
             )
-        lit = [bool(row.lasers) for row in source.rows]
+        instants, n_rows = group_instants(source.rows, source.name), len(source.rows)
         self.is_unknown = np.array([LASER_UNKNOWN in one.flags for one in source.rows], np.bool_)
         """Rows of which nobody knows what lasers were on."""
         if self.is_unknown.all():
             raise InputError(
-                f"of none of {len(lit)} exposures is it known what lasers were on",
+                f"of none of {n_rows} exposures is it known what lasers were on",
                 where=source.name,
                 remedy="see that the laser controller answers, and record with a schedule of one "
                 "step, fewer triggers a second, or images that bear its trigger ids",
             )
-        is_named = any(lit) or bool(self.is_unknown.any())
-        self.is_lit: BoolArray = np.array(lit if is_named else [True] * len(lit), dtype=np.bool_)
+        lit = [k for one in instants if one.lasers for k in one.rows]
+        self.is_lit: BoolArray = np.full(n_rows, not lit and not self.is_unknown.any())
+        self.is_lit[lit] = ~self.is_unknown[lit]
         self._dark_row = {
             (row.view, row.camera): k
             for k, row in enumerate(source.rows)
@@ -468,7 +479,7 @@ class ScanInstants:
         self._dark: dict[int, tuple[int, Exposure]] = {}
         self.lit: tuple[Instant, ...] = tuple(
             one
-            for one in group_instants(source.rows, source.name)
+            for one in instants
             if len(one.rows) == n_cameras and self.is_lit[list(one.rows)].all()
         )
         """Instants at which a laser was on and of which every camera has an image."""

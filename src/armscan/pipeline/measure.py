@@ -369,11 +369,14 @@ def cameras_of(sensor: SensorCalibration) -> tuple[CameraModel, ...]:
 
 
 def measured_again(
-    profiles: Sequence[LabelledProfile], sensor: SensorCalibration
+    profiles: Sequence[LabelledProfile],
+    lasers: Sequence[tuple[str, ...]],
+    sensor: SensorCalibration,
 ) -> Iterator[tuple[int, StripePoints]]:
     """Number and measured points of each profile of a scan: what it does not keep of them.
 
-    Of a head of two cameras, the profiles of one instant follow each other.
+    ``lasers`` are those of each profile's exposure. Of a head of two cameras, the profiles of one
+    instant follow each other.
     """
     if sensor.second is None:
         for k, labelled in enumerate(profiles):
@@ -381,7 +384,8 @@ def measured_again(
         return
     labeller = StereoLabeller(sensor)
     for k in range(0, len(profiles) - 1, 2):
-        labels = labeller.label([profiles[k].profile, profiles[k + 1].profile])
+        both = profiles[k].profile, profiles[k + 1].profile
+        labels = labeller.label(both, lasers[k] or lasers[k + 1])
         for camera, found in enumerate(measure_points(labels, sensor, labeller.depths)):
             yield k + camera, found.points
 

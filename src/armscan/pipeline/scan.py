@@ -349,8 +349,7 @@ def measure_long_scan(
     wanted = [one for one in scan.lit if poses.has_pose[list(one.rows)].all()]
     transform = BaseTransform.of(scanner)
     labeller = labeller_for(sensor, options.measure, is_scan=True)
-    named = [source.rows[one.rows[0]].lasers for one in wanted]
-    of_lasers = laser_warnings(named, labeller, sensor, options.measure)
+    of_lasers = laser_warnings([one.lasers for one in wanted], labeller, sensor, options.measure)
     found = _Measured(SheetDepths.of(sensor))
     shown = _shown_rows(wanted, most_images)
     at = sensor_poses(poses, scanner)

@@ -42,7 +42,7 @@ from armscan.reconstruction.epipolar import (
     project_on_sheets,
     residual_and_sigma,
 )
-from armscan.reconstruction.labels import LabelledInstant, LabelledProfile, PointStatus
+from armscan.reconstruction.labels import LabelledInstant, LabelledProfile, PointStatus, sheets_of
 from armscan.reconstruction.segments import (
     Samples,
     StripeSegments,
@@ -401,6 +401,8 @@ class StereoLabeller:
     ) -> LabelledInstant:
         """See `StripeLabeller`; each instant is labelled by itself.
 
+        Only sheets of ``lasers`` are possible, or all of them where it names no calibrated one.
+
         Raises
         ------
         InputError
@@ -408,7 +410,7 @@ class StereoLabeller:
         """
         sides = _Side.of(profiles[0]), _Side.of(profiles[1])
         offset = self._prior
-        found = _Hypotheses.of(sides, self.sensor, self.depths)
+        found = _Hypotheses.of(sides, self.sensor, self.depths, sheets_of(self.sensor, lasers))
         at, projected = found.sample, found.projected
         doubt = ever = np.zeros(len(at), dtype=np.bool_)
         judged: tuple[BoolArray, BoolArray] | None = None
@@ -471,11 +473,17 @@ class _Hypotheses:
 
     @staticmethod
     def of(
-        sides: tuple[_Side, _Side], sensor: SensorCalibration, depths: DepthRange
+        sides: tuple[_Side, _Side],
+        sensor: SensorCalibration,
+        depths: DepthRange,
+        lit: tuple[int, ...],
     ) -> _Hypotheses:
         left, row = sides[0].profile, sides[0].row
         pixels = left.points_px[row]
         at, sheet = possible_sheets(pixels, sensor, depths)
+        if 0 < len(lit) < len(sensor.sheets):
+            is_lit = np.isin(sheet, lit)
+            at, sheet = at[is_lit], sheet[is_lit]
         projected = project_on_sheets(pixels[at], sheet, sensor)
         kept = projected.is_met & depths.holds(projected.points_mm, sheet, sensor)
         at, projected = at[kept], projected.select(kept)

@@ -14,6 +14,7 @@ from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.hand_eye import observe_stripes
 from armscan.pipeline.instants import PARTNER_MISSING, SAME_TIME_NS, ScanInstants, group_instants
 from armscan.pipeline.measure import reconstruct
+from armscan.pipeline.progress import silent
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
 from armscan.records.recording import LASER_UNKNOWN, ExposureRow
 from armscan.storage.images import ImageOptions
@@ -85,6 +86,27 @@ def test_lone_rows_are_told_from_complete_instants() -> None:
     found = ScanInstants(two_camera_scan(3, lost=LOST, late_ns=1), 2)
     assert [one.rows for one in found.lit] == [(0, 1), (3, 4)]
     assert found.without_partner == (2,)
+
+
+def test_the_lasers_of_an_instant_are_those_that_any_of_its_rows_names() -> None:
+    """The table of a trigger box: ids and lasers of camera 0, ids alone of camera 1."""
+    scan = two_camera_scan(3)
+    first, dark, last = (
+        tuple(
+            replace(row, trigger_id=k, lasers=("A",) if row.camera == 0 and k != 1 else ())
+            for row in scan.rows[2 * k : 2 * k + 2]
+        )
+        for k in range(3)
+    )
+    found = ScanInstants(replace(scan, rows=(*first, *dark, *last)), 2)
+    assert [(one.rows, one.lasers) for one in found.lit] == [((0, 1), ("A",)), ((4, 5), ("A",))]
+    assert found.is_lit.tolist() == [True, True, False, False, True, True]
+    assert found.without_partner == ()
+    (images,) = found.read(found.lit[:1], "scan", silent)
+    assert images.lasers == ("A",)
+    other = replace(first[1], lasers=("B",))
+    with pytest.raises(InputError, match="cameras of one instant name different lasers, A and B"):
+        ScanInstants(replace(scan, rows=(first[0], other, *dark, *last)), 2)
 
 
 def test_a_scan_goes_on_without_a_lost_frame(

@@ -98,6 +98,24 @@ def test_a_margin_that_was_given_counts_and_what_lies_beyond_is_out_of_depth(
     assert len(usual[0].points) > len(given[0].points)
 
 
+def test_a_stripe_is_of_no_source_that_was_off(
+    sensor: SensorCalibration, profiles: tuple[Profile, Profile]
+) -> None:
+    names = ("A.1", "B.1", "B.2")
+    of_two = zip(sensor.sheets, names, strict=True)
+    two = replace(sensor, sheets=tuple(replace(one, name=name) for one, name in of_two))
+    labeller = StereoLabeller(two)
+    every, both, unknown, one = (
+        np.concatenate([found.sheet for found in labeller.label(profiles, lasers).profiles])
+        for lasers in ((), ("B", "A"), ("Q",), ("A",))
+    )
+    assert {-1, 0, 1, 2} == set(every.tolist())
+    np.testing.assert_array_equal(both, every)
+    np.testing.assert_array_equal(unknown, every)
+    assert set(one.tolist()) == {-1, 0}
+    assert (one[every == 0] == 0).mean() > 0.99
+
+
 def test_a_chosen_sheet_is_refused_for_two_cameras(sensor: SensorCalibration) -> None:
     assert isinstance(labeller_for(sensor, MeasureOptions()), StereoLabeller)
     with pytest.raises(OptionError, match="two cameras tell each stripe's sheet"):

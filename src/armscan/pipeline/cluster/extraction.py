@@ -225,9 +225,7 @@ class ClusterReader:
                 if isinstance(found, ArmscanError):
                     scan.unreadable.update(dict.fromkeys(one.rows, str(found)))
                     continue
-                yield InstantImages(
-                    (), base_from_sensor(one), one, profiles=found, named_lasers=row.lasers
-                )
+                yield InstantImages((), base_from_sensor(one), one, profiles=found)
         progress(ProgressEvent(stage, done, len(instants)))
 
     def _results(

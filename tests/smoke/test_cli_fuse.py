@@ -58,6 +58,22 @@ def test_two_clouds_become_one(
     assert "why" in output.with_suffix(".html").read_text()
 
 
+def test_clouds_in_the_frame_of_a_sensor_that_may_have_moved_are_warned_of(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [str(folder / name) for name in ("a.ply", "b.ply")]
+    words = ["fuse", *names, "--voxel", "1.5", "--json", "-o"]
+    warned = []
+    for frame in ("Base", "Sensor"):
+        for name in names:
+            cloud = replace(read_ply(Path(name)), frame=frame)
+            Path(name).write_bytes(ply_bytes(cloud))
+        assert main([*words, str(folder / f"{frame}.ply")]) == 0
+        told = json.loads(capsys.readouterr().out)["warnings"]
+        warned.append(any("head and object stood still" in text for text in told))
+    assert warned == [False, True]
+
+
 def test_how_the_clouds_of_others_were_read_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

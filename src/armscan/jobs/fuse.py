@@ -34,6 +34,12 @@ NOT_KNOWN = (
     "the points' covariances are not known: all count alike, and the fused points have none either"
 )
 
+SENSOR_MOVES = (
+    "the clouds are in the frame Sensor, which moves with the head: they belong together only if "
+    "head and object stood still between them; `armscan register` joins them by markers, "
+    "`armscan reconstruct` places a scan in Base"
+)
+
 
 def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
     """Put clouds of one frame together, one point a voxel of edge ``size_mm``."""
@@ -52,7 +58,12 @@ def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
             job.progress(ProgressEvent(STAGE, len(paths), len(paths)))
             if voxels.n_points == 0:
                 raise InputError("the clouds hold no point", where=", ".join(map(str, paths)))
-            warnings = (*remarks, *(() if voxels.has_covariance else (NOT_KNOWN,)))
+            is_moved = voxels.frame == "Sensor" and len(paths) > 1
+            warnings = (
+                *remarks,
+                *((SENSOR_MOVES,) if is_moved else ()),
+                *(() if voxels.has_covariance else (NOT_KNOWN,)),
+            )
             provenance = job.provenance(paths, (), warnings=warnings, forced=voxels.forced)
             return _written(job, places, voxels, scratch, provenance)
         finally:

@@ -13,7 +13,7 @@ import pytest
 
 from armscan.cli.run import main
 from armscan.records.cloud import PointCloud
-from armscan.storage.clouds import ply_bytes, read_ply
+from armscan.storage.clouds import CloudPiece, parse_ply, ply_bytes, read_ply
 from armscan.storage.documents import read_registration
 from armscan.storage.points import markers_csv, read_marker_list
 from rigs.inspection_clouds import cloud_of
@@ -51,8 +51,12 @@ def views(scene: Walk, tmp_path: Path) -> list[Path]:
 def test_views_are_joined_and_their_clouds_coincide(
     views: list[Path], scene: Walk, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = tmp_path / "joined"
+    folder, fused = tmp_path / "joined", views[1].with_suffix(".ply")
+    counts = np.arange(1, len(PATCH) + 1)
+    fused.write_bytes(ply_bytes(CloudPiece(read_ply(fused), n_points=counts)))
     assert main(["register", *map(str, views), "-o", str(folder), "--json"]) == 0
+    kept = parse_ply((folder / "view2.ply").read_bytes(), "view2").table["n_points"]
+    np.testing.assert_array_equal(kept, counts)
     found = json.loads(capsys.readouterr().out)
     assert found["n_joined"] == 4
     assert found["of"] == "views"

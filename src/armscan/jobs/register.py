@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.registration import spread_mm
 from armscan.jobs.job import Job
 from armscan.markers.join_views import JoinedViews
@@ -53,7 +53,7 @@ from armscan.report.quantity import (
     significant,
     with_sigma,
 )
-from armscan.storage.clouds import FOREIGN_FRAME, ply_bytes, read_cloud_file
+from armscan.storage.clouds import FOREIGN_FRAME, CloudPiece, ply_bytes, read_cloud_file
 from armscan.storage.documents import (
     CODEC,
     MarkerResidual,
@@ -77,12 +77,16 @@ LEAST_MM = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _NamedCloud:
-    """A cloud and the name of its file in the new folder."""
+    """A cloud and the name of its file in the new folder.
+
+    ``n_points`` (N,) are the measured points that each of a fused cloud stands for, or None.
+    """
 
     name: str
     path: Path
     cloud: PointCloud
     remarks: tuple[str, ...] = ()
+    n_points: IntArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +155,9 @@ def register(
     contents = {
         DOCUMENT: registration_document(document),
         MARKERS: markers_csv(joined.markers, is_simulated=is_simulated),
-        **{item.name: ply_bytes(item.cloud) for item in carried},
+        **{
+            item.name: ply_bytes(CloudPiece(item.cloud, n_points=item.n_points)) for item in carried
+        },
         PAGE: render_page(registration_page(report, provenance, is_simulated=is_simulated)),
     }
     with new_folder(folder) as place:
@@ -223,7 +229,7 @@ def _read_cloud(path: Path, name: str, markers: MarkerList) -> _NamedCloud:
             where=f"{path} and {markers.path}",
             remedy="measure both in one frame, or correct '# frame =' in the list",
         )
-    return _NamedCloud(f"{name}.ply", path, cloud, found.remarks)
+    return _NamedCloud(f"{name}.ply", path, cloud, found.remarks, found.n_points)
 
 
 def _different_names(paths: Sequence[Path]) -> tuple[str, ...]:

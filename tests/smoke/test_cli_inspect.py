@@ -223,6 +223,7 @@ def test_what_cannot_be_inspected_gets_one_sentence(
         ("--uncertainty=nan", "uncertainty of the standard is nan mm"),
         ("--mpe=nan", "the limit is nan mm"),
         ("--mpe=-0.1", "the limit is -0.1 mm"),
+        ("--mpe=0", "--mpe: the limit is 0 mm; give more than 0 mm"),
         ("--ball=nan", "--ball: a diameter of nan mm"),
         ("--ball=inf", "--ball: a diameter of inf mm"),
         ("--feature-mm=nan", "a feature band of nan mm"),
@@ -272,7 +273,7 @@ def test_the_daily_check_ends_with_its_verdict(
     )
     assert "give --scanner" in fails("verify", tmp_path, "--ball", 34.96)
     said = fails("verify", clouds / "ball.ply", "--ball", 34.96, "--mpe", -1)
-    assert said == "error: --mpe: the limit is -1 mm; give 0 mm or more.\n"
+    assert said == "error: --mpe: the limit is -1 mm; give more than 0 mm.\n"
 
 
 def test_a_fused_cloud_says_why_nothing_is_known_of_its_exposures(

@@ -85,15 +85,17 @@ class VerifyOptions:
     reference_u_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        lengths = {
-            ("limit", "--mpe"): self.mpe_mm,
-            ("uncertainty of the standard", "--uncertainty"): self.reference_u_mm,
-        }
-        for (name, option), length in lengths.items():
-            if length is not None and not 0.0 <= length < math.inf:
-                raise OptionError(
-                    f"the {name} is {length:g} mm", where=option, remedy="give 0 mm or more"
-                )
+        limit, u_mm = self.mpe_mm, self.reference_u_mm
+        if limit is not None and not 0.0 < limit < math.inf:
+            raise OptionError(
+                f"the limit is {limit:g} mm", where="--mpe", remedy="give more than 0 mm"
+            )
+        if not 0.0 <= u_mm < math.inf:
+            raise OptionError(
+                f"the uncertainty of the standard is {u_mm:g} mm",
+                where="--uncertainty",
+                remedy="give 0 mm or more",
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -418,7 +418,11 @@ def _mirrored_images(scan: _Scan) -> Iterator[tuple[str, str, Stripes]]:
     camera = sensor.camera.camera
     size, start = (camera.width_px, camera.height_px), (0, 0)
     if setup is not None:
-        size = (setup.width_px or size[0], setup.height_px or size[1])
+        binning = setup.window.binning
+        size = (
+            binning * setup.width_px if setup.width_px else size[0],
+            binning * setup.height_px if setup.height_px else size[1],
+        )
         start = (setup.window.x_px, setup.window.y_px)
     for axis, words in enumerate(("right to left", "bottom up")):
         pixels = scan.pixels.copy()

@@ -15,8 +15,10 @@ from armscan.geometry.poses import Pose
 from armscan.models.calibration import ScannerCalibration
 from armscan.reconstruction.sync import poses_by_time
 from armscan.reconstruction.track_faults import TrackFault
+from armscan.records.exposure import SensorWindow
+from armscan.records.recording import CameraSetup, Session
 from rigs.passes_over_a_ball import N_PASSES, N_STEPS, BallScan, ball_scan, doubt, poses_of, read_as
-from rigs.scan_fake import scanner
+from rigs.scan_fake import CAMERA, scanner
 
 Misread = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 UP = np.array([0.0, 0.6, 0.8])
@@ -108,8 +110,13 @@ def test_poses_taken_for_something_else(scan: BallScan, wrong: Misread, words: s
     assert words in cause(misread(scan, wrong))
 
 
-def test_mirrored_images(scan: BallScan) -> None:
-    assert "mirrored, right to left" in cause(scan, mirrored=True)
+@pytest.mark.parametrize("binning", [1, 2])
+def test_mirrored_images(scan: BallScan, binning: int) -> None:
+    """Stripes are in pixels of the full sensor, the size of binned images in their own."""
+    size = (CAMERA.width_px // binning, CAMERA.height_px // binning)
+    setup = CameraSetup(*size, window=SensorWindow(binning=binning))
+    binned = replace(scan, session=Session(cameras=(setup,)))
+    assert "mirrored, right to left" in cause(binned, mirrored=True)
 
 
 def test_a_shifted_sheet(scan: BallScan) -> None:

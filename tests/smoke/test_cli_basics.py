@@ -188,6 +188,16 @@ def test_info_of_images_and_folders(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "image, 6 x 4 px, grey, 8 bits" in capsys.readouterr().out
 
 
+def test_info_of_a_mesh_tells_its_faces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kinds = "".join(f"property float {axis}\n" for axis in "xyz")
+    faces = "element face 1\nproperty list uchar int vertex_indices\n"
+    header = f"ply\nformat ascii 1.0\nelement vertex 3\n{kinds}{faces}end_header\n"
+    path = tmp_path / "part.ply"
+    path.write_text(f"{header}0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    assert main(["info", str(path)]) == 0
+    assert "mesh, 3 vertices and 1 faces" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("heading", "what"),
     [

@@ -513,7 +513,9 @@ def _image(path: Path) -> dict[str, Any]:
 def _ply(path: Path, data: bytes) -> dict[str, Any]:
     vertices = parse_ply(data, str(path))
     fields = list(vertices.table.dtype.names or ())
-    content: dict[str, Any] = {"what": f"point cloud, {len(vertices.table)} points"}
+    n, n_faces = len(vertices.table), vertices.n_faces
+    what = f"mesh, {n} vertices and {n_faces} faces" if n_faces else f"point cloud, {n} points"
+    content: dict[str, Any] = {"what": what}
     if "cov_xx_mm2" in fields:
         content |= _carried(read_ply(path))
     if {"x", "y", "z"} <= set(fields):

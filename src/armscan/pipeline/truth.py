@@ -455,6 +455,7 @@ def _of_image(
     right_name = own < CROSSING_PX
     shared = on & image.profile.is_accepted & _seen_by_all(nearest, best, stripes, others)
     counts = {s.sheet: int((shared & (best == k)).sum()) for k, s in enumerate(stripes)}
+    beyond = (image.status == PointStatus.OUT_OF_DEPTH) & (image.sheet < 0)
     errors = NamingErrors(
         n_named=int((measured & on).sum()),
         n_wrong=int((measured & on & ~right_name).sum()),
@@ -462,7 +463,7 @@ def _of_image(
         n_shared=int(shared.sum()),
         n_shared_named=int((shared & measured).sum()),
         n_ambiguous=image.count(PointStatus.AMBIGUOUS),
-        n_unexplained=image.count(PointStatus.STRAY),
+        n_unexplained=image.count(PointStatus.STRAY) + int(beyond.sum()),
     )
     return errors, counts
 

@@ -261,14 +261,15 @@ class Hypotheses:
         (H,) indices into the sensor's sheets.
     points_mm
         (H, S, 3) in Sensor.
-    is_inside
-        (S, H) True where the point exists, within the depths accepted.
+    is_met, is_inside
+        (S, H) True where the point exists, and where it lies within the depths accepted.
     place_mm
         (H, S) coordinate along the sheet.
     """
 
     sheets: tuple[int, ...]
     points_mm: FloatArray
+    is_met: BoolArray
     is_inside: BoolArray
     place_mm: FloatArray
 
@@ -280,15 +281,18 @@ def hypothesise(
     depths: DepthRange,
 ) -> Hypotheses:
     """Intersect the rays of samples (S, 2) with each sheet."""
-    points, inside, place = [], [], []
+    points, exists, inside, place = [], [], [], []
     for k in sheets:
         of_sheet = np.full(len(points_px), k)
         met, is_met = intersect_sheets(points_px, of_sheet, sensor)
         sheet = sensor.sheets[k].sheet
         points.append(met)
+        exists.append(is_met)
         inside.append(is_met & depths.holds(met, of_sheet, sensor))
         place.append((met - sheet.origin_mm) @ sheet.axes[0])
-    return Hypotheses(sheets, np.array(points), np.array(inside).T, np.array(place))
+    return Hypotheses(
+        sheets, np.array(points), np.array(exists).T, np.array(inside).T, np.array(place)
+    )
 
 
 def still_evidence(
@@ -542,11 +546,13 @@ class CrossLabeller:
         hypotheses = hypothesise(samples, possible, self._sensor, self._depths)
         posterior = self._posterior(samples, pieces, hypotheses, pose)
         best, margin = _best(posterior)
-        inside = pieces.mean(hypotheses.is_inside.astype(np.float64))
-        is_sure = margin >= MARGIN
-        is_explained = np.take_along_axis(inside, best[:, None], axis=1)[:, 0] > 0.5
-        of_piece = np.where(is_sure, PointStatus.MEASURED, PointStatus.AMBIGUOUS)
-        of_piece[~is_explained] = PointStatus.STRAY
+        is_met, is_explained = (
+            np.take_along_axis(pieces.mean(flag.astype(np.float64)), best[:, None], 1)[:, 0] > 0.5
+            for flag in (hypotheses.is_met, hypotheses.is_inside)
+        )
+        of_piece = np.where(margin >= MARGIN, PointStatus.MEASURED, PointStatus.AMBIGUOUS)
+        beyond = np.where(is_met, PointStatus.OUT_OF_DEPTH, PointStatus.STRAY)
+        of_piece[~is_explained] = beyond[~is_explained]
         accepted = pieces.of_point >= 0
         piece = pieces.of_point[accepted]
         status[accepted] = of_piece[piece]

@@ -6,7 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.pipeline.measure import MeasureOptions, labeller_for
+from armscan.pipeline.measure import (
+    MeasureOptions,
+    SheetDepths,
+    labeller_for,
+    measurement_warnings,
+)
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.labels import PointStatus
 from armscan.reconstruction.points import MeasuredProfile, measure_points
@@ -52,9 +57,12 @@ def test_a_stripe_that_the_margin_lets_in_is_labelled_and_measured(beyond: float
     assert (found.points.sheet == 0).all()
 
 
-def test_what_lies_beyond_the_margin_is_on_no_sheet() -> None:
-    assert measured(0.8, DepthRange(0.3)).labelled.count(PointStatus.STRAY) > 0
-    assert len(measured(0.8, DepthRange(0.3)).points) == 0
+def test_what_lies_beyond_the_margin_is_out_of_depth_and_the_margin_is_hinted_at() -> None:
+    found = measured(0.8, DepthRange(0.3))
+    assert found.labelled.count(PointStatus.OUT_OF_DEPTH) == len(found.labelled.profile)
+    assert len(found.points) == 0
+    told = measurement_warnings([found.labelled.counts], SheetDepths.of(SENSOR), SENSOR)
+    assert any("--depth-margin" in text for text in told)
 
 
 def test_without_a_margin_labels_look_further_than_points_are_kept() -> None:
@@ -63,4 +71,6 @@ def test_without_a_margin_labels_look_further_than_points_are_kept() -> None:
     assert LABEL_DEPTHS.margin > 0.2
     assert (found.labelled.sheet == 0).all()
     assert found.labelled.count(PointStatus.OUT_OF_DEPTH) == len(found.labelled.profile)
-    assert measured(0.8, None).labelled.count(PointStatus.STRAY) > 0
+    beyond = measured(0.8, None).labelled
+    assert beyond.count(PointStatus.OUT_OF_DEPTH) == len(beyond.profile)
+    assert set(beyond.sheet.tolist()) == {-1}

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from armscan.devices.sources import ScanSource
-from armscan.errors import EstimationError, InputError
+from armscan.errors import EstimationError, InputError, begun
 from armscan.fusion.point_spool import PointSpool
 from armscan.fusion.scan_normals import ScanNormals, choose_scan_radius_mm
 from armscan.geometry.arrays import Box, FloatArray
@@ -530,9 +530,12 @@ def _nothing_placed(
     """Why a scan has no point in Base, to be raised."""
     placed = [one for one in exposures if one.status is ExposureStatus.PLACED]
     if not placed:
-        unreadable = [e.reason for e in exposures if e.status is ExposureStatus.UNREADABLE]
-        why = "; ".join(unreadable) or "no laser"
-        return EstimationError(f"no exposure with a pose could be measured: {why}")
+        why = []
+        for status, n in Counter(one.status for one in exposures).items():
+            of_status = dict.fromkeys(e.reason for e in exposures if e.status is status)
+            reasons = [reason for reason in of_status if reason != status.value]
+            why.append(f"{status.value}: {n}{f' ({begun(reasons, LISTED)})' if reasons else ''}")
+        return EstimationError(f"no exposure with a pose could be measured; {'; '.join(why)}")
     n_outside = sum(one.n_outside_volume for one in placed)
     if n_outside:
         return EstimationError(

@@ -214,8 +214,17 @@ def test_what_gives_no_cloud_is_refused_in_words(device: ScannerCalibration) -> 
     with pytest.raises(InputError, match="no camera"):
         coupled = replace(device.hand_eye, dhand_eye_dsensor=None)
         measure_scan(as_source(scan), replace(device, sensor=None, hand_eye=coupled))
-    with pytest.raises(EstimationError, match=r"could be measured: images/0\.png: the image"):
-        measure_scan(as_source(replace(scan, broken=(0, 1, 2))), device)
+    with pytest.raises(
+        EstimationError, match=r"could be measured; .*: 6 \(images/0\.png: "
+    ) as caught:
+        measure_scan(as_source(replace(fake_scan(), broken=tuple(range(6)))), device)
+    assert str(caught.value).count("cut short") == 4, "the first few reasons"
+    assert scan.arm is not None
+    late = int(scan.arm.t_ns[-1])
+    dark: dict[str, object] = {"lasers": ()}
+    unposed = with_rows(scan, [dark, {"t_ns": late + 1}, {"t_ns": late + 2}])
+    with pytest.raises(EstimationError, match=r"without pose: 2 \(after"):
+        measure_scan(as_source(unposed), device)
     away = Box(np.full(3, 900.0), np.full(3, 901.0))
     with pytest.raises(EstimationError, match="outside the volume"):
         measure_scan(as_source(scan), device, ScanOptions(volume=away))

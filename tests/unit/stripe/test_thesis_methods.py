@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
+from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeMethod, StripeOptions, mono_plane
 from armscan.vision.stripe.ridge import measure_level
@@ -31,6 +32,24 @@ def test_noise_is_the_methods_own_and_the_mean_is_right(
     assert result.rms_px < NOISE_PX[method]
     assert abs(result.error_px.mean()) < 0.05
     assert result.normalised.std() < 3.0
+
+
+@pytest.mark.parametrize("method", ["threshold", "template"])
+def test_what_pixels_round_is_in_sigma_and_shared_along_the_line(method: StripeMethod) -> None:
+    """A level line without noise lies beside the truth by the same all along."""
+    means, sigmas, of_means = [], [], []
+    rows = np.tile(np.arange(60.0)[:, None], (1, 300))
+    for y in 30.02 + np.arange(0.0, 1.0, 0.125):
+        grey = np.round(10.0 + 150.0 * np.exp(-0.5 * ((rows - y) / 2.6) ** 2))
+        found = extract_stripes(Exposure(grey.astype(np.uint8), "a"), StripeOptions(method=method))
+        assert found.noise_length is not None
+        means.append(float(found.points_px[:, 1].mean()) - y)
+        sigmas.append(float(found.sigma_px[0]))
+        of_means.append(float(np.sqrt((found.sigma_px**2 * found.noise_length).sum()) / len(found)))
+    rms = float(np.sqrt(np.mean(np.square(means))))
+    assert rms > 0.1
+    for stated in (sigmas, of_means):
+        assert rms < 1.05 * np.sqrt(np.mean(np.square(stated))) < 3.0 * rms
 
 
 def test_threshold_gives_the_middle_of_the_run() -> None:

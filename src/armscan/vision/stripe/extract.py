@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import importlib
+import math
 from dataclasses import replace
 
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.kernels.stripe.profile_fit import ALIKE, AMPLITUDE
 from armscan.kernels.stripe.section import (
     EDGE_BLUR_PX2,
@@ -61,7 +62,7 @@ from armscan.vision.stripe.ridge import (
     trace_ridges,
 )
 from armscan.vision.stripe.smooth import UNKNOWN_SCATTER_PX, Polyline, bends, scatter, smooth
-from armscan.vision.stripe.thesis import THESIS_METHODS, link_centres
+from armscan.vision.stripe.thesis import ROUNDING_PX, THESIS_METHODS, link_centres
 
 SPARSE = 4
 """Of the fast way: background and noise are told from a sixteenth and a fourth of the sample."""
@@ -204,7 +205,7 @@ def _find(
     if not len(ridge):
         return Profile.empty(source=exposure.source)
     if options.method != "fit":
-        return thesis_profile(exposure, plane, ridge, sigma)
+        return thesis_profile(exposure, plane, ridge, sigma, ROUNDING_PX.get(options.method, 0.0))
     profile = to_profile(exposure, plane, fit_ridge(plane, ridge, sigma, noise), options)
     width = profile.width_px[profile.is_accepted] / exposure.window.binning
     # where cores are clipped, runs are wider than the line's own sigma
@@ -230,9 +231,17 @@ def _of_laser(plane: StripePlane, ridge: RidgePoints, sigma_px: float) -> RidgeP
 
 
 def thesis_profile(
-    exposure: Exposure, plane: StripePlane, ridge: RidgePoints, sigma_px: float
+    exposure: Exposure,
+    plane: StripePlane,
+    ridge: RidgePoints,
+    sigma_px: float,
+    rounding_px: float,
 ) -> Profile:
-    """Profile of a thesis method: not smoothed, one sigma and one width for all points."""
+    """Profile of a thesis method: not smoothed, one sigma and one width for all points.
+
+    ``rounding_px`` is the standard deviation of what the method rounds to, which points that follow
+    each other in one row or column of pixels share.
+    """
     points, normals, chain = ridge.table[:, :2], ridge.table[:, 2:4], ridge.chain
     flags = np.zeros(len(points), np.int64)
     flags[is_saturated(points, plane.saturated)] |= int(StripeFlag.SATURATED)
@@ -240,7 +249,9 @@ def thesis_profile(
     own = scatter(points, normals, chain)
     if own is None:
         flags |= int(StripeFlag.NOISE_ASSUMED)
-    sigma = np.full(len(points), max(UNKNOWN_SCATTER_PX if own is None else own, LEAST_SIGMA_PX))
+    both = UNKNOWN_SCATTER_PX if own is None else math.hypot(max(own, LEAST_SIGMA_PX), rounding_px)
+    n_alike = np.maximum(*(_run_lengths(place, chain) for place in points.T))
+    sigma = np.full(len(points), both)
     return Profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(points),
@@ -250,7 +261,7 @@ def thesis_profile(
         intensity=np.maximum(ridge.table[:, 4], 0.0) * plane.grey_levels_per_unit,
         flags=flags,
         segment=chain,
-        noise_length=np.ones(len(points)),
+        noise_length=1.0 + (n_alike - 1.0) * (rounding_px / both) ** 2,
     )
 
 
@@ -304,9 +315,9 @@ def to_profile(
     )
 
 
-def _run_lengths(is_alike: BoolArray, chain: IntArray) -> IntArray:
-    """(N,) how many points follow each other along a chain that are alike."""
-    is_new = (np.diff(is_alike) != 0) | (np.diff(chain) != 0)
+def _run_lengths(values: BoolArray | FloatArray, chain: IntArray) -> IntArray:
+    """(N,) how many points of one value follow each other along a chain."""
+    is_new = (np.diff(values) != 0) | (np.diff(chain) != 0)
     run = np.concatenate([[0], np.cumsum(is_new)])
     return np.asarray(np.bincount(run)[run])
 

@@ -203,6 +203,14 @@ THESIS_METHODS: Mapping[str, CentreFinder] = MappingProxyType(
     }
 )
 
+ROUNDING_PX: Mapping[str, float] = MappingProxyType(
+    {"threshold": float(np.sqrt(1.0 / 24.0)), "template": float(np.sqrt(1.0 / 12.0))}
+)
+"""Standard deviation of what rounding to pixels puts beside the line, also where points scatter by
+nothing: of one whole pixel, and of half the sum of two edges in whole pixels. On synthetic lines
+almost without noise, over all places within a pixel, the centres lie 0.290 px and, by their width,
+0.10 to 0.19 px beside the truth; more noise moves edges and leaves less."""
+
 
 def link_centres(centres: FloatArray, image: FloatImage) -> RidgePoints:
     """Order a method's points along chains; the curvature column holds the grey level."""

@@ -361,11 +361,10 @@ def measure_long_scan(
         instants, labeller, sensor, options.measure, is_pass=True, cache=cache, clock=clock
     ):
         rows = one.images.instant.rows
-        base_from_tool = poses.pose(rows[0])
         for row, measured in zip(rows, one.profiles, strict=True):
             found.rows.append(row)
             with clock.stage(PLACING):
-                placed = _place(measured, base_from_tool, transform, options.volume, found)
+                placed = _place(measured, poses.pose(rows[0]), transform, options.volume, found)
                 points.add(*placed, instant=rows[0])
             if row in shown:
                 found.images[row] = measured.labelled

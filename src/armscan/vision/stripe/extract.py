@@ -250,7 +250,8 @@ def thesis_profile(
     if own is None:
         flags |= int(StripeFlag.NOISE_ASSUMED)
     both = UNKNOWN_SCATTER_PX if own is None else math.hypot(max(own, LEAST_SIGMA_PX), rounding_px)
-    n_alike = np.maximum(*(_run_lengths(place, chain) for place in points.T))
+    in_column, in_row = (_run_lengths(place, chain) for place in points.T)
+    n_alike = np.maximum(in_column, in_row)
     sigma = np.full(len(points), both)
     return Profile(
         source=exposure.source,

@@ -590,7 +590,8 @@ def distance_by_calibration(
     found = np.zeros((len(scan.cloud), n + 6))
     order = np.argsort(scan.cloud.exposure, kind="stable")
     ends = np.searchsorted(scan.cloud.exposure[order], np.arange(len(scan.images) + 1))
-    lasers = [scan.exposures[row].row.lasers for row in scan.image_rows]
+    of_row = dict(enumerate(one.row.lasers for one in scan.exposures))
+    lasers = [of_row.get(row, ()) for row in scan.image_rows]
     for k, stripe in measured_again(scan.images, lasers, sensor):
         rows = order[ends[k] : ends[k + 1]]
         along = directions[rows]

@@ -48,6 +48,7 @@ def looks_of(folder: Path) -> tuple[list[BoardLook], CameraCalibration, BoardBow
     if isinstance(run, FitFailure):
         return f"camera refused: {run.reason}"
     camera = camera_calibration(run.fit, Provenance("study", "", "", (), ()))
+    found = found.before(camera.camera)
     bow = find_board_bow(found.views, HeadCameras.of(camera))
     place = {exposure.source: k for k, exposure in enumerate(exposures)}
     looks = []

@@ -156,6 +156,7 @@ def calibrate_hand_eye_on_board(
     check_same_size(views.exposures)
     plate = settle_target(views.exposures, plate)
     found = find_targets(views.exposures, plate, cache=job.cache, progress=job.progress)
+    found = found.before(camera.camera)
     # views of a target that quarter turns leave alike do not tell along which side it is bowed
     is_square = any(turns % 2 for turns in plate.symmetric_turns)
     bow = None if is_square else find_board_bow(found.views, HeadCameras.of(camera))

@@ -10,10 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
+from armscan.models.camera import CameraModel
 from armscan.pipeline.progress import Progress, ProgressEvent, in_order, silent
 from armscan.records.exposure import Exposure
 from armscan.storage.detection_cache import DetectionCache, detection_key
+from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target, settle_target
 from armscan.vision.targets.target import (
     AprilGrid,
@@ -115,6 +118,19 @@ class FoundTargets:
         """Those of the sources that show the target."""
         empty = {source for source, _ in self.not_found}
         return tuple(source for source in sources if source not in empty)
+
+    def before(self, camera: CameraModel) -> FoundTargets:
+        """As seen by a known camera: with circles' centres measured again without its distortion.
+
+        Of a view with an edge that the camera's model cannot invert, that is said in its place.
+        """
+        views, not_found = [], list(self.not_found)
+        for view in self.views:
+            try:
+                views.append(view if view.edges is None else correct_centres(view, camera))
+            except InputError as error:
+                not_found.append((view.source, error.what))
+        return replace(self, views=tuple(views), not_found=tuple(not_found))
 
     def not_found_text(self) -> str:
         """Why there is no target, with the exposures of each reason, in brackets; or empty."""

@@ -484,13 +484,13 @@ def _pairs_numbered_alike(
     turn = _numbering_of(seen, numberings(target))
     if not turn:
         return None
-    alike = {pair.name: pair for pair in pairs}
+    alike: dict[str, TargetView] = {}
     for pair in (fitted.pair for fitted in fit.pairs):
-        told = [v.source for v in pair.views if v is not None and v.source in turn]
-        if told:
-            views = (v and renumbered(v, target, turn[told[0]]) for v in pair.views)
-            alike[pair.name] = StereoPair(*views)
-    return list(alike.values())
+        views = [view for view in pair.views if view is not None]
+        for numbering in [turn[view.source] for view in views if view.source in turn][:1]:
+            alike |= {view.source: renumbered(view, target, numbering) for view in views}
+    # views that could not be used are in no pair of the fit
+    return [StereoPair(*(v and alike.get(v.source, v) for v in pair.views)) for pair in pairs]
 
 
 def stereo_calibration(fit: StereoFit, provenance: Provenance) -> StereoCalibration:

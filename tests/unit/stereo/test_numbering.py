@@ -176,3 +176,19 @@ def test_pairs_numbered_apart_state_what_pairs_numbered_alike_do(
     assert alike.fit.target_error_mm == pytest.approx(0.01, rel=0.25)
     sigma, expected = (np.sqrt(np.diag(run.fit.covariance)) for run in (again, alike))
     np.testing.assert_allclose(sigma, expected, rtol=1e-4)
+
+
+def test_a_view_that_cannot_be_used_stays_in_its_pair() -> None:
+    """It is in no pair of the solution, by which the others are numbered alike."""
+    scene = replace(SCENE, n_pairs=8, missed_mm=0.01)
+    pairs = [
+        turned(pair, scene.target, *((2, 0) if k % 2 else (0, 2)))
+        for k, pair in enumerate(make_pairs(scene, 3)[0])
+    ]
+    right = pairs[3].right
+    assert right is not None
+    pairs[3] = StereoPair(pairs[3].left, right.select(np.arange(4)))
+    run = calibrate_stereo_from_pairs(pairs, scene.target, OPTIONS)
+    assert isinstance(run, StereoRun), run
+    assert [pair.is_related for pair in run.fit.pairs] == [k != 3 for k in range(8)]
+    assert run.fit.target_error_mm == pytest.approx(0.01, rel=0.25)

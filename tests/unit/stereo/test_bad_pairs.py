@@ -10,6 +10,7 @@ import pytest
 
 from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
 from armscan.calibration.cameras.pairs import StereoOptions, StereoPair
+from armscan.calibration.cameras.relate import PairNoise
 from armscan.calibration.cameras.result import CameraOptions
 from armscan.calibration.cameras.stereo_result import StereoFit
 from armscan.errors import InputError, OptionError
@@ -121,6 +122,20 @@ def test_one_of_three_pairs_that_is_wrong_leaves_too_few() -> None:
     assert isinstance(fit, FitFailure)
     assert "2 pairs tell where the cameras are to each other, 3 are needed" in fit.reason
     assert "left03.png" in fit.reason
+
+
+def test_of_three_pairs_none_is_left_out_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two that are left would not say which of them is wrong."""
+    misfit = PairNoise(np.array([1.0, 1.0, 10.0]), 1.0, np.array([False, False, True]))
+    monkeypatch.setattr(
+        "armscan.calibration.cameras.calibrate_stereo.compare_pairs", lambda *_: misfit
+    )
+    pairs = make_pairs(SCENE, 0)[0][:3]
+    assert [pair.is_misfit for pair in solved(pairs).pairs] == [False, False, True]
+    fit = calibrate_stereo(pairs, SCENE.target, replace(OPTIONS, leave_out_misfits=True))
+    assert isinstance(fit, FitFailure)
+    assert "2 pairs tell where the cameras are to each other, 3 are needed" in fit.reason
+    assert "left02.png + right02.png: taken apart" in fit.reason
 
 
 def test_a_camera_that_shook_between_pairs_is_said() -> None:

@@ -395,9 +395,9 @@ def calibrate_stereo(
     if isinstance(cameras, FitFailure):
         return cameras
     relation = relate(chosen, cameras, target)
-    if isinstance(relation, FitFailure):
-        return relation
     while True:
+        if isinstance(relation, FitFailure):
+            return relation
         boards = boards_of(relation)
         solution = _solve(boards, relation, cameras, options, given)
         if isinstance(solution, FitFailure):
@@ -406,7 +406,7 @@ def calibrate_stereo(
         levels = compare_pairs(own, solution.state.right_from_left)
         if not (options.leave_out_misfits and levels.is_misfit.any()):
             break
-        relation = relation.without(levels.is_misfit, TAKEN_APART)
+        relation = relation.without(levels.is_misfit, TAKEN_APART).unless_too_few()
     evidence = Evidence(relation, boards, cameras, solution, tuple(own), levels)
     return _result(evidence, options, given)
 

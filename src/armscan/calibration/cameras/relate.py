@@ -472,6 +472,15 @@ class Relation:
         ]
         return replace(self, pairs=tuple(pairs))
 
+    def unless_too_few(self) -> Relation | FitFailure:
+        """Itself, or why its pairs do not do."""
+        n_good = sum(pair.is_related for pair in self.pairs)
+        return self if n_good >= MIN_PAIRS else too_few(n_good, _notes(self.pairs))
+
+
+def _notes(pairs: Sequence[RelatedPair]) -> list[str]:
+    return [f"{pair.given.name}: {pair.note}" for pair in pairs if pair.note]
+
 
 def relate(pairs: Sequence[StereoPair], cameras: Cameras, target: Target) -> Relation | FitFailure:
     """Find where the cameras are to each other, and which pairs do not tell."""
@@ -479,7 +488,7 @@ def relate(pairs: Sequence[StereoPair], cameras: Cameras, target: Target) -> Rel
     usable = [_usable(pair, cameras, known[0]) for pair in pairs]
     both = [k for k, pair in enumerate(usable) if all(pair.seen)]
     if len(both) < MIN_PAIRS:
-        return too_few(len(both), [f"{p.given.name}: {p.note}" for p in usable if p.note])
+        return too_few(len(both), _notes(usable))
     ways = [relative_pose_candidates(*usable[k].seen, known) for k in both]
     agreement = agree(ways)
     if isinstance(agreement, FitFailure):
@@ -492,10 +501,7 @@ def relate(pairs: Sequence[StereoPair], cameras: Cameras, target: Target) -> Rel
             others = [usable[j] for i, j in enumerate(both) if not agreement.agrees[i]]
             level = float(agreement.levels[position]) / agreement.typical
             usable[k] = replace(found, note=_wrong(found, others, agreement, level, known))
-    n_good = sum(pair.is_related for pair in usable)
-    if n_good < MIN_PAIRS:
-        return too_few(n_good, [f"{p.given.name}: {p.note}" for p in usable if p.note])
-    return Relation(tuple(usable), agreement.right_from_left)
+    return Relation(tuple(usable), agreement.right_from_left).unless_too_few()
 
 
 def too_few(n_pairs: int, reasons: Sequence[str]) -> FitFailure:

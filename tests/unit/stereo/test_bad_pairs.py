@@ -10,13 +10,15 @@ import pytest
 
 from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
 from armscan.calibration.cameras.pairs import StereoOptions, StereoPair
-from armscan.calibration.cameras.relate import PairNoise
+from armscan.calibration.cameras.relate import BoardSeen, PairNoise, _Stacked, true_order
 from armscan.calibration.cameras.result import CameraOptions
 from armscan.calibration.cameras.stereo_result import StereoFit
 from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector
+from armscan.vision.targets.detect import numberings
 from rigs.stereo_rig import CONVERGING, StereoScene, make_pairs, normalised_stereo_error, pair_at
 
 SCENE = StereoScene(n_pairs=8)
@@ -83,6 +85,33 @@ def test_lists_in_different_orders_are_refused_with_the_right_one() -> None:
     assert isinstance(fit, FitFailure)
     assert "not in the same order" in fit.reason
     assert "left01.png with right01.png" in fit.reason
+
+
+def test_the_order_of_long_lists_is_found_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any order of 24 pairs, one without partner; places that are tried grow with their count."""
+    rng, n, tried = np.random.default_rng(5), 24, 0
+    levels = _Stacked.levels
+
+    def counted(stacked: _Stacked, k: int) -> FloatArray:
+        nonlocal tried
+        tried += 1
+        return levels(stacked, k)
+
+    def seen(turn: FloatArray, place_mm: FloatArray) -> tuple[BoardSeen, ...]:
+        covariance = np.diag([1e-8] * 3 + [1e-4] * 3)
+        return (BoardSeen(Pose(rotation_from_vector(turn), place_mm), covariance),)
+
+    left = [seen(rng.normal(0.0, 0.4, 3), rng.normal(0.0, 20.0, 3)) for _ in range(n)]
+    where = [CONVERGING @ board.camera_from_board for (board,) in left]
+    right = [seen(pose.rotation_vector_rad, pose.translation_mm) for pose in where]
+    right[7] = seen(rng.normal(0.0, 0.4, 3), rng.normal(0.0, 20.0, 3))
+    order = rng.permutation(n)
+    monkeypatch.setattr(_Stacked, "levels", counted)
+    known = numberings(SCENE.target)[:1]
+    found = true_order(left, [right[k] for k in order], known)
+    assert found is not None
+    assert [int(order[k]) for i, k in enumerate(found) if i != 7] == [i for i in range(n) if i != 7]
+    assert tried <= 3 * n
 
 
 def test_pairs_of_different_instants_throughout_are_refused() -> None:

@@ -39,9 +39,9 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.models.two_views import StereoCalibration, StereoDiagnostics
-from armscan.pipeline.instants import group_instants
+from armscan.pipeline.instants import check_sizes, group_instants
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.targets import FoundTargets, find_targets
+from armscan.pipeline.targets import FoundTargets, find_targets, on_sensor
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ExposureRow
 from armscan.vision.targets.circle_grid import correct_centres
@@ -412,7 +412,9 @@ def calibrate_stereo_from_found(
     """
     if found.wrong_count is not None:
         return found.wrong_count
-    pairs = _found_pairs(exposures, {view.source: view for view in found.views})
+    for side, known in enumerate(given or ()):
+        check_sizes(filter(None, (pair[side] for pair in exposures)), known.camera)
+    pairs = _found_pairs(exposures, {view.source: view for view in found.views}, given)
     missing = _stereo_too_few(exposures, pairs, found)
     if missing is not None:
         return missing
@@ -547,11 +549,14 @@ def _camera(
 
 
 def _found_pairs(
-    exposures: Sequence[ExposedPair], views: dict[str, TargetView]
+    exposures: Sequence[ExposedPair], views: dict[str, TargetView], given: Given | None
 ) -> list[StereoPair]:
     pairs = []
     for left, right in exposures:
         seen = [None if one is None else views.get(one.source) for one in (left, right)]
+        if given is not None:
+            both = zip(seen, given, strict=True)
+            seen = [view and on_sensor(view, known.camera) for view, known in both]
         if any(view is not None for view in seen):
             pairs.append(StereoPair(seen[0], seen[1]))
     return pairs

@@ -42,7 +42,7 @@ from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, check_sizes
 from armscan.pipeline.measure import cached_profile
 from armscan.pipeline.progress import Progress, ProgressEvent, in_order, silent
-from armscan.pipeline.targets import DETECTION_THREADS, cached_target, wrong_count
+from armscan.pipeline.targets import DETECTION_THREADS, cached_target, on_sensor, wrong_count
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.storage.detection_cache import DetectionCache
@@ -540,6 +540,7 @@ def _posed(
     if isinstance(view, FitFailure):
         return view
     model = cameras.model(camera)
+    view = on_sensor(view, model)
     if view.edges is not None:
         view = correct_centres(view, model)
     if is_lit:
@@ -563,10 +564,12 @@ def _same_placement(
         key=lambda n: float(np.trace(right_from_left @ n.new_from_found.rotation.T)),
     )
     if best.quarter_turns:
-        again = _posed(1, renumbered(right[1], target, best), cameras, is_lit=False)
-        if isinstance(again, FitFailure):
-            return again
-        right = again
+        # with its covariances, which are wide where the laser pulls a point
+        view = renumbered(right[1], target, best)
+        pose = estimate_board_pose(view, cameras.model(1))
+        if isinstance(pose, FitFailure):
+            return pose
+        right = 1, view, pose
     chi2 = poses_chi2(left, right, cameras)
     if chi2 <= LARGEST_CHI2:
         return right

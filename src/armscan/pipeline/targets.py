@@ -43,6 +43,14 @@ def cached_target(
     return looked
 
 
+def on_sensor(view: TargetView, camera: CameraModel) -> TargetView:
+    """The view with the size of its camera's sensor, which a window need not tell.
+
+    `armscan.pipeline.instants.check_sizes` tells whether the image is of that sensor.
+    """
+    return replace(view, width_px=camera.width_px, height_px=camera.height_px)
+
+
 ENOUGH_IMAGES = 4
 """Images that show one and the same other count, and never the target, prove the count wrong."""
 _AGREEING = 0.5
@@ -126,8 +134,9 @@ class FoundTargets:
         """
         views, not_found = [], list(self.not_found)
         for view in self.views:
+            seen = on_sensor(view, camera)
             try:
-                views.append(view if view.edges is None else correct_centres(view, camera))
+                views.append(seen if seen.edges is None else correct_centres(seen, camera))
             except InputError as error:
                 not_found.append((view.source, error.what))
         return replace(self, views=tuple(views), not_found=tuple(not_found))

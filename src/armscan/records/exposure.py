@@ -96,6 +96,8 @@ class Exposure:
         Number that the arm's sample of the same trigger bears too, or None.
     view
         Exposures of equal view saw one rigid arrangement; None stands for a view of its own.
+    sensor_px
+        Width and height of the full sensor where they are known; None where the image ends there.
     """
 
     image: ImageArray
@@ -107,6 +109,7 @@ class Exposure:
     camera: int = 0
     trigger_id: int | None = None
     view: str | None = None
+    sensor_px: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         image = np.ascontiguousarray(self.image)

@@ -229,6 +229,7 @@ def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposur
         row.source,
         bits_used=image.bits_used,
         window=setup.window,
+        sensor_px=_sensor_px(image, setup),
         lasers=row.lasers,
         t_ns=row.t_ns,
         camera=row.camera,
@@ -305,6 +306,17 @@ def _check_layout(image: Exposure, setup: CameraSetup, path: Path) -> None:
         )
 
 
+def _sensor_px(image: Exposure, setup: CameraSetup) -> tuple[int, int] | None:
+    """The camera's size where it holds the image's window; else it is that of the window."""
+    if setup.width_px is None or setup.height_px is None:
+        return None
+    window = setup.window
+    right = window.x_px + window.binning * image.width_px
+    bottom = window.y_px + window.binning * image.height_px
+    is_inside = right <= setup.width_px and bottom <= setup.height_px
+    return (setup.width_px, setup.height_px) if is_inside else None
+
+
 def _check_size(image: Exposure, setup: CameraSetup, path: Path) -> None:
     """An image has its camera's size, or is smaller and lies inside it at the window's place."""
     have = np.array([image.width_px, image.height_px])
@@ -313,8 +325,7 @@ def _check_size(image: Exposure, setup: CameraSetup, path: Path) -> None:
     size = np.array([setup.width_px, setup.height_px])
     corner = np.array([setup.window.x_px, setup.window.y_px])
     is_whole = bool((have == size).all())
-    is_inside = bool((corner + setup.window.binning * have <= size).all())
-    if not (is_whole or is_inside):
+    if not is_whole and _sensor_px(image, setup) is None:
         place = f" with a window at {corner[0]}, {corner[1]}" if corner.any() else ""
         raise FileFormatError(
             f"the image is {have[0]} x {have[1]} px, its camera {size[0]} x {size[1]} px{place}",

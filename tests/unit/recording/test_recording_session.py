@@ -12,10 +12,11 @@ import pytest
 from armscan.errors import ArmscanError, FileFormatError, InputError, OptionError
 from armscan.pipeline.instants import check_sizes
 from armscan.records.exposure import SensorWindow
-from armscan.records.recording import CameraSetup, Session
+from armscan.records.recording import CameraSetup, ExposureRow, Session
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.recording import read_recording, write_recording
+from armscan.storage.recording import read_recorded, read_recording, write_recording
 from armscan.storage.recording_session import read_session_file, session_toml
+from armscan.vision.targets.target import Chessboard, TargetView
 from rigs.plain_scanner import plain_camera
 from rigs.recording_folders import ARM, EXPOSURES, SESSION, lab_folder, pixels, refusal
 
@@ -330,3 +331,19 @@ def test_an_image_of_another_camera_is_described_by_its_own_table(tmp_path: Path
     assert scan.exposure(2).camera == 1
     assert scan.exposure(2).window.x_px == 4
     assert (scan.session.cameras[1].width_px, scan.session.cameras[1].height_px) == (3, 2)
+
+
+@pytest.mark.parametrize(
+    ("stated_px", "size_px"),
+    [((64, 48), (64, 48)), ((30, 20), (38, 24)), ((None, None), (38, 24))],
+)
+def test_a_view_in_a_window_is_of_the_sensor_that_the_session_states(
+    stated_px: tuple[int | None, int | None], size_px: tuple[int, int], tmp_path: Path
+) -> None:
+    """Of a sensor of unknown size it reaches to where the window ends."""
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((20, 30), np.uint8))
+    setup = CameraSetup(*stated_px, window=SensorWindow(8, 4))
+    exposure = read_recorded(tmp_path, ExposureRow(0, 0, 0, "0.png"), setup)
+    nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2))
+    view = TargetView.of_image(exposure, Chessboard(9, 6, 25.0), *nothing)
+    assert (view.width_px, view.height_px) == size_px

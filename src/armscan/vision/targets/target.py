@@ -27,9 +27,9 @@ from armscan.records.exposure import Exposure
 
 @dataclass(frozen=True, slots=True)
 class CircleGrid:
-    """Grid of circles; ``is_asymmetric`` shifts every second row by half a pitch (as OpenCV).
+    """Grid of circles; ``is_asymmetric`` shifts every second row by a pitch (as OpenCV).
 
-    Rows lie ``stretch`` times the pitch apart.
+    Then neighbours in a row are two pitches apart. Rows lie ``stretch`` times the pitch apart.
     """
 
     columns: int
@@ -500,7 +500,7 @@ class TargetView(RowRecord):
     source
         The exposure's source name.
     width_px, height_px
-        Size of the image, in full-sensor pixels.
+        Size of the full sensor; of a window on one of unknown size, where it ends there.
     point_index
         (N,) index into the target's points.
     points_px
@@ -513,6 +513,8 @@ class TargetView(RowRecord):
         Edge points, for circle targets.
     is_ambiguous
         True if the target looks the same turned by half a turn, so that the numbering may be too.
+    is_square
+        True if it looks the same turned by a quarter, so that the image tells which axis is x.
     """
 
     source: str
@@ -524,6 +526,7 @@ class TargetView(RowRecord):
     points_board_mm: FloatArray = floats("N", 3)
     edges: CircleEdges | None = None
     is_ambiguous: bool = False
+    is_square: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -540,15 +543,19 @@ class TargetView(RowRecord):
     ) -> TargetView:
         """Points (N, 2) of these numbers (N,), measured in the pixels of the exposure's image."""
         window = exposure.window
+        right = window.x_px + exposure.width_px * window.binning
+        bottom = window.y_px + exposure.height_px * window.binning
+        width_px, height_px = exposure.sensor_px or (right, bottom)
         return TargetView(
             source=exposure.source,
-            width_px=window.x_px + exposure.width_px * window.binning,
-            height_px=window.y_px + exposure.height_px * window.binning,
+            width_px=width_px,
+            height_px=height_px,
             point_index=number,
             points_px=window.to_full_sensor(image_px),
             covariance_px2=covariance_px2 * window.binning**2,
             points_board_mm=target.points_board_mm[number],
             is_ambiguous=bool(target.symmetric_turns),
+            is_square=1 in target.symmetric_turns,
         )
 
 

@@ -35,6 +35,7 @@ from armscan.pipeline.hand_eye import (
     repeated_postures,
     standing_postures,
 )
+from armscan.pipeline.instants import check_sizes
 from armscan.pipeline.targets import FoundTargets, find_targets
 from armscan.reconstruction.sync import exposure_poses
 from armscan.records.exposure import Exposure
@@ -154,12 +155,11 @@ def calibrate_hand_eye_on_board(
         image_options.check_unused()
         views = _scan_views(source)
     check_same_size(views.exposures)
+    check_sizes(views.exposures, camera.camera)
     plate = settle_target(views.exposures, plate)
     found = find_targets(views.exposures, plate, cache=job.cache, progress=job.progress)
     found = found.before(camera.camera)
-    # views of a target that quarter turns leave alike do not tell along which side it is bowed
-    is_square = any(turns % 2 for turns in plate.symmetric_turns)
-    bow = None if is_square else find_board_bow(found.views, HeadCameras.of(camera))
+    bow = find_board_bow(found.views, HeadCameras.of(camera))
     looks, unclear = _looks(found, views, plate, camera, bow)
     fit = calibrate_on_board(
         looks, camera, options, bow=bow, target=plate, readings=_readings(looks, source, views)

@@ -34,6 +34,8 @@ LASERS_APART = "\n"
 R = TypeVar("R")
 Arrays = Mapping[str, NDArray[Any]]
 
+ADDED = ("is_square",)
+"""Fields that earlier files lack, whose defaults stand for them."""
 MOST_BYTES = 512 * 2**20
 """Of all arrays together; a file of some megabytes may claim any size."""
 MOST_RECORDS = 1_000_000
@@ -260,6 +262,8 @@ def _unpacked(kind: type[R], word: str, arrays: Arrays) -> tuple[R, ...]:
         if (get_origin(hint) or hint) is Pose:
             turns, shifts = arrays[f"{word}_rotation"], arrays[f"{word}_translation_mm"]
             columns[name] = [Pose(*pair) for pair in zip(turns, shifts, strict=True)]
+            continue
+        if name in ADDED and f"{word}_{name}" not in arrays:
             continue
         array = arrays[f"{word}_{name}"]
         if get_origin(hint) is np.ndarray:

@@ -12,7 +12,7 @@ from scipy.stats import chi2, kstest
 
 from armscan.calibration.hand_eye import on_board
 from armscan.calibration.hand_eye.alternatives import other_readings
-from armscan.calibration.hand_eye.board_looks import BoardLook, find_board_start
+from armscan.calibration.hand_eye.board_looks import BoardLook, board_poses, find_board_start
 from armscan.calibration.hand_eye.board_result import BoardHandEyeFit
 from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.on_board import (
@@ -30,6 +30,7 @@ from armscan.geometry.rotations import (
     euler_from_rotations,
     rotations_from_euler,
 )
+from armscan.vision.targets.detect import numberings, renumbered
 from armscan.vision.targets.target import parse_target
 from rigs.board_postures import TRUE_CAMERA, BoardRig, board_rig, misread
 from rigs.calibration_documents import sensor_calibration
@@ -301,6 +302,20 @@ def test_a_bow_is_taken_out_of_the_pose_of_a_view() -> None:
         )
         assert step.max() < 0.5
         assert wrong.max() > 2.0
+
+
+def test_a_quarter_turn_swaps_the_bows_of_a_view() -> None:
+    """Numbered from another side before or after, a view follows them alike."""
+    target, rig = parse_target("circle-grid:6x6:30"), board_rig(4, 3, target="circle-grid:6x6:30")
+    view, ends = rig.looks[0].poses[0].view, (np.zeros(2), np.full(2, 150.0))
+    bow = BoardBow(np.full(2, 0.3), np.eye(2), np.zeros((2, 9)), *ends)
+    poses = board_poses(view, target, rig.camera.camera, bow)
+    assert not isinstance(poses, FitFailure)
+    for numbering, pose in zip(numberings(target), poses[:: len(poses) // 4], strict=True):
+        again = board_poses(renumbered(view, target, numbering), target, rig.camera.camera, bow)
+        assert not isinstance(again, FitFailure)
+        assert pose.by_common == pytest.approx(again[0].by_common, rel=1e-4, abs=1e-6)
+    assert np.abs(poses[0].by_common[:, 9] - poses[0].by_common[:, 10]).max() > 1e-3
 
 
 def test_three_postures_are_too_few() -> None:

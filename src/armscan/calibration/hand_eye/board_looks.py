@@ -23,8 +23,8 @@ from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Board, Pose, Sensor, Tool
 from armscan.geometry.rotations import nearest_rotation, skew
-from armscan.models.camera import CameraModel
-from armscan.vision.targets.detect import numberings
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.vision.targets.detect import Numbering, numberings
 from armscan.vision.targets.target import Target, TargetView, format_target
 
 N_POSE = 6
@@ -114,11 +114,21 @@ def board_poses(
                 BoardPose(
                     sensor_from_board=estimate.value @ back,
                     covariance=moved @ estimate.covariance @ moved.T,
-                    by_common=moved @ dpose_dcamera(bent, estimate.value, camera, bow),
+                    by_common=_numbered(
+                        moved @ dpose_dcamera(bent, estimate.value, camera, bow), numbering
+                    ),
                     view=numbered,
                 )
             )
     return tuple(found)
+
+
+def _numbered(by_common: FloatArray, numbering: Numbering) -> FloatArray:
+    """Derivative by the camera, and by the bow along axes that a quarter turn swaps."""
+    n_camera = len(PARAMETER_NAMES)
+    if numbering.quarter_turns % 2 == 0:
+        return by_common
+    return np.concatenate([by_common[:, :n_camera], by_common[:, n_camera:][:, ::-1]], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

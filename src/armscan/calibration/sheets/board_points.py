@@ -41,6 +41,8 @@ LIKELY_BOARD_BOWS = np.geomspace(1e-5, 8e-4, 21)
 """Bows of boards that are called flat, in parts of half their size, each as likely as any other: of
 300 mm from glass, 1.5 um, to a print on a plate, 0.12 mm. Their rms is 3e-4."""
 BOW_STEPS = 3
+SAME = 1e-6
+"""Relative difference of variances that are the same but for rounding."""
 
 SeenBoard = tuple[int, TargetView, Estimate[Pose[Sensor, Board]]]
 """Camera, target, and the board's pose in that camera's own frame."""
@@ -344,6 +346,9 @@ class BoardBow:
         (2, P) derivative by the cameras' parameters.
     low_mm, high_mm
         (2,) the target's extent.
+
+    Of a target that quarter turns leave alike both bows are their mean, for each view is numbered
+    by its image and may swap them: their covariance leaves the difference open.
     """
 
     bow_mm: FloatArray
@@ -385,6 +390,20 @@ class BoardBow:
             by_cameras=np.average(gain, axis=0, weights=weight) @ self.by_cameras,
         )
 
+    def of_either_axis(self, sizes_mm: FloatArray) -> BoardBow:
+        """The mean of both bows, which does not depend on which axis is x.
+
+        Half their difference may be as large as the mean is and as bows (S,) are that are likely.
+        """
+        mean_mm, variance = float(self.bow_mm.mean()), float(self.covariance_mm2.mean())
+        apart = mean_mm**2 + float(np.mean(sizes_mm**2))
+        return replace(
+            self,
+            bow_mm=np.full(2, mean_mm),
+            covariance_mm2=variance + apart * np.array([[1.0, -1.0], [-1.0, 1.0]]),
+            by_cameras=np.tile(self.by_cameras.mean(axis=0), (2, 1)),
+        )
+
     def height_mm(self, points_mm: FloatArray, pose: Pose[Sensor, Board]) -> FloatArray:
         """(N,) height of the bowed board over its plane below points (N, 3) in Sensor."""
         local = (points_mm - pose.translation_mm) @ pose.rotation
@@ -409,29 +428,34 @@ class BoardBow:
 def find_bow(
     boards: Sequence[BoardStripes], cameras: HeadCameras, likely_mm: float | None
 ) -> tuple[BoardBow | None, Sequence[BoardStripes]]:
-    """The target's bow, and the boards placed with it; where it is not zero, estimated anew."""
-    bow = find_board_bow(
-        list({board.view.source: board.view for board in boards if board.camera == 0}.values()),
-        cameras,
-        likely_mm,
-    )
+    """The target's bow, and the boards placed with it; where it is not zero, estimated anew.
+
+    It is that of the views of the camera that saw most boards.
+    """
+    views: dict[int, dict[str, TargetView]] = {}
+    for board in boards:
+        views.setdefault(board.camera, {})[board.view.source] = board.view
+    camera = max(sorted(views), key=lambda k: len(views[k]), default=0)
+    bow = find_board_bow(list(views.get(camera, {}).values()), cameras, likely_mm, camera)
     if bow is None:
         return None, boards
     found: dict[tuple[int, str], SeenBoard] = {}
-    placements: dict[str, dict[int, SeenBoard]] = {}
+    placements: dict[str, dict[int, tuple[SeenBoard, SeenBoard]]] = {}
     for board in boards:
         key = board.camera, board.view.source
+        flat = board.camera, board.view, board.sensor_from_board
         if key not in found and not bow.bow_mm.any():
-            found[key] = board.camera, board.view, board.sensor_from_board
+            found[key] = flat
         elif key not in found:
             view = bow.bent(board.view)
             pose = estimate_board_pose(view, cameras.model(board.camera), allow_ambiguous=True)
             if isinstance(pose, FitFailure):
                 return None, boards
             found[key] = board.camera, view, pose
-        placements.setdefault(board.place, {})[board.camera] = found[key]
+        placements.setdefault(board.place, {})[board.camera] = flat, found[key]
+    given = {board.place: board.placed for board in boards}
     placed = {
-        place: place_board([seen[camera] for camera in sorted(seen)], cameras, bow)
+        place: _placed_with_bow([seen[k] for k in sorted(seen)], given[place], cameras, bow)
         for place, seen in placements.items()
     }
     return bow, [
@@ -445,39 +469,75 @@ def find_bow(
     ]
 
 
+def _placed_with_bow(
+    seen: Sequence[tuple[SeenBoard, SeenBoard]],
+    given: PlacedBoard | None,
+    cameras: HeadCameras,
+    bow: BoardBow,
+) -> PlacedBoard:
+    """A board by what cameras saw of it, taken for flat and with its bow.
+
+    Where it was ``given`` by the other camera, too, which shows no stripe on it, that counts; what
+    the bow moves in that camera's view, of which the points are not at hand, these tell.
+    """
+    bowed = place_board([one for _, one in seen], cameras, bow)
+    if given is None or cameras.second is None or len(seen) > 1:
+        return bowed
+    ((camera, view, pose), _) = seen[0]
+    flat = _in_sensor((camera, view, pose), cameras)
+    if np.allclose(np.diag(flat.covariance), np.diag(given.covariance), rtol=SAME, atol=0.0):
+        return bowed
+    place = cameras.camera_from_sensor(1 - camera)
+    there = place @ given.sensor_from_board
+    as_sensor: Pose[Sensor, Board] = Pose(there.rotation, there.translation_mm)
+    by_other = dpose_dcamera(view, as_sensor, cameras.model(1 - camera), bow)[:, N_CAMERA:]
+    own_share = given.covariance @ np.linalg.inv(flat.covariance)
+    by_bow = _twice(place.rotation.T) @ by_other
+    by_bow += own_share @ (bowed.by_cameras[:, cameras.n_parameters :] - by_bow)
+    return PlacedBoard(
+        given.sensor_from_board.retract(by_bow @ bow.bow_mm),
+        given.covariance,
+        np.concatenate([given.by_cameras, by_bow], axis=1),
+    )
+
+
 def find_board_bow(
-    views: Sequence[TargetView], cameras: HeadCameras, likely_mm: float | None = None
+    views: Sequence[TargetView],
+    cameras: HeadCameras,
+    likely_mm: float | None = None,
+    camera: int = 0,
 ) -> BoardBow | None:
-    """Bow of the target that camera 0 saw in several views, the camera being held.
+    """Bow of the target that one camera saw in several views, the camera being held.
 
     One that is not significant is held at zero, with the mean square of what the views leave likely
     of it where ``likely_mm`` is known beforehand (None: `LIKELY_BOARD_BOWS`); of fewer than
-    `LEAST_BOW_VIEWS` views that is all that is likely. None where a view's pose has no solution,
-    and where the bow is known to be zero and the views do not contradict.
+    `LEAST_BOW_VIEWS` views, and where a view's pose has no solution, that is all that is likely.
+    None where the bow is known to be zero and the views do not contradict.
     """
     if not views:
         return None
     board = np.concatenate([view.points_board_mm[:, :2] for view in views])
-    half_mm = 0.5 * float(np.ptp(board, axis=0).max())
+    low_mm, high_mm = board.min(axis=0), board.max(axis=0)
+    half_mm = 0.5 * float((high_mm - low_mm).max())
     sizes_mm = LIKELY_BOARD_BOWS * half_mm if likely_mm is None else np.array([likely_mm])
-    if len(views) >= LEAST_BOW_VIEWS:
-        solved = _solved_bow(views, cameras)
-        if solved is None:
-            return None
-        bow, is_significant = solved
-        if is_significant:
-            return bow
-        bow = bow.held_at_zero(sizes_mm)
-    else:
+    solved = _solved_bow(views, cameras, camera) if len(views) >= LEAST_BOW_VIEWS else None
+    if solved is None:
         likely = np.mean(sizes_mm**2) * np.eye(2)
         of_cameras = np.zeros((2, cameras.n_parameters))
-        bow = BoardBow(np.zeros(2), likely, of_cameras, board.min(axis=0), board.max(axis=0))
+        bow = BoardBow(np.zeros(2), likely, of_cameras, low_mm, high_mm)
+    elif solved[1]:
+        bow, _ = solved
+        return bow.of_either_axis(sizes_mm) if views[0].is_square else bow
+    else:
+        bow = solved[0].held_at_zero(sizes_mm)
     return None if likely_mm == 0.0 else bow
 
 
-def _solved_bow(views: Sequence[TargetView], cameras: HeadCameras) -> tuple[BoardBow, bool] | None:
+def _solved_bow(
+    views: Sequence[TargetView], cameras: HeadCameras, camera: int
+) -> tuple[BoardBow, bool] | None:
     """The bow as the views show it, and whether it is significant."""
-    flat = _held_camera(views, cameras.model(0))
+    flat = _held_camera(views, cameras.model(camera))
     bowed = None if flat is None else with_board_warp(flat, MAX_STEPS)
     if flat is None or bowed is None or isinstance(bowed, FitFailure):
         return None
@@ -489,7 +549,8 @@ def _solved_bow(views: Sequence[TargetView], cameras: HeadCameras) -> tuple[Boar
     )
     of_bow = np.linalg.inv(reduced[N_CAMERA:, N_CAMERA:])
     by_cameras = np.zeros((2, cameras.n_parameters))
-    by_cameras[:, :N_CAMERA] = -of_bow @ reduced[N_CAMERA:, :N_CAMERA]
+    own = RIGHT_CAMERA if camera else LEFT_CAMERA
+    by_cameras[:, own] = -of_bow @ reduced[N_CAMERA:, :N_CAMERA]
     covariance = bowed.variance_factor * of_bow
     board = np.concatenate([view.points_board_mm[:, :2] for view in views])
     ends = board.min(axis=0), board.max(axis=0)

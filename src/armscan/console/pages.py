@@ -86,7 +86,8 @@ class ConsolePage:
         self._is_viewing = bench is not None and bench.has_operator
         self._held = ExitStack()
         self._lock, self._showing = threading.RLock(), threading.RLock()
-        self._is_cancelled = False
+        self._is_cancelled = self._is_turning = False
+        self._under_way: list[tuple[str, bool]] = []
         self.journey = self._opened(folder)
         self.step = self.journey.next_step()
         self.scan = self.journey.scans[-1] if self.journey.scans else ""
@@ -99,14 +100,14 @@ class ConsolePage:
         """Start the worker's process, and save what a killed console left behind."""
         self.worker.prepare()
         if self.journey.cut_short:
-            self.controls.tried(self._recover)
+            self.controls.tried(lambda: self.controls.alone(self._recover, waits=True))
 
     def _recover(self) -> None:
-        self._busy("Saving a recording that was cut short ...")
-        try:
+        """Save what was cut short; a scan that runs meanwhile looks like that, too."""
+        if self.live is not None or not self.journey.cut_short:
+            return
+        with self._busy("Saving a recording that was cut short ..."):
             self._said = self.worker.run(recover_scans, self.journey.folder)
-        finally:
-            self._busy("")
         if not self.scan and self.journey.scans:
             self.scan = self.journey.scans[-1]
 
@@ -186,9 +187,7 @@ class ConsolePage:
         self.points.build(gui)
         with gui.add_folder("Sessions", expand_by_default=False):
             self._session_list = gui.add_dropdown("Session", (self._name(),))
-            self._open = self.controls.button(
-                "Open", self._open_chosen, "", "Close this one, open that"
-            )
+            button("Open", self._open_chosen, "", "Close this one, open that", is_alone=True)
 
     def _settings(self) -> None:
         gui = self.server.gui
@@ -226,12 +225,13 @@ class ConsolePage:
     # what the operator does
 
     def choose(self, step: StepName) -> None:
-        """Show a step."""
-        if self.live is not None:
-            self.controls.problem = "Finish the scan first."
-            self.refresh()
-            return
-        self.step, self._seen, self._said = step, None, ()
+        """Show a step; not while a scan of the one that is shown begins, runs or ends."""
+        with self._showing:
+            if self.live is not None or self._is_turning:
+                self.controls.problem = "Finish the scan first, and wait for its end."
+                self.refresh()
+                return
+            self.step, self._seen, self._said = step, None, ()
         self.controls.forget_question()
         self._rest()
         self.refresh()
@@ -290,8 +290,7 @@ class ConsolePage:
     def take_one(self) -> None:
         """Record the placement or touch that is drawn, and say what is seen in it."""
         step = self.step
-        self._busy("Taking ...", can_end=False)
-        try:
+        with self._busy("Taking ...", can_end=False):
             self.take(step)
             if BY_NAME[step].filling == "placements":
                 n_taken = self.journey.n_taken(step)
@@ -299,89 +298,94 @@ class ConsolePage:
                 # of something else, if the person has gone on meanwhile
                 if self.step is step and self.journey.n_taken(step) == n_taken:
                     self._seen = seen
-        finally:
-            self._busy("")
 
     def take_all(self) -> None:
         """Record all that is left, as the twin shows it."""
         self._seen, self._is_cancelled = None, False
         step, n_wanted = self.step, self._n_wanted()
-        self._busy("Taking all that is left ...")
-        try:
+        with self._busy("Taking all that is left ..."):
             while self.journey.n_taken(step) < n_wanted and not self._is_cancelled:
                 put(self._bar, 100.0 * self.journey.n_taken(step) / n_wanted)
                 self.take(step)
                 self.refresh()
-        finally:
-            self._busy("")
 
     def take_back(self) -> None:
         """Remove the placement or touch that was taken last."""
-        self._seen = None
+        self._seen, step = None, self.step
         with self._lock:
-            take_back(self.step, self.journey.recording(self.step))
+            take_back(step, self.journey.recording(step))
 
     def start_over(self) -> None:
         """Remove what this step has taken."""
-        self._seen = None
+        self._seen, step = None, self.step
         with self._lock:
             self.scanning.show_images(())
-            self.journey.start_over(self.step, self._scan_of(self.step))
+            self.journey.start_over(step, self._scan_of(step))
 
     def start_or_pause(self) -> None:
         """Begin a scan, pause it, or go on."""
+        # before the lock: what waited for the end of this scan does not begin another
+        live = self.live
         with self._lock:
-            if self.live is None:
+            if live is None:
                 self._begin()
-            elif self.live.snapshot.state == "scanning":
-                self.live.pause()
+            elif live.snapshot.state == "scanning":
+                live.pause()
             else:
-                self.live.start()
+                live.start()
+
+    @contextmanager
+    def _turning(self, words: str) -> Iterator[None]:
+        """A scan begins or ends: step and session stay meanwhile."""
+        with self._showing:
+            self._is_turning = True
+        try:
+            with self._busy(words, can_end=False):
+                yield
+        finally:
+            self._is_turning = False
 
     def _begin(self) -> None:
-        step, now = self.step, self.journey.settings
-        scanner = read_scanner_calibration(self.journey.scanner_file)
-        scan = self.journey.new_scan() if step is StepName.SCAN else ""
-        path, model = self.journey.new_file(step, scan), None
-        if step is StepName.SCAN and now.part:
-            model = ModelWatch(self.worker, self.journey.folder / now.part)
-        self._busy("Starting the devices ...", can_end=False)
-        try:
-            live = LiveScan(self._bench(), step, path, scanner, now.seeing)
-            live.open(lambda: None if scan else self.journey.start_over(step))
+        with self._turning("Starting the devices ..."):
+            step, journey, model = self.step, self.journey, None
+            part, seeing = journey.settings.part, journey.settings.seeing
+            scanner = read_scanner_calibration(journey.scanner_file)
+            scan = journey.new_scan() if step is StepName.SCAN else ""
+            if step is StepName.SCAN and part:
+                model = ModelWatch(self.worker, journey.folder / part)
+            live = LiveScan(self._bench(), step, journey.new_file(step, scan), scanner, seeing)
+            live.open(lambda: None if scan else journey.start_over(step))
             self.scanning.begin(live, scanner, model)
-        finally:
-            self._busy("")
-        self.scan = scan or self.scan
+            self.scan = scan or self.scan
 
     def finish(self) -> None:
         """End the scan, and run its job."""
-        with self._lock:
+        n, of = list[int](), (self.journey.folder, self.step, self._scan_of(self.step))
+        self.controls.alone(lambda: n.append(self._end()))
+        self.refresh()
+        if any(n):
+            self._run(*of)
+
+    def _end(self) -> int:
+        """End the scan; how many exposures it recorded."""
+        with self._turning("Ending the scan ..."), self._lock:
             try:
-                n = self.scanning.end()
+                return self.scanning.end()
             except OutputError as error:
-                if self.journey.cut_short:
-                    self._recover()
                 raise OutputError(
                     error.what, remedy="free some space, and scan the rest anew"
                 ) from error
-        self.refresh()
-        if n:
-            self.calculate()
+            finally:
+                self._recover()
 
     def calculate(self) -> None:
         """Run this step's job in its process, and show what it says."""
-        step, scan = self.step, self._scan_of(self.step)
-        put(self._bar, 0.0)
-        self._busy(f"{BY_NAME[step].title}: calculating ...")
-        try:
-            self.worker.run(
-                run_step, self.journey.folder, step, scan, self._compare.value,
-                progress=self._tell,
-            )  # fmt: skip
-        finally:
-            self._busy("")
-            self.refresh()
+        self._run(self.journey.folder, self.step, self._scan_of(self.step))
+
+    def _run(self, folder: Path, step: StepName, scan: str) -> None:
+        with self._busy(f"{BY_NAME[step].title}: calculating ..."):
+            self.worker.run(run_step, folder, step, scan, self._compare.value, progress=self._tell)
+        self.refresh()
         self._show_stored()
 
     def _tell(self, event: ProgressEvent) -> None:
@@ -389,12 +393,25 @@ class ConsolePage:
         words = f"{event.stage.capitalize()}: {event.done} of {event.total}"
         self._working.content = padded(paragraph(words, MUTED))
 
-    def _busy(self, words: str, *, can_end: bool = True) -> None:
-        self._working.content = padded(paragraph(words, MUTED))
-        self._working.visible = bool(words)
-        for handle in (self._bar, self._cancel):
-            handle.visible = bool(words) and can_end
-        self._calculate.disabled = bool(words)
+    @contextmanager
+    def _busy(self, words: str, *, can_end: bool = True) -> Iterator[None]:
+        """Say what is under way; what was before it, and still is, is said again afterwards."""
+        work = words, can_end
+        if not self._under_way:
+            put(self._bar, 0.0)
+        self._under_way.append(work)
+        self._show_work()
+        try:
+            yield
+        finally:
+            self._under_way.remove(work)
+            self._show_work()
+
+    def _show_work(self) -> None:
+        works = tuple(self._under_way)
+        self._working.content = padded(paragraph(works[-1][0] if works else "", MUTED))
+        self._working.visible = self._calculate.disabled = bool(works)
+        self._bar.visible = self._cancel.visible = any(can_end for _, can_end in works)
 
     def _open_chosen(self) -> None:
         chosen = self._session_list.value
@@ -408,8 +425,7 @@ class ConsolePage:
             if self._choice.options != titles:
                 self._choice.options = titles
             self.choose(self.journey.next_step())
-            if self.journey.cut_short:
-                self._recover()
+            self._recover()
 
     # what is shown
 

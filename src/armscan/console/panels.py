@@ -88,9 +88,7 @@ class Controls:
         press meanwhile is passed over: one that waited would record the same posture twice.
         """
         if is_alone:
-            return self._kept_out_of(
-                self.button(label, lambda: self.alone(work), key, hint, colour)
-            )
+            return self.kept_out(self.button(label, lambda: self.alone(work), key, hint, colour))
         named = f"{label} ({key})" if key else label
         button = self.gui.add_button(named, hint=hint, color=colour)
         button.on_click(lambda _: self.tried(work))
@@ -116,9 +114,10 @@ class Controls:
 
         button = self.gui.add_button(label, hint=hint, color="gray")
         button.on_click(lambda _: self.tried(ask_first, is_answer=True))
-        return self._kept_out_of(button)
+        return self.kept_out(button)
 
-    def _kept_out_of(self, button: viser.GuiButtonHandle) -> viser.GuiButtonHandle:
+    def kept_out(self, button: viser.GuiButtonHandle) -> viser.GuiButtonHandle:
+        """Disable this one while something that is alone is being done."""
         self._kept_out.append(button)
         return button
 
@@ -128,9 +127,9 @@ class Controls:
             (button, label), self._asked = self._asked, None
             button.label, button.color = label, "gray"
 
-    def alone(self, work: Callable[[], object]) -> None:
-        """Do this unless something else that is alone is being done."""
-        if not self._hand.acquire(blocking=False):
+    def alone(self, work: Callable[[], object], *, waits: bool = False) -> None:
+        """Do this unless something else that is alone is being done, or when that has ended."""
+        if not self._hand.acquire(blocking=waits):
             return
         try:
             for button in self._kept_out:
@@ -386,8 +385,8 @@ class ScanPanel:
         )
         self._undo = button("Undo last pass", self.undo, "U", "Take the last pass out")
         self._clear = button("Clear", self.clear, "C", "Take all passes out of the scan")
-        self._finish = button(
-            "Finish", self._finish_scan, "F", "End the scan and calculate", "teal"
+        self._finish = self._controls.kept_out(
+            button("Finish", self._finish_scan, "F", "End the scan and calculate", "teal")
         )
         self._arm = button("See the arm", self.see_arm, "A", "Turn the view to base and head")
         self._facts = self._controls.gui.add_html("", visible=False)
@@ -535,11 +534,16 @@ class ScanPanel:
             found.points_mm, found.sheet, found.sigma_mm, None, deviation, float(f"{limit:.1g}")
         )
 
+    def _turn(self, live: LiveScan) -> None:
+        """Pause a scan or go on; one that has ended meanwhile does not begin anew."""
+        if self.live is live:
+            self._start()
+
     def _hear(self, live: LiveScan) -> None:
         while live.events:
             event = live.events.popleft()
             if event.kind == "button" and event.text == START_BUTTON:
-                self._controls.tried(lambda: self._controls.alone(self._start))
+                self._controls.tried(lambda: self._controls.alone(lambda: self._turn(live)))
             elif event.kind == "button" and event.text == UNDO_BUTTON:
                 self._controls.tried(self.undo)
             elif event.kind in ("fault", "warning"):

@@ -11,6 +11,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -263,7 +264,7 @@ def run_step(
 def recover_scans(folder: Path, progress: Progress = silent) -> tuple[str, ...]:
     """Make recordings that were cut short whole again, with all exposures that are.
 
-    Nobody may record into the session meanwhile.
+    Nobody may record into the session meanwhile; what takes a file's place all the same stays.
 
     Returns
     -------
@@ -277,19 +278,32 @@ def recover_scans(folder: Path, progress: Progress = silent) -> tuple[str, ...]:
     """
     said = []
     for path in Journey(folder, SessionSettings()).cut_short:
-        whole = path.with_name(f".{path.name}")
+        whole, before = path.with_name(f".{path.name}"), _which(path)
         try:
             found = recover_recording(path, whole, is_overwriting=True)
         except FileFormatError as error:
-            aside = path.with_suffix(".aside")
-            path.replace(aside)
-            said.append(f"{path.stem} was cut short, and {error.what}: it lies in {aside.name}.")
+            if _which(path) == before:
+                aside = path.with_suffix(".aside")
+                path.replace(aside)
+                lies = f"it lies in {aside.name}"
+                said.append(f"{path.stem} was cut short, and {error.what}: {lies}.")
+            continue
+        if _which(path) != before:
+            whole.unlink()
             continue
         whole.replace(path)
         n = next(one.value for one in found.quantities if one.key == "exposures")
         saved = "its one exposure was" if n == 1 else f"its {n} exposures were"
         said.append(f"{path.stem} was cut short: {saved} saved.")
     return tuple(said)
+
+
+def _which(path: Path) -> tuple[int, ...]:
+    """Which file it is and how far it was written; nothing where there is none."""
+    with suppress(OSError):
+        found = path.stat()
+        return found.st_ino, found.st_size, found.st_mtime_ns
+    return ()
 
 
 def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> tuple[bool, str]:

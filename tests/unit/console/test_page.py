@@ -23,6 +23,7 @@ pytest.importorskip("viser")
 from armscan.console.journey import StepName
 from armscan.console.pages import ConsolePage
 from armscan.console.server import close_server, open_server
+from armscan.console.work import Worker
 from armscan.errors import DeviceError
 from armscan.pipeline.live.rig import Rig
 from armscan.storage.arm import PROBE_FILE, ProbeTip, probe_tip_toml, read_probe_tip
@@ -119,9 +120,73 @@ def test_a_press_while_a_scan_begins_does_not_pause_it(
         again.start()
         again.join(10.0)
         assert not again.is_alive()
+        page.choose(StepName.CHECK)
+        assert page.step is StepName.SCAN and "wait for its end" in text_of(page)
         may_go_on.set()
         first.join()
         assert page.live is not None and page.live.snapshot.state == "scanning"
+
+
+def test_nothing_begins_while_a_scan_ends_and_its_step_stays(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    with opened(tmp_path / "s", FailingBench()) as page:
+        page.choose(StepName.CHECK)
+        page.controls.tried(page.start_or_pause)
+        waited(lambda: page.live is not None and page.live.n_recorded > 2)
+        live, ran = page.live, list[tuple[Any, ...]]()
+        ending, may_end, stop = threading.Event(), threading.Event(), live.stop
+
+        def stop_slowly() -> None:
+            ending.set()
+            assert may_end.wait(30.0)
+            stop()
+
+        live.stop, page._run = stop_slowly, lambda *of: ran.append(of)
+        first = threading.Thread(target=pressed, args=(page.scanning._finish,))
+        first.start()
+        assert ending.wait(30.0)
+        assert "Ending the scan" in page._working.content and page._working.visible
+        assert page.scanning.start_button.disabled and page.scanning._finish.disabled
+        again = threading.Thread(target=pressed, args=(page.scanning.start_button,))
+        again.start()
+        again.join(10.0)
+        assert not again.is_alive()
+        page.choose(StepName.SCAN)
+        assert page.step is StepName.CHECK and "wait for its end" in text_of(page)
+        may_end.set()
+        first.join()
+        # and the arm's button, heard late
+        page.scanning._turn(live)
+        assert page.live is None and not page.scanning.start_button.disabled
+        assert ran == [(page.journey.folder, StepName.CHECK, "")]
+        assert len(read_recording(page.journey.recording(StepName.CHECK)).rows) == live.n_recorded
+
+
+def test_nothing_begins_while_a_recording_that_was_cut_short_is_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_scanner(tmp_path / "s")
+    place = tmp_path / "s" / "recordings" / "check.mcap"
+    place.parent.mkdir()
+    place.write_bytes(b"cut")
+    saving, may_end = threading.Event(), threading.Event()
+
+    def save(*_: object, **__: object) -> tuple[str, ...]:
+        saving.set()
+        assert may_end.wait(30.0)
+        place.unlink()
+        return ("It is saved.",)
+
+    monkeypatch.setattr(Worker, "run", save)
+    with opened(tmp_path / "s", FailingBench()) as page:
+        assert saving.wait(30.0)
+        page.choose(StepName.CHECK)
+        pressed(page.scanning.start_button)
+        assert page.live is None and place.read_bytes() == b"cut"
+        may_end.set()
+        waited(lambda: not page.scanning.start_button.disabled)
+        pressed(page.scanning.start_button)
+        assert page.live is not None
 
 
 def test_a_closed_console_ends_its_scan_and_the_next_one_goes_on_there(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from armscan.console.scene import ShownPoints, depths_mm, point_colours, range_b
 from armscan.console.work import recover_scans
 from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import Frame, LaserEvent
-from armscan.errors import InputError, OutputError
+from armscan.errors import FileFormatError, InputError, OutputError
 from armscan.pipeline.live.acquire import WaitingInstant
 from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription
@@ -188,6 +188,28 @@ def test_a_killed_scan_is_saved_when_the_session_is_opened_again(tmp_path: Path)
     assert journey.n_taken(StepName.SCAN, "scan-02") == 10
     assert journey.new_scan() == "scan-04"
     assert (path.parent / "scan-03.aside").read_bytes() == killed[:300]
+
+
+@pytest.mark.parametrize("is_damaged", [False, True])
+def test_what_took_the_place_of_a_recording_that_was_cut_short_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_damaged: bool
+) -> None:
+    place = tmp_path / "recordings" / "check.mcap"
+    place.parent.mkdir()
+    place.write_bytes(b"cut")
+
+    def recover(path: Path, whole: Path, *, is_overwriting: bool) -> None:
+        whole.write_bytes(b"saved")
+        path.unlink()
+        path.write_bytes(b"begun meanwhile")
+        if is_damaged:
+            whole.unlink()
+            raise FileFormatError("nothing can be used")
+
+    monkeypatch.setattr("armscan.console.work.recover_recording", recover)
+    assert recover_scans(tmp_path) == ()
+    assert [one.name for one in place.parent.iterdir()] == ["check.mcap"]
+    assert place.read_bytes() == b"begun meanwhile"
 
 
 def test_devices_are_taken_from_one_placement_at_a_time(tmp_path: Path) -> None:

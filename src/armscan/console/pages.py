@@ -444,7 +444,12 @@ class ConsolePage:
         if self.worker.is_busy or not self._take.visible or not self._lock.acquire(blocking=False):
             return ()
         try:
-            return self.bench.look(self.step, self.journey.n_taken(self.step))
+            seen = self.bench.look(step.name, self.journey.n_taken(step.name))
+            if self._is_viewing:
+                return seen
+            # it was ended meanwhile: what looked has lit the lasers anew
+            self.bench.rest()
+            return ()
         finally:
             self._lock.release()
 

@@ -468,18 +468,22 @@ class DeviceBench:
         grown = GrowingRecording.of(folder, session)
         shots = []
         view = f"{k + 1:02d}"
-        for state, instant in zip(states, self._instants(states, step), strict=True):
-            t_ns = _later(grown, instant)
-            for camera, frame in enumerate(instant.frames):
-                if frame is None:
-                    continue
-                index = 1 + max((row.index for row in grown.rows), default=-1)
-                row = ExposureRow(index, t_ns, camera, f"images/{index:04d}.png", state, None, view)
-                shot = exposure_of(frame, setups[camera], replace(instant, lasers=state), camera)
-                grown.add(row, shot)
-                shots.append(shot)
-            if step is StepName.HAND_EYE:
-                grown.add_sample(t_ns, instant.pose, None)
+        try:
+            for state, instant in zip(states, self._instants(states, step), strict=True):
+                t_ns = _later(grown, instant)
+                for camera, frame in enumerate(instant.frames):
+                    if frame is None:
+                        continue
+                    index = 1 + max((row.index for row in grown.rows), default=-1)
+                    name = f"images/{index:04d}.png"
+                    row = ExposureRow(index, t_ns, camera, name, state, None, view)
+                    lit = replace(instant, lasers=state)
+                    shots.append(exposure_of(frame, setups[camera], lit, camera))
+                    grown.add(row, shots[-1])
+                if step is StepName.HAND_EYE:
+                    grown.add_sample(t_ns, instant.pose, None)
+        finally:
+            self._light(())
         grown.flush()
         return _one_a_camera(shots)
 
@@ -572,6 +576,8 @@ class DeviceBench:
     def _light(self, lasers: tuple[str, ...]) -> None:
         """Have these lasers on from now."""
         if self.rig.lasers is not None and self._lit != lasers:
+            # one that does not answer may have done it all the same
+            self._lit = None
             self.rig.lasers.set_next(lasers)
             self._lit = lasers
 
@@ -592,7 +598,6 @@ class DeviceBench:
                     )
                 time.sleep(0.01)
             yield one
-        self._light(())
 
     def _complete(
         self, latest: _Latest, state: tuple[str, ...], step: StepName

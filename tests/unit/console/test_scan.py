@@ -36,7 +36,7 @@ from armscan.console.scene import ShownPoints, depths_mm, point_colours, range_b
 from armscan.console.work import recover_scans
 from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import Frame, LaserEvent
-from armscan.errors import FileFormatError, InputError, OutputError
+from armscan.errors import DeviceError, FileFormatError, InputError, OutputError
 from armscan.pipeline.live.acquire import WaitingInstant
 from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription
@@ -270,7 +270,26 @@ def test_lasers_are_on_only_where_the_step_needs_them_and_off_afterwards() -> No
     for step in (StepName.CAMERA, StepName.CAMERA, StepName.HAND_EYE):
         bench.look(step, 0)
     bench.rest()
-    assert lasers.asked == ["start", (), "off", "start", ("A",), "off"]
+    off = ["off"] * 2  # before what is waited for, and with the rest
+    assert lasers.asked == ["start", (), *off, "start", ("A",), *off]
+    bench.close()
+
+
+def test_lasers_go_off_where_a_take_fails_and_before_a_camera_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand, lasers = _Hand(drawn_scan(40), rate_hz=50.0), TellingLasers()
+    description = RigDescription(("d",), is_common_trigger=True)
+    rig = Rig([_HandCamera(hand, 0)], _HandArm(hand), lasers, description)
+    bench = DeviceBench(rig, "rig.toml")
+    monkeypatch.setattr("armscan.console.rig.WAIT_S", 0.05)
+    with pytest.raises(DeviceError, match="no complete image"):
+        bench.take(StepName.HAND_EYE, tmp_path / "r", 0)
+    assert lasers.asked == ["start", ("A",), ()]
+    for control in bench._watched[0]._controls:
+        control.stop = lambda: lasers.asked.append("waited")
+    bench.rest()
+    assert lasers.asked[3:] == ["off", "waited", "off"]
     bench.close()
 
 

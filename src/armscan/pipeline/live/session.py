@@ -410,6 +410,8 @@ class LiveSession:
         """Lasers off; what arrived is recorded and measured to its end."""
         if self._state in ("closed", "stopped"):
             return
+        # a control waits for its camera, which may be unplugged
+        self._rig.darken()
         for control in self._controls:
             control.stop()
         self._acquisition.stop()

@@ -332,11 +332,11 @@ class Journey:
     def recording(self, step: StepName, scan: str = "") -> Path:
         """What a step fills, of a scan by its name: a folder, or one file while the hand moves.
 
-        A folder that is there, of an earlier console or put there, is read all the same.
+        Where there is no file, a folder of an earlier console or put there is read all the same.
         """
-        place = self.folder / RECORDINGS / (scan or step.value)
+        place, file = self.folder / RECORDINGS / (scan or step.value), self.new_file(step, scan)
         is_one_file = BY_NAME[step].filling == "motion" or step in OF_A_SCAN
-        return self.new_file(step, scan) if is_one_file and not place.is_dir() else place
+        return file if is_one_file and (file.is_file() or not place.is_dir()) else place
 
     def new_file(self, step: StepName, scan: str = "") -> Path:
         """Where a recording is written while the hand moves."""

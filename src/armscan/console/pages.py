@@ -354,7 +354,7 @@ class ConsolePage:
             if step is StepName.SCAN and part:
                 model = ModelWatch(self.worker, journey.folder / part)
             live = LiveScan(self._bench(), step, journey.new_file(step, scan), scanner, seeing)
-            live.open(lambda: None if scan else journey.start_over(step))
+            live.open()
             self.scanning.begin(live, scanner, model)
             self.scan = scan or self.scan
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -18,6 +18,7 @@ import numpy as np
 from armscan.console.journey import SeeingSettings, SessionSettings, StepName
 from armscan.console.quality import Incidence, passes_apart_mm
 from armscan.devices.matching import MatchedInstant, TimedSample, arm_track
+from armscan.errors import DeviceError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.arm import axis_frames
@@ -33,7 +34,14 @@ from armscan.pipeline.live.session import (
 from armscan.records.exposure import Exposure
 from armscan.records.recording import NO_TRIGGER, ArmTrack, ExposureRow, Session
 from armscan.storage.arm import ARM_FILE, arm_columns
-from armscan.storage.files import make_folder, write_files
+from armscan.storage.files import (
+    SetAside,
+    bring_back,
+    make_folder,
+    set_aside,
+    settle_aside,
+    write_files,
+)
 from armscan.storage.recording import encoded_png, read_recording
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
@@ -287,6 +295,7 @@ class LiveScan:
         self._scanner = scanner
         self._incidence = Incidence()
         self._drift: tuple[int, float | None] = -1, None
+        self._before: SetAside | None = None
         self.session = LiveSession(
             self.rig,
             scanner,
@@ -295,13 +304,10 @@ class LiveScan:
         )
         self.session.add_listener(self._hear)
 
-    def open(self, make_room: Callable[[], object] = lambda: None) -> None:
+    def open(self) -> None:
         """Start the devices, and make the file; nothing is recorded yet.
 
-        Parameters
-        ----------
-        make_room
-            Removes what lay at its place, once the devices answer.
+        What lay at its place is set aside until `stop`: it comes back where no image came.
 
         Raises
         ------
@@ -311,11 +317,13 @@ class LiveScan:
         self.session.open()
         try:
             self._wait_for_clocks()
-            make_room()
             make_folder(self.path.parent, with_parents=True)
+            settle_aside(self.path)
+            self._before = set_aside(self.path, is_overwriting=True)
             self.recorder.begin()
         except BaseException:
             self.session.stop()
+            self._settle()
             raise
         self.session.add_listener(self.recorder.hear)
 
@@ -357,10 +365,26 @@ class LiveScan:
         ------
         OutputError
             If the disk was full or refused; says how much is safe. All else has ended then.
+        DeviceError
+            If no image came.
         """
         self.bench.hold(True)
         self.session.stop()
-        self.recorder.finish()
+        try:
+            self.recorder.finish()
+        finally:
+            self._settle()
+        if not self.recorder.n_exposures:
+            raise DeviceError(
+                "no image came", remedy="check camera and trigger; what was there before stays"
+            )
+
+    def _settle(self) -> None:
+        before, self._before = self._before, None
+        if before is not None and self.path.exists():
+            before.remove()
+        elif before is not None:
+            bring_back(before, self.path)
 
     @property
     def snapshot(self) -> LiveSnapshot:

@@ -57,7 +57,7 @@ from armscan.report.page import Block, Facts, Links, Page, Section, footer, rend
 from armscan.report.quantity import Summary, fact, sentence
 from armscan.storage.arm import ARM_FILE
 from armscan.storage.documents import new_provenance
-from armscan.storage.files import is_file, write_files
+from armscan.storage.files import is_file, settle_aside, write_files
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE
@@ -269,7 +269,8 @@ def recover_scans(folder: Path, progress: Progress = silent) -> tuple[str, ...]:
     Returns
     -------
     told
-        A sentence for each; one of which nothing can be used is laid aside as ``NAME.aside``.
+        A sentence for each; one of which nothing can be used is laid aside as ``NAME.aside``, and
+        the one that it was to replace is there again.
 
     Raises
     ------
@@ -287,11 +288,13 @@ def recover_scans(folder: Path, progress: Progress = silent) -> tuple[str, ...]:
                 path.replace(aside)
                 lies = f"it lies in {aside.name}"
                 said.append(f"{path.stem} was cut short, and {error.what}: {lies}.")
+                settle_aside(path)
             continue
         if _which(path) != before:
             whole.unlink()
             continue
         whole.replace(path)
+        settle_aside(path)
         n = next(one.value for one in found.quantities if one.key == "exposures")
         saved = "its one exposure was" if n == 1 else f"its {n} exposures were"
         said.append(f"{path.stem} was cut short: {saved} saved.")

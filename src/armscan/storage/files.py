@@ -278,6 +278,15 @@ def bring_back(aside: SetAside, path: Path) -> None:
         _rename(aside.path, path)
 
 
+def settle_aside(path: Path) -> None:
+    """End what a killed run left of `set_aside`: its file goes, or takes a name that is free."""
+    with _refusing("the file cannot be replaced", path):
+        if path.exists():
+            _aside(path).unlink(missing_ok=True)
+        elif _aside(path).exists():
+            _rename(_aside(path), path)
+
+
 def _rename(path: Path, free: Path) -> None:
     """Give a name that nothing has; raise `FileExistsError` where something does."""
     _give_name(path, free, is_overwriting=False)

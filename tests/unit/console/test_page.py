@@ -23,7 +23,7 @@ pytest.importorskip("viser")
 from armscan.console.journey import StepName
 from armscan.console.pages import ConsolePage
 from armscan.console.server import close_server, open_server
-from armscan.console.work import Worker
+from armscan.console.work import Worker, recover_scans
 from armscan.errors import DeviceError
 from armscan.pipeline.live.rig import Rig
 from armscan.storage.arm import PROBE_FILE, ProbeTip, probe_tip_toml, read_probe_tip
@@ -341,6 +341,27 @@ def test_a_press_while_one_is_taken_takes_nothing(
         assert not page._take.disabled
 
 
+def test_a_look_that_lasts_until_the_view_was_ended_lights_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_scanner(tmp_path / "s")
+    bench, done = FailingBench(), list[str]()
+    with opened(tmp_path / "s", bench) as page:
+        page.choose(StepName.CAMERA)
+        page.scanning._closing.set()
+        page.scanning._thread.join()
+        monkeypatch.setattr(bench, "rest", lambda: done.append("rest"))
+
+        def look(*_: object) -> tuple[str, ...]:
+            page.view()
+            done.append("lit")
+            return ("image",)
+
+        monkeypatch.setattr(bench, "look", look)
+        page.view()
+        assert page._look() == () and done == ["rest", "lit", "rest"]
+
+
 def test_what_was_taken_stays_where_a_new_take_does_not_begin(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -359,3 +380,31 @@ def test_what_was_taken_stays_where_a_new_take_does_not_begin(
         page.controls.tried(page.start_or_pause)
         assert "does not answer" in text_of(page) and page.live is None
         assert place.read_bytes() == before
+
+
+def test_what_was_taken_stays_until_an_image_came(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    bench = FailingBench()
+    with opened(tmp_path / "s", bench) as page:
+        page.choose(StepName.CHECK)
+        page._run = lambda *_: None
+        place = page.journey.recording(StepName.CHECK)
+        place.parent.mkdir()
+        place.write_bytes(b"before")
+        bench.cameras[0].is_gone = True
+        page.controls.tried(page.start_or_pause)
+        assert not place.read_bytes().startswith(b"before")
+        page.controls.tried(page.finish)
+        assert "no image came" in text_of(page)
+        assert place.read_bytes() == b"before"
+        bench.cameras[0].is_gone = False
+        page.controls.tried(page.start_or_pause)
+        waited(lambda: page.live.n_recorded > 0)
+        page.controls.tried(page.finish)
+        assert read_recording(place).rows
+        assert [one.name for one in place.parent.iterdir()] == ["check.mcap"]
+        # of a console that was killed before its first image
+        aside = place.rename(place.with_name(".check.mcap.before"))
+        place.write_bytes(b"cut")
+        page._said = recover_scans(page.journey.folder)
+        assert not aside.exists() and read_recording(place).rows

@@ -26,6 +26,7 @@ from armscan.pipeline.live.session import LiveOptions
 from armscan.pipeline.measure import MeasureOptions
 from armscan.storage.arm import ARM_FILE
 from armscan.storage.codec import MismatchError, RecordCodec, parse_toml, toml_bytes
+from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.files import files_in, is_file, make_folder, path_text, read_bytes, write_files
 from armscan.storage.recording_session import EXPOSURES_FILE, exposure_rows
 from armscan.storage.tables import read_csv
@@ -38,6 +39,7 @@ except ImportError:  # pragma: no cover - Windows has none
 
 SETTINGS_FILE, LOCK_FILE, REPORT_FILE = "console.toml", ".console.lock", "report.html"
 RECORDINGS, RESULTS = "recordings", "results"
+TIMED_FILE = "scanner-timed.json"
 MOVED = ".mcap"
 """Of a recording that was taken while the hand moved."""
 
@@ -387,9 +389,14 @@ class Journey:
 
     @property
     def scanner_file(self) -> Path:
-        """The calibrated scanner: with latency where that was found."""
-        timed = self.folder / "scanner-timed.json"
-        return timed if timed.is_file() else self.folder / "scanner.json"
+        """The calibrated scanner: with latency where that is needed and was found for this one."""
+        timed, plain = self.folder / TIMED_FILE, self.folder / "scanner.json"
+        if self.settings.needs_latency and timed.is_file():
+            with suppress(ArmscanError):
+                inputs = read_scanner_calibration(timed).provenance.inputs
+                if digest_of(plain) in [one.sha256 for one in inputs]:
+                    return timed
+        return plain
 
     def cloud_file(self, scan: str) -> Path:
         """Points of a scan."""
@@ -492,16 +499,20 @@ class Journey:
             StepName.LASER: self.folder / "sensor.json",
             StepName.PROBING: self.folder / "plate.csv",
             StepName.HAND_EYE: self.folder / "scanner.json",
-            StepName.LATENCY: self.folder / "scanner-timed.json",
+            StepName.LATENCY: self.folder / TIMED_FILE,
         }
         return names[step]
 
     def _changed(self, result: StepResult) -> str:
         """The first input that is not what the result rests on, in words; empty if none is."""
         for name, digest in (result.rests_on or {}).items():
-            if digest_of(self.folder / name) != digest:
+            if self.digest(name) != digest:
                 return self._words(name)
         return ""
+
+    def digest(self, name: str) -> str:
+        """SHA-256 of what a result rests on, by its name, as it is now."""
+        return digest_of(self.scanner_file if name == TIMED_FILE else self.folder / name)
 
     def _words(self, name: str) -> str:
         """A file of the session as the person knows it."""

@@ -28,6 +28,7 @@ from armscan.console.journey import (
     RESULTS,
     SETTINGS_FILE,
     STEPS,
+    TIMED_FILE,
     WORDS,
     Journey,
     SessionSettings,
@@ -424,7 +425,7 @@ def _work(journey: Journey, step: StepName, scan: str, compare: str, progress: P
         StepName.PROBING: lambda: probe(job("plate.csv"), place),
         StepName.HAND_EYE: hand_eye,
         StepName.LATENCY: lambda: calibrate_latency(
-            job("scanner-timed.json"), place, folder / "scanner.json"
+            job(TIMED_FILE), place, folder / "scanner.json"
         ),
         StepName.CHECK: lambda: verify(
             job("check.html"), place, journey.scanner_file, Standard(ball_mm=settings.ball_mm)

@@ -37,11 +37,14 @@ from armscan.errors import (
 )
 from armscan.geometry.poses import Pose
 from armscan.jobs.probe import probe
+from armscan.models.calibration import InputFile
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from armscan.report.quantity import Summary
 from armscan.storage.arm import ProbeTip, write_probing
+from armscan.storage.documents import scanner_document
 from armscan.storage.recording import read_arm_track, read_recording
+from rigs.scan_fake import scanner
 
 SETTINGS = SessionSettings(rig="twin:thesis-single?seed=1", target="chessboard:9x6:10", ball_mm=30)
 
@@ -226,6 +229,28 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) ->
     with held_session(tmp_path / "new"):
         pass
     assert not (tmp_path / "new").exists(), "nothing became of it"
+
+
+def test_a_latency_counts_for_the_hand_eye_that_it_was_found_with(tmp_path: Path) -> None:
+    journey = open_journey(tmp_path / "s", replace(SETTINGS, needs_latency=True))
+    plain, timed = journey.folder / "scanner.json", journey.folder / "scanner-timed.json"
+    plain.write_bytes(scanner_document(scanner()))
+    made = replace(scanner().provenance, inputs=(InputFile("scanner.json", digest_of(plain)),))
+    timed.write_bytes(scanner_document(replace(scanner(), provenance=made)))
+    assert journey.scanner_file == timed
+    of_check = journey.folder / "results" / "check.json"
+    of_check.parent.mkdir()
+    rests_on = {timed.name: digest_of(timed)}
+    of_check.write_text(json.dumps({"verdict": "good", "rests_on": rests_on}))
+    assert journey.state(StepName.CHECK).status == "good"
+    open_journey(journey.folder, SETTINGS)
+    assert open_journey(journey.folder).scanner_file == plain, "one trigger leaves no latency"
+    # a new hand-eye
+    plain.write_bytes(plain.read_bytes() + b"\n")
+    assert journey.scanner_file == plain
+    state = journey.state(StepName.CHECK)
+    why = "the result of 'Latency' has changed since: calculate again"
+    assert (state.status, state.why) == ("old", why)
 
 
 def test_a_damaged_result_counts_as_none(tmp_path: Path) -> None:

@@ -279,6 +279,8 @@ class ConsolePage:
 
     def take(self, step: StepName | None = None) -> None:
         """Record the placement or touch that is drawn, of the step that is shown or another."""
+        if self.worker.is_busy:
+            raise ArmscanError("other work is under way", remedy="wait for it or cancel it")
         with self._lock:
             bench, step = self._bench(), step or self.step
             k, place = self.journey.n_taken(step), self.journey.recording(step)
@@ -410,7 +412,8 @@ class ConsolePage:
     def _show_work(self) -> None:
         works = tuple(self._under_way)
         self._working.content = padded(paragraph(works[-1][0] if works else "", MUTED))
-        self._working.visible = self._calculate.disabled = bool(works)
+        self._working.visible = bool(works)
+        self._calculate.disabled = self._take.disabled = bool(works)
         self._bar.visible = self._cancel.visible = any(can_end for _, can_end in works)
 
     def _open_chosen(self) -> None:

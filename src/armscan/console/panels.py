@@ -430,6 +430,8 @@ class ScanPanel:
         finally:
             self.show_images(())
             self._points.view.show_head(None, None)
+            if self._model is not None:
+                self._model.end()
         return live.n_recorded
 
     def undo(self) -> None:

@@ -230,6 +230,7 @@ class ModelWatch:
         self.problem = ""
         self._worker, self._part = worker, part
         self._thread: threading.Thread | None = None
+        self._lock, self._is_over = threading.Lock(), False
         self._pose: Pose[Cad, Part] | None = None
         self._n_laid = 0
         nothing = np.zeros(0, dtype=np.int64)
@@ -238,11 +239,19 @@ class ModelWatch:
 
     def latest(self, cloud: ShownCloud) -> tuple[ShownCloud, FloatArray]:
         """What was compared last, and its (N,) deviations; asks for those of a newer cloud."""
-        is_free = self._thread is None or not self._thread.is_alive()
-        if is_free and len(cloud.points_mm) != len(self._found[1]):
-            self._thread = threading.Thread(target=self._ask, args=(cloud,), daemon=True)
-            self._thread.start()
+        with self._lock:
+            is_free = self._thread is None or not self._thread.is_alive()
+            if is_free and not self._is_over and len(cloud.points_mm) != len(self._found[1]):
+                self._thread = threading.Thread(target=self._ask, args=(cloud,), daemon=True)
+                self._thread.start()
         return self._found
+
+    def end(self) -> None:
+        """Wait for what is being compared, and compare no more: the worker is free then."""
+        with self._lock:
+            self._is_over = True
+        if self._thread is not None:
+            self._thread.join()
 
     def _ask(self, cloud: ShownCloud) -> None:
         n = len(cloud.points_mm)

@@ -314,6 +314,20 @@ def test_start_over_asks_what_it_would_remove(tmp_path: Path) -> None:
         assert page._start_over.label == "Start over"
 
 
+def test_a_refused_press_hides_nothing_of_what_runs(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    with opened(tmp_path / "s", FailingBench()) as page:
+        page.choose(StepName.CAMERA)
+        with page._busy("Camera: calculating ..."), page.worker._lock:
+            assert page._take.disabled
+            page.controls.tried(page.take_one)
+            page.controls.tried(page.calculate)
+            assert "other work is under way" in text_of(page)
+            assert page._cancel.visible and "Camera: calculating" in page._working.content
+            assert page.journey.n_taken(StepName.CAMERA) == 0
+        assert not page._cancel.visible and not page._working.visible and not page._take.disabled
+
+
 def test_a_press_while_one_is_taken_takes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from armscan.console.quality import Incidence, coverage, deviations_mm, passes_apart_mm
+from armscan.console.quality import (
+    Incidence,
+    ModelWatch,
+    coverage,
+    deviations_mm,
+    passes_apart_mm,
+)
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray
 from armscan.pipeline.live.session import ShownCloud
@@ -122,6 +129,33 @@ def test_a_growing_cloud_shows_its_deviations_from_the_model(tmp_path: Path) -> 
     assert np.median(high[3000:]) == pytest.approx(0.0, abs=0.01)
     _, far = deviations_mm(part, seen_block(30.0), pose)
     assert np.isnan(far[:3000]).mean() > 0.9, "what lies beside the part has no deviation"
+
+
+class SlowWorker:
+    """Does not answer until it is told to."""
+
+    def __init__(self) -> None:
+        self.n_asked, self.may_end = 0, threading.Event()
+
+    def run(self, *_: object) -> tuple[None, FloatArray]:
+        self.n_asked += 1
+        assert self.may_end.wait(30.0)
+        return None, np.zeros(0)
+
+
+def test_a_watch_that_has_ended_keeps_the_worker_from_nobody() -> None:
+    worker, cloud = SlowWorker(), lines(0.0)
+    watch = ModelWatch(worker, Path("part.stl"))  # type: ignore[arg-type]
+    watch.latest(cloud)
+    ending = threading.Thread(target=watch.end)
+    ending.start()
+    ending.join(0.1)
+    assert ending.is_alive(), "the worker is not free yet"
+    worker.may_end.set()
+    ending.join(30.0)
+    assert not ending.is_alive()
+    watch.latest(cloud)
+    assert worker.n_asked == 1
 
 
 def test_a_cloud_of_something_else_is_refused(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import RigDescription
 from armscan.pipeline.live.session import LiveOptions
 from armscan.pipeline.measure import MeasureOptions
+from armscan.report.quantity import plural
 from armscan.storage.arm import ARM_FILE
 from armscan.storage.codec import MismatchError, RecordCodec, parse_toml, toml_bytes
 from armscan.storage.documents import read_scanner_calibration
@@ -559,6 +560,8 @@ def open_journey(folder: Path, settings: SessionSettings | None = None) -> Journ
         If it holds other files than a session's, or cannot be written.
     FileFormatError
         If its settings are damaged.
+    OptionError
+        If the rig has not as many cameras as were calibrated.
     """
     path = folder / SETTINGS_FILE
     if path.is_file():
@@ -566,7 +569,19 @@ def open_journey(folder: Path, settings: SessionSettings | None = None) -> Journ
         if settings is not None:
             told = {key: getattr(settings, key) for key in settings.__slots__}
             known = {key: value for key in told if (value := getattr(journey.settings, key))}
-            of_rig = {"rig": settings.rig, "needs_latency": settings.needs_latency}
+            of_rig: dict[str, Any] = {
+                "rig": settings.rig,
+                "needs_latency": settings.needs_latency,
+                "n_cameras": settings.n_cameras,
+            }
+            n_known = journey.settings.n_cameras
+            if n_known != settings.n_cameras and journey.camera_file.is_file():
+                raise OptionError(
+                    f"the session is of {plural(n_known, 'camera')}, the rig has "
+                    f"{settings.n_cameras}",
+                    where=path_text(folder),
+                    remedy="name another folder, or the rig that was calibrated in this one",
+                )
             journey.change(**{**told, **known, **of_rig})
         return journey
     _check_own(folder)

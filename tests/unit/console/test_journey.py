@@ -212,6 +212,17 @@ def test_settings_stay_and_a_rig_tells_what_they_lack(tmp_path: Path) -> None:
     assert StepName.LATENCY in [step.name for step in journey.steps]
 
 
+def test_a_rig_tells_how_many_cameras_until_they_are_calibrated(tmp_path: Path) -> None:
+    folder = tmp_path / "s"
+    open_journey(folder)
+    journey = open_journey(folder, replace(SETTINGS, n_cameras=2))
+    assert journey.settings.n_cameras == 2 and journey.camera_file.name == "stereo.json"
+    journey.camera_file.write_text("{}")
+    with pytest.raises(OptionError, match="of 2 cameras, the rig has 1"):
+        open_journey(folder, SETTINGS)
+    assert open_journey(folder).settings == journey.settings
+
+
 @pytest.mark.parametrize("content", ["", "ball_mm = [", 'ball_mm = "large"', "ball_mm = nan\n["])
 def test_damaged_settings_are_one_sentence(tmp_path: Path, content: str) -> None:
     (tmp_path / SETTINGS_FILE).write_text(content)

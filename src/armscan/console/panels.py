@@ -373,6 +373,8 @@ class ScanPanel:
         self._controls, self._points, self._finish_scan = controls, points, finish
         self._scanner: ScannerCalibration | None = None
         self._version, self._drawn_at = -1, 0.0
+        self._unseen = ""
+        """What kept the cameras' images from being shown last."""
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._keep_fresh, daemon=True)
 
@@ -489,7 +491,12 @@ class ScanPanel:
                     self._show(live)
                 elif seen := self._look():
                     self.show_images(seen)
+                    if self._unseen and self._unseen == self._controls.problem:
+                        self._tell("")
             except Exception as error:  # the page goes on showing what it can
+                if self.live is None:
+                    self._unseen = told(error)
+                    self.show_images(())
                 self._tell(told(error))
 
     def _tell(self, problem: str) -> None:

@@ -41,6 +41,7 @@ from armscan.pipeline.live.session import LiveOptions, LiveSession
 from armscan.pipeline.simulate import TwinName, fewer_views
 from armscan.records.exposure import Exposure
 from armscan.records.recording import NO_TRIGGER, CameraSetup, ExposureRow, PoseForm, Session
+from armscan.report.quantity import sentence
 from armscan.storage.arm import (
     ARM_FILE,
     PROBE_FILE,
@@ -58,6 +59,8 @@ from armscan.storage.tables import csv_bytes
 TWIN = "twin:"
 WAIT_S = 5.0
 """A take waits so long for an image and a pose."""
+SHOWN_NS = 2_000_000_000
+"""An image that is older is not what a camera sees now."""
 
 
 SHOWN_SCENES: dict[StepName, TwinScene] = {
@@ -508,15 +511,17 @@ class DeviceBench:
                        is_simulated=self.is_simulated)  # fmt: skip
 
     def look(self, step: StepName, k: int) -> tuple[Exposure, ...]:
-        """As of `Bench`: the latest images."""
+        """As of `Bench`: the latest images; raises while a device does not answer."""
         latest = self._watch(step)
+        if self._watched is not None and (faults := self._watched[0].snapshot().faults):
+            raise DeviceError(" ".join(sentence(fault) for fault in faults))
         self._light(() if step is StepName.CAMERA else self._sources)
-        instants = tuple(latest.instants)
+        since_ns = time.monotonic_ns() - SHOWN_NS
         found = {
             camera: (frame, one)
-            for one in instants
+            for one in tuple(latest.instants)
             for camera, frame in enumerate(one.frames)
-            if frame is not None
+            if frame is not None and frame.t_host_ns > since_ns
         }
         return tuple(
             exposure_of(frame, self.rig.cameras[camera].setup, one, camera)

@@ -355,6 +355,25 @@ def test_a_press_while_one_is_taken_takes_nothing(
         assert not page._take.disabled
 
 
+def test_a_camera_that_is_gone_is_named_and_not_shown_while_it_is_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_scanner(tmp_path / "s")
+    bench = FailingBench()
+    with opened(tmp_path / "s", bench) as page:
+        page.choose(StepName.CAMERA)
+        page.view()
+        waited(lambda: page.scanning._window.visible)
+        bench.cameras[0].is_gone = True
+        waited(lambda: "it was unplugged" in text_of(page))
+        waited(lambda: not page.scanning._window.visible)
+        bench.cameras[0].is_gone = False
+        waited(lambda: page.scanning._window.visible and "unplugged" not in text_of(page))
+        # and what is old is not shown, whatever its device says
+        monkeypatch.setattr("armscan.console.rig.SHOWN_NS", 0)
+        assert bench.look(StepName.CAMERA, 0) == ()
+
+
 def test_a_look_that_lasts_until_the_view_was_ended_lights_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

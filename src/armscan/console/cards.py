@@ -54,7 +54,7 @@ def live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) ->
     drift = live.drift_mm()
     late = "" if shown.latency_ms is None else f", shown after {shown.latency_ms[0]:.0f} ms"
     lines = [
-        f"{live.n_recorded} exposures recorded, {shown.rate_hz:.2g} a second{late}",
+        f"{live.n_recorded} exposures recorded, {shown.rate_hz:.1f} a second{late}",
         f"passes: {shown.n_passes}, points: {shown.n_points:,}",
         "passes do not meet yet"
         if drift is None
@@ -76,7 +76,8 @@ def live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) ->
     lines += [", ".join(lost)] if lost else []
     if live.bench.is_over:
         lines.append("the simulated hand has come to its end: finish")
-    alerts = [model.problem] if model is not None and model.problem else []
+    alerts = ["Paused: nothing is recorded."] if shown.state == "paused" else []
+    alerts += [model.problem] if model is not None and model.problem else []
     if shown.state == "scanning" and is_device:
         alerts += [
             f"{sentence(fault)} The scan goes on by itself when it answers again."

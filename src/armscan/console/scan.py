@@ -430,5 +430,8 @@ class LiveScan:
         is_of_device = bool(event.device) and event.device not in OWN_PARTS
         # what does not answer is told while it lasts, and a simulated hand waits for its images
         is_told = is_of_device and (event.kind != "warning" or self.bench.has_operator)
-        if event.kind == "button" or not is_told:
+        if event.kind == "button":
+            # one that was pressed while the devices start would pause what has just begun
+            is_told = self.snapshot.state not in ("scanning", "paused")
+        if not is_told:
             self.events.append(event)

@@ -19,6 +19,7 @@ import pytest
 pytest.importorskip("viser")
 
 import armscan.console.journey as journey_module
+from armscan.console.cards import live_facts
 from armscan.console.journey import SeeingSettings, SessionSettings, StepName
 from armscan.console.placements import (
     CAMERA,
@@ -37,7 +38,7 @@ from armscan.console.work import recover_scans
 from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import Frame, LaserEvent
 from armscan.errors import DeviceError, FileFormatError, InputError, OutputError
-from armscan.pipeline.live.acquire import WaitingInstant
+from armscan.pipeline.live.acquire import LiveEvent, WaitingInstant
 from armscan.pipeline.live.exposure import ExposureSettings
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.measure import MeasuredInstant
@@ -144,6 +145,28 @@ def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> list[int]:
 
     monkeypatch.setattr(mcap_file, "_write_some", some)
     return left
+
+
+def test_an_arms_button_counts_from_the_begin_on(tmp_path: Path) -> None:
+    live = LiveScan(FailingBench(), StepName.SCAN, tmp_path / "scan-01.mcap", scanner())
+    button = LiveEvent("button", "0", "arm")
+    live.session._tell(button)
+    live.open()
+    live.session._tell(button)
+    live.start()
+    assert button not in live.events
+    live.session._tell(button)
+    assert live.events.count(button) == 1
+    live.pause()
+    assert "Paused: nothing is recorded." in live_facts(live, live.snapshot, None)
+    fast = replace(live.snapshot, rate_hz=119.8)
+    assert "119.8 a second" in live_facts(live, fast, None)
+    # what came a minute ago is neither the rate nor the distance of now
+    minute_ago_ns = time.monotonic_ns() - 60 * 10**9
+    live.session._arrivals.extend(minute_ago_ns + 10**7 * k for k in range(500))
+    live.session._range_mm, live.session._ranged_ns = 130.0, minute_ago_ns
+    assert live.snapshot.rate_hz < 10.0 and live.snapshot.range_mm is None
+    live.session.stop()
 
 
 def test_a_disk_that_is_full_is_told_and_what_was_written_is_read(

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
@@ -147,7 +147,7 @@ class LiveSnapshot:
     base_from_tool
         The latest pose; None where it is not known.
     range_mm
-        Median depth in Sensor of the latest points; None where nothing was measured.
+        Median depth in Sensor of the latest points; None where none was placed for a second.
     n_passes, n_points
         Passes and shown points.
     cloud_version
@@ -274,7 +274,7 @@ class LiveSession:
         self._latest: Pose[Base, Tool] | None = None
         self._moved_ns = 0
         self._last_moved: Pose[Base, Tool] | None = None
-        self._range_mm: float | None = None
+        self._range_mm, self._ranged_ns = cast(float | None, None), 0
         self._arrivals: deque[int] = deque(maxlen=LATENCIES)
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
         self._next_pass: int | None = 0
@@ -443,12 +443,15 @@ class LiveSession:
         with self._lock:
             views = tuple(self._view(k) for k in sorted(self._frames))
             times, late = list(self._arrivals), list(self._latencies)
-            span = (times[-1] - times[0]) * 1e-9 if len(times) > 1 else 0.0
+            now_ns = time.monotonic_ns()
+            # to now: what came before a camera fell silent is no rate of it any more
+            span = (now_ns - times[0]) * 1e-9 if len(times) > 1 else 0.0
+            is_near = now_ns - self._ranged_ns < NEWER_NS
             return LiveSnapshot(
                 state=self._state,
                 cameras=views,
                 base_from_tool=self._latest,
-                range_mm=self._range_mm,
+                range_mm=self._range_mm if is_near else None,
                 n_passes=len(self._passes),
                 n_points=sum(len(one.voxels) for one in self._passes),
                 cloud_version=self._version,
@@ -671,6 +674,7 @@ class LiveSession:
                     self._measured[camera] = frame.t_host_ns, view
             depth = np.concatenate(depths)
             self._range_mm = float(np.median(depth)) if len(depth) else None
+            self._ranged_ns = time.monotonic_ns()
             self._counts[LiveStatus.PLACED] += 1
             self._version += 1
             taken_ns = instant.t_ns or max(one.t_host_ns for one in instant.frames if one)

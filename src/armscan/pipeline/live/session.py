@@ -446,12 +446,11 @@ class LiveSession:
             now_ns = time.monotonic_ns()
             # to now: what came before a camera fell silent is no rate of it any more
             span = (now_ns - times[0]) * 1e-9 if len(times) > 1 else 0.0
-            is_near = now_ns - self._ranged_ns < NEWER_NS
             return LiveSnapshot(
                 state=self._state,
                 cameras=views,
                 base_from_tool=self._latest,
-                range_mm=self._range_mm if is_near else None,
+                range_mm=self._range_mm if now_ns - self._ranged_ns < NEWER_NS else None,
                 n_passes=len(self._passes),
                 n_points=sum(len(one.voxels) for one in self._passes),
                 cloud_version=self._version,
@@ -579,6 +578,8 @@ class LiveSession:
         if last is not None and _is_still(last, pose):
             if self._next_pass is None and t_ns - self._moved_ns > STOP_NS:
                 self._next_pass = number
+            if time.monotonic_ns() - self._ranged_ns < NEWER_NS:
+                self._ranged_ns = time.monotonic_ns()
             return LiveStatus.STILL
         self._last_moved, self._moved_ns = pose, t_ns
         return LiveStatus.NOT_SHOWN if number % self.options.measured_every else None

@@ -516,7 +516,8 @@ class ConsolePage:
             (self._tolerance, now.tolerance),
         )
         for field, value in known:
-            if field.value != value:
+            typed = field.value.strip() if isinstance(field.value, str) else field.value
+            if typed != value:
                 put(field, value)
         self._target.visible = self.step in (StepName.CAMERA, StepName.LASER)
         self.tip.show(is_visible=self._needs_tip())

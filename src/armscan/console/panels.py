@@ -199,6 +199,8 @@ class SeeingPanel:
 
     def __init__(self, controls: Controls, keep: Callable[[SeeingSettings | None], object]) -> None:
         self._controls, self._keep = controls, keep
+        self._shown: SeeingSettings | None = None
+        self._before = SeeingSettings()
 
     def build(self, *, has_exposure: bool) -> None:
         """Add it to the column; a rendered camera has no exposure to set."""
@@ -239,12 +241,18 @@ class SeeingPanel:
             self._every = gui.add_number("Measure every", 1, min=1, step=1, hint="Exposure, live")
             self._controls.button("Use these", lambda: self._keep(self._read()), "", "From now on")
             self._controls.button(
-                "As the rig says", lambda: self._keep(None), "", "What rig.toml says, or the twin"
+                "As the rig says", self._forget, "", "What rig.toml says, or the twin"
             )
 
+    def _forget(self) -> None:
+        self._shown = None
+        self._keep(None)
+
     def show(self, seeing: SeeingSettings, *, is_visible: bool) -> None:
-        """Show what holds."""
+        """Show what holds; what is being typed stays until that changes."""
         self._folder.visible = is_visible
+        if seeing == self._shown:
+            return
         given, lines = seeing.exposure, seeing.stripes
         mode = next(words for words, name in MODES.items() if name == given.mode)
         windows = "; ".join(", ".join(map(str, one)) for one in seeing.windows)
@@ -267,7 +275,7 @@ class SeeingPanel:
         )
         for field, value in known:
             put(field, value)
-        self._before = seeing
+        self._before = self._shown = seeing
 
     def _read(self) -> SeeingSettings:
         """What stands in the fields; raises `OptionError`."""

@@ -269,6 +269,19 @@ def test_settings_hold_for_the_session_and_a_wrong_one_is_a_sentence(tmp_path: P
         assert page.bench.rig.description.windows == ()
 
 
+def test_what_is_being_typed_stays(tmp_path: Path) -> None:
+    put_scanner(tmp_path / "s")
+    with opened(tmp_path / "s", FailingBench()) as page:
+        page.seeing._windows.value, page.seeing._height.value = "0, 40, 3", 12.0
+        page._target.value = "chessboard:9x6:10 "
+        page.refresh()
+        assert page.seeing._windows.value == "0, 40, 3" and page.seeing._height.value == 12.0
+        assert page._target.value == "chessboard:9x6:10 "
+        assert page.journey.settings.target == "chessboard:9x6:10"
+        page.controls.tried(page.seeing._forget)
+        assert page.seeing._windows.value == "" and page.seeing._height.value == 0.0
+
+
 def test_a_plate_is_touched_by_what_the_page_asks_for(tmp_path: Path) -> None:
     put_scanner(tmp_path / "s")
     bench = FailingBench()

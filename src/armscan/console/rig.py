@@ -459,6 +459,12 @@ class DeviceBench:
     def take(self, step: StepName, folder: Path, k: int) -> tuple[Exposure, ...]:
         """As of `Bench`: one image in the light of the room, one of each laser, or both."""
         sources = self._sources
+        if step is StepName.LASER and not sources:
+            raise DeviceError(
+                "the rig has no laser controller: this step takes images with the laser and without",
+                remedy="name one as lasers in rig.toml, or calibrate the sheets from photographs "
+                "with `armscan calibrate laser`",
+            )
         states: list[tuple[str, ...]] = [()]
         if step is StepName.LASER:
             states = [*((source,) for source in sources), ()]

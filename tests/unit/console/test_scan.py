@@ -256,6 +256,13 @@ def test_devices_are_taken_from_one_placement_at_a_time(tmp_path: Path) -> None:
     bench.close()
 
 
+def test_light_sheets_are_not_taken_without_a_laser_controller(tmp_path: Path) -> None:
+    bench = FailingBench()
+    with pytest.raises(DeviceError, match="no laser controller"):
+        bench.take(StepName.LASER, tmp_path / "r", 0)
+    assert not (tmp_path / "r").exists()
+
+
 class TellingLasers:
     """A laser that says what it was asked for."""
 

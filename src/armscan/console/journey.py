@@ -40,6 +40,8 @@ except ImportError:  # pragma: no cover - Windows has none
 
 SETTINGS_FILE, LOCK_FILE, REPORT_FILE = "console.toml", ".console.lock", "report.html"
 RECORDINGS, RESULTS = "recordings", "results"
+SETTING = f"{SETTINGS_FILE}: "
+"""Before the key of a setting that a result rests on."""
 TIMED_FILE = "scanner-timed.json"
 MOVED = ".mcap"
 """Of a recording that was taken while the hand moved."""
@@ -270,7 +272,8 @@ class StepResult:
     written
         Files, relative to the session.
     rests_on
-        SHA-256 of every input, by its path relative to the session.
+        SHA-256 of every input, by its path relative to the session, and of each setting that was
+        used, by its key behind `SETTING`; older results have no settings.
     """
 
     verdict: Verdict
@@ -513,12 +516,18 @@ class Journey:
 
     def digest(self, name: str) -> str:
         """SHA-256 of what a result rests on, by its name, as it is now."""
+        if name.startswith(SETTING):
+            value = getattr(self.settings, name.removeprefix(SETTING), "")
+            told = value if isinstance(value, str) else repr(float(value))
+            return hashlib.sha256(told.encode()).hexdigest()
         return digest_of(self.scanner_file if name == TIMED_FILE else self.folder / name)
 
     def _words(self, name: str) -> str:
         """A file of the session as the person knows it."""
         if name.startswith(f"{RECORDINGS}/"):
             return "what was taken"
+        if name.startswith(SETTING):
+            return f"the setting {name.removeprefix(SETTING)}"
         for step in CALIBRATED:
             if self._document(step, "").name == name:
                 return f"the result of '{BY_NAME[step].title}'"

@@ -10,7 +10,7 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
@@ -26,6 +26,7 @@ from armscan.console.journey import (
     OF_A_SCAN,
     REPORT_FILE,
     RESULTS,
+    SETTING,
     SETTINGS_FILE,
     STEPS,
     TIMED_FILE,
@@ -35,7 +36,6 @@ from armscan.console.journey import (
     StepName,
     StepResult,
     Verdict,
-    digest_of,
     read_settings,
     result_key,
 )
@@ -240,8 +240,13 @@ def run_step(
             where=scan or known.title,
             remedy="scan once more; without a trigger in common at ten images a second or more",
         )
-    inputs = [path for path in _inputs(journey, step, scan) if is_file(path)]
-    rests_on = {path.relative_to(folder).as_posix(): digest_of(path) for path in inputs}
+    inputs = [path for path in _inputs(journey, step, scan, compare) if is_file(path)]
+    names = [
+        (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix()
+        for path in inputs
+    ]
+    used = USED.get(step, ()) if step is not StepName.INSPECT else USED_TO_COMPARE[compare]
+    rests_on = {name: journey.digest(name) for name in (*names, *(SETTING + key for key in used))}
     try:
         result = _judged(step, _work(journey, step, scan, compare, progress))
     except ArmscanError as error:
@@ -378,17 +383,27 @@ def _seen_by_one(
     return one
 
 
-def _inputs(journey: Journey, step: StepName, scan: str) -> list[Path]:
+USED: Mapping[StepName, tuple[str, ...]] = {
+    StepName.CAMERA: ("target",),
+    StepName.LASER: ("target",),
+    StepName.CHECK: ("ball_mm",),
+}
+USED_TO_COMPARE = dict(zip(INSPECTIONS, (("part", "tolerance"), (), ("ball_mm",)), strict=True))
+"""Settings that steps, and the inspection by what it compares with, make use of."""
+
+
+def _inputs(journey: Journey, step: StepName, scan: str, compare: str) -> list[Path]:
     place = journey.recording(step, scan)
     own = [place / EXPOSURES_FILE, place / ARM_FILE]
-    folder = journey.folder
+    folder, part = journey.folder, journey.settings.part
+    standards = [[folder / part] if part else [], [folder / "plate.csv"], []]
     rest: dict[StepName, list[Path]] = {
         StepName.LASER: [journey.camera_file],
         StepName.HAND_EYE: [folder / "sensor.json", folder / "plate.csv"],
         StepName.LATENCY: [folder / "scanner.json"],
         StepName.CHECK: [journey.scanner_file],
         StepName.SCAN: [journey.scanner_file],
-        StepName.INSPECT: [journey.cloud_file(scan)],
+        StepName.INSPECT: [journey.cloud_file(scan), *standards[INSPECTIONS.index(compare)]],
     }
     return [*([] if step is StepName.INSPECT else own), *rest.get(step, [])]
 

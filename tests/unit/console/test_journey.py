@@ -242,6 +242,43 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) ->
     assert not (tmp_path / "new").exists(), "nothing became of it"
 
 
+@pytest.mark.parametrize(
+    ("compare", "changes"),
+    [
+        ("CAD model", {"tolerance": "0.2", "part": "other.stl"}),
+        ("ball", {"ball_mm": 25.0}),
+        ("plate", {}),
+    ],
+)
+def test_an_inspection_is_old_where_what_it_compared_with_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: str, changes: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(work, "_work", lambda *_: Summary("an inspection", (), {}, ()))
+    journey = open_journey(tmp_path / "s", replace(SETTINGS, part="part.stl", tolerance="0.1"))
+    touch_plate(journey, 12)
+    for name in ("part.stl", "plate.csv", "scan-01.ply"):
+        (journey.folder / name).write_text(name)
+    for name in ("camera.json", "sensor.json", "scanner.json"):
+        (journey.folder / name).write_text("{}")
+    run_step(journey.folder, StepName.INSPECT, "scan-01", compare)
+
+    def status() -> str:
+        return journey.state(StepName.INSPECT, "scan-01").status
+
+    assert status() == "good"
+    for key, value in changes.items():
+        before = getattr(journey.settings, key)
+        journey.change(**{key: value})
+        assert status() == "old"
+        assert f"the setting {key}" in journey.state(StepName.INSPECT, "scan-01").why
+        journey.change(**{key: before})
+        assert status() == "good"
+    for name, of in (("part.stl", "CAD model"), ("plate.csv", "plate")):
+        (journey.folder / name).write_text("another one")
+        assert (status() == "old") is (compare == of)
+        (journey.folder / name).write_text(name)
+
+
 def test_a_latency_counts_for_the_hand_eye_that_it_was_found_with(tmp_path: Path) -> None:
     journey = open_journey(tmp_path / "s", replace(SETTINGS, needs_latency=True))
     plain, timed = journey.folder / "scanner.json", journey.folder / "scanner-timed.json"

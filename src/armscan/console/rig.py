@@ -461,7 +461,7 @@ class DeviceBench:
         sources = self._sources
         if step is StepName.LASER and not sources:
             raise DeviceError(
-                "the rig has no laser controller: this step takes images with the laser and without",
+                "the rig has no laser controller; each take is with the laser and without",
                 remedy="name one as lasers in rig.toml, or calibrate the sheets from photographs "
                 "with `armscan calibrate laser`",
             )

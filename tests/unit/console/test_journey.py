@@ -253,7 +253,7 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) ->
 def test_an_inspection_is_old_where_what_it_compared_with_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: str, changes: dict[str, Any]
 ) -> None:
-    monkeypatch.setattr(work, "_work", lambda *_: Summary("an inspection", (), {}, ()))
+    monkeypatch.setattr(work, "_work", lambda *_: Summary("An inspection"))
     journey = open_journey(tmp_path / "s", replace(SETTINGS, part="part.stl", tolerance="0.1"))
     touch_plate(journey, 12)
     for name in ("part.stl", "plate.csv", "scan-01.ply"):

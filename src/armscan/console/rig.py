@@ -517,10 +517,8 @@ class DeviceBench:
                        is_simulated=self.is_simulated)  # fmt: skip
 
     def look(self, step: StepName, k: int) -> tuple[Exposure, ...]:
-        """As of `Bench`: the latest images; raises while a device does not answer."""
+        """As of `Bench`: the latest images; raises while a camera does not answer."""
         latest = self._watch(step)
-        if self._watched is not None and (faults := self._watched[0].snapshot().faults):
-            raise DeviceError(" ".join(sentence(fault) for fault in faults))
         self._light(() if step is StepName.CAMERA else self._sources)
         since_ns = time.monotonic_ns() - SHOWN_NS
         found = {
@@ -529,6 +527,9 @@ class DeviceBench:
             for camera, frame in enumerate(one.frames)
             if frame is not None and frame.t_host_ns > since_ns
         }
+        watched = self._watched if len(found) < len(self.rig.cameras) else None
+        if watched is not None and (faults := watched[0].snapshot().faults):
+            raise DeviceError(" ".join(sentence(fault) for fault in faults))
         return tuple(
             exposure_of(frame, self.rig.cameras[camera].setup, one, camera)
             for camera, (frame, one) in sorted(found.items())

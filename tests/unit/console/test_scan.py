@@ -300,8 +300,7 @@ def test_lasers_are_on_only_where_the_step_needs_them_and_off_afterwards() -> No
     for step in (StepName.CAMERA, StepName.CAMERA, StepName.HAND_EYE):
         bench.look(step, 0)
     bench.rest()
-    off = ["off"] * 2  # before what is waited for, and with the rest
-    assert lasers.asked == ["start", (), *off, "start", ("A",), *off]
+    assert lasers.asked == ["start", (), "off", "start", ("A",), "off"]
     bench.close()
 
 
@@ -309,7 +308,8 @@ def test_lasers_go_off_where_a_take_fails_and_before_a_camera_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hand, lasers = _Hand(drawn_scan(40), rate_hz=50.0), TellingLasers()
-    description = RigDescription(("d",), is_common_trigger=True)
+    automatic = ExposureSettings("automatic")
+    description = RigDescription(("d",), is_common_trigger=True, exposure=automatic)
     rig = Rig([_HandCamera(hand, 0)], _HandArm(hand), lasers, description)
     bench = DeviceBench(rig, "rig.toml")
     monkeypatch.setattr("armscan.console.rig.WAIT_S", 0.05)

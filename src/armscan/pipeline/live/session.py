@@ -410,8 +410,9 @@ class LiveSession:
         """Lasers off; what arrived is recorded and measured to its end."""
         if self._state in ("closed", "stopped"):
             return
-        # a control waits for its camera, which may be unplugged
-        self._rig.darken()
+        if self.options.exposure.mode != "fixed":
+            # a control waits for its camera, which may be unplugged
+            self._rig.darken()
         for control in self._controls:
             control.stop()
         self._acquisition.stop()
@@ -444,7 +445,6 @@ class LiveSession:
             views = tuple(self._view(k) for k in sorted(self._frames))
             times, late = list(self._arrivals), list(self._latencies)
             now_ns = time.monotonic_ns()
-            # to now: what came before a camera fell silent is no rate of it any more
             span = (now_ns - times[0]) * 1e-9 if len(times) > 1 else 0.0
             return LiveSnapshot(
                 state=self._state,

@@ -435,22 +435,25 @@ def test_what_was_taken_stays_until_an_image_came(tmp_path: Path) -> None:
         page.choose(StepName.CHECK)
         page._run = lambda *_: None
         place = page.journey.recording(StepName.CHECK)
-        place.parent.mkdir()
-        place.write_bytes(b"before")
+        page.controls.tried(page.start_or_pause)
+        waited(lambda: page.live is not None and page.live.n_recorded > 0)
+        page.controls.tried(page.finish)
+        before = place.read_bytes()
         bench.cameras[0].is_gone = True
         page.controls.tried(page.start_or_pause)
-        assert not place.read_bytes().startswith(b"before")
+        assert place.read_bytes() != before
         page.controls.tried(page.finish)
         assert "no image came" in text_of(page)
-        assert place.read_bytes() == b"before"
+        assert place.read_bytes() == before
         bench.cameras[0].is_gone = False
         page.controls.tried(page.start_or_pause)
         waited(lambda: page.live.n_recorded > 0)
         page.controls.tried(page.finish)
-        assert read_recording(place).rows
+        after = place.read_bytes()
+        assert read_recording(place).rows and after != before
         assert [one.name for one in place.parent.iterdir()] == ["check.mcap"]
         # of a console that was killed before its first image
         aside = place.rename(place.with_name(".check.mcap.before"))
         place.write_bytes(b"cut")
-        page._said = recover_scans(page.journey.folder)
-        assert not aside.exists() and read_recording(place).rows
+        recover_scans(page.journey.folder)
+        assert not aside.exists() and place.read_bytes() == after

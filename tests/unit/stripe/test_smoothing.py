@@ -16,7 +16,7 @@ from armscan.kernels.stripe.smoothing import (
     SMOOTH_SIGMA,
     WINDOW,
 )
-from armscan.vision.stripe.smooth import CONFIDENCE, Neighbourhoods, Polyline
+from armscan.vision.stripe.smooth import CONFIDENCE, Neighbourhoods, Polyline, smooth
 
 WINDOWS = np.array([3.2, 5.0, 7.7, 12.0])
 INFLATION = np.array([1.0, 1.1, 1.3, 1.6])
@@ -124,3 +124,20 @@ def test_points_that_are_asked_are_as_if_all_were() -> None:
     every = Neighbourhoods(course, windows).fit_parabolas(ones, course.sigma)
     assert (every[WINDOW, asked] > 0.0).any()
     np.testing.assert_array_equal(found[:, asked], every[:, asked])
+
+
+def test_no_more_is_smoothed_than_was_asked_for() -> None:
+    """The sigma of white noise in a half window w falls as the root of 9/4 over its points."""
+    rng, n = np.random.default_rng(5), 3000
+    points = np.stack([np.arange(float(n)), rng.normal(0.0, 0.05, n)], axis=1)
+    course = Polyline(
+        points, np.tile([0.0, 1.0], (n, 1)), np.full(n, 0.05), np.zeros(n, np.int64), np.ones(n) > 0
+    )
+    stated = []
+    for largest_px in (2.0, 4.0, 12.0):
+        found = smooth(course, largest_px)
+        stated.append(float(np.median(found.sigma)))
+        assert np.std(found.points[:, 1]) == pytest.approx(stated[-1], rel=0.1)
+        expected = 0.05 * np.sqrt(9.0 / 4.0 / (2.0 * largest_px + 1.0))
+        assert stated[-1] == pytest.approx(expected, rel=0.15)
+    assert stated[0] > stated[1] > stated[2]

@@ -255,7 +255,7 @@ def find_runs(
     ``cell_px`` pixels, interpolated in between. ``is_lit_cell``: (rows, columns) 0 for cells that
     are passed over unread. ``cell_px``: Side of a cell. ``rise``:
     Height above the background. ``longest_px``: Longer runs are no cross-sections of a line and are
-    left out. ``runs``: (capacity, 3) output rows: ``x, y`` of the centroid above the threshold, and
+    left out. ``runs``: (capacity, 3) output rows: ``x, y`` of the centroid above half its peak, and
     the axis (0: the run goes down a column, 1: along a row).
 
     Returns count of candidates; more than the capacity if the output was too short.

@@ -228,7 +228,7 @@ def widen(
     """Fit parabolas to one more ring, and take those that agree with the narrower ones.
 
     ``moments``: (9 `LANES`,) of the ring. ``reach``, ``inflation``, ``confidence``: As for
-    `smooth_lanes`. ``state``: (31 `LANES`,) moments so far, results, interval and chosen moments.
+    `smooth_lanes`. ``state``: (30 `LANES`,) moments so far, results, interval and chosen moments.
     """
     for k in range(MOMENTS * LANES):
         state[k] += moments[k]

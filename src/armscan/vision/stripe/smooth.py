@@ -26,6 +26,8 @@ from armscan.kernels.stripe.smoothing import (
 )
 
 SMALLEST_WINDOW_PX = 3.2
+LEAST_WINDOW_PX = 1.0
+"""However little smoothing is asked for."""
 WINDOW_RATIO = 1.6
 CONFIDENCE = 2.2
 LAGS = 6
@@ -147,7 +149,8 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     The noise of neighbours is measured from the residuals, not assumed: its size corrects the
     sigmas, and its correlation widens those of the smoothed centres.
 
-    ``course``: The centres. ``largest_px``: Largest half window; 0 only measures the noise.
+    ``course``: The centres. ``largest_px``: Largest half window; 0 only measures the noise, which
+    is done in windows of twice `SMALLEST_WINDOW_PX` at least.
     """
     half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
     around = Neighbourhoods(course, half)
@@ -159,7 +162,11 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     dropped = np.flatnonzero(is_outlier & course.is_used)
     if len(dropped):
         course = replace(course, is_used=course.is_used & ~is_outlier)
+        around.leave_out(dropped)
     found = noise_correlation(course, half[-1])
+    if 0.0 < largest_px < half[-1]:
+        half = windows(max(largest_px, LEAST_WINDOW_PX))
+        around = Neighbourhoods(course, half)
     is_measured = found is not None
     correlation = WHITE if found is None else found
     course = replace(course, sigma=course.sigma * np.sqrt(correlation[0]))
@@ -169,8 +176,6 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
         return SmoothedCentres(
             course.points, course.normals, course.sigma, sigma_sum, is_outlier, is_measured
         )
-    if len(dropped):
-        around.leave_out(dropped)
     inflation = np.array([inflation_of(correlation, h) for h in half])
     result = around.fit_parabolas(inflation, course.sigma, float(correlation[0]))
     points, normals, sigma, _, is_used = course.rows

@@ -127,7 +127,9 @@ def test_a_press_while_a_scan_begins_does_not_pause_it(
         assert page.live is not None and page.live.snapshot.state == "scanning"
 
 
-def test_nothing_begins_while_a_scan_ends_and_its_step_stays(tmp_path: Path) -> None:
+def test_nothing_begins_while_a_scan_ends_and_its_step_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     put_scanner(tmp_path / "s")
     with opened(tmp_path / "s", FailingBench()) as page:
         page.choose(StepName.CHECK)
@@ -141,7 +143,8 @@ def test_nothing_begins_while_a_scan_ends_and_its_step_stays(tmp_path: Path) -> 
             assert may_end.wait(30.0)
             stop()
 
-        live.stop, page._run = stop_slowly, lambda *of: ran.append(of)
+        monkeypatch.setattr(live, "stop", stop_slowly)
+        monkeypatch.setattr(page, "_run", lambda *of: ran.append(of))
         first = threading.Thread(target=pressed, args=(page.scanning._finish,))
         first.start()
         assert ending.wait(30.0)
@@ -428,12 +431,14 @@ def test_what_was_taken_stays_where_a_new_take_does_not_begin(
         assert place.read_bytes() == before
 
 
-def test_what_was_taken_stays_until_an_image_came(tmp_path: Path) -> None:
+def test_what_was_taken_stays_until_an_image_came(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     put_scanner(tmp_path / "s")
     bench = FailingBench()
     with opened(tmp_path / "s", bench) as page:
         page.choose(StepName.CHECK)
-        page._run = lambda *_: None
+        monkeypatch.setattr(page, "_run", lambda *_: None)
         place = page.journey.recording(StepName.CHECK)
         page.controls.tried(page.start_or_pause)
         waited(lambda: page.live is not None and page.live.n_recorded > 0)

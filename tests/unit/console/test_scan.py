@@ -317,7 +317,7 @@ def test_lasers_go_off_where_a_take_fails_and_before_a_camera_is_waited_for(
         bench.take(StepName.HAND_EYE, tmp_path / "r", 0)
     assert lasers.asked == ["start", ("A",), ()]
     for control in bench._watched[0]._controls:
-        control.stop = lambda: lasers.asked.append("waited")
+        monkeypatch.setattr(control, "stop", lambda: lasers.asked.append("waited"))
     bench.rest()
     assert lasers.asked[3:] == ["off", "waited", "off"]
     bench.close()

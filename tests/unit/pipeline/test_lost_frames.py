@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -195,7 +196,7 @@ def test_stills_of_a_recording_keep_the_partners_of_their_views(tmp_path: Path) 
     """By file name they would be other ones, which were refused."""
     lit = [("b", "on/0.png"), ("a", "on/1.png"), ("b", "on/2.png")]
     dark = [("a", "off/0.png"), ("b", "off/1.png")]
-    views = [{"view": view, "source": source} for view, source in lit]
+    views: list[dict[str, Any]] = [{"view": view, "source": source} for view, source in lit]
     views += [{"view": view, "source": source, "lasers": ()} for view, source in dark]
     write_recording(tmp_path / "scan", as_source(with_rows(fake_scan(5), views)))
     read = read_stills(StillPaths((str(tmp_path / "scan"),)), ImageOptions(), 1)

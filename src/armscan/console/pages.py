@@ -279,10 +279,11 @@ class ConsolePage:
 
     def take(self, step: StepName | None = None) -> None:
         """Record the placement or touch that is drawn, of the step that is shown or another."""
-        if self.worker.is_busy:
+        step = step or self.step
+        if self.worker.is_busy and BY_NAME[step].filling == "placements":
             raise ArmscanError("other work is under way", remedy="wait for it or cancel it")
         with self._lock:
-            bench, step = self._bench(), step or self.step
+            bench = self._bench()
             k, place = self.journey.n_taken(step), self.journey.recording(step)
             if BY_NAME[step].filling == "touches":
                 bench.touch(place, k)
@@ -337,12 +338,12 @@ class ConsolePage:
                 live.start()
 
     @contextmanager
-    def _turning(self, words: str) -> Iterator[None]:
+    def _turning(self, words: str, *, can_end: bool = False) -> Iterator[None]:
         """A scan begins or ends: step and session stay meanwhile."""
         with self._showing:
             self._is_turning = True
         try:
-            with self._busy(words, can_end=False):
+            with self._busy(words, can_end=can_end):
                 yield
         finally:
             self._is_turning = False
@@ -355,30 +356,36 @@ class ConsolePage:
             scan = journey.new_scan() if step is StepName.SCAN else ""
             if step is StepName.SCAN and part:
                 model = ModelWatch(self.worker, journey.folder / part)
-            live = LiveScan(self._bench(), step, journey.new_file(step, scan), scanner, seeing)
+            place = journey.new_file(step, scan)
+            if place in journey.cut_short:
+                raise ArmscanError(
+                    f"{place.stem} was cut short and is not saved yet",
+                    remedy="open the session again to save it, or start over",
+                )
+            live = LiveScan(self._bench(), step, place, scanner, seeing)
             live.open()
             self.scanning.begin(live, scanner, model)
             self.scan = scan or self.scan
 
     def finish(self) -> None:
-        """End the scan, and run its job."""
+        """End the scan, and run its job; then save what was cut short before, which had to wait."""
         n, of = list[int](), (self.journey.folder, self.step, self._scan_of(self.step))
         self.controls.alone(lambda: n.append(self._end()))
         self.refresh()
         if any(n):
             self._run(*of)
+        self.controls.alone(self._recover)
 
     def _end(self) -> int:
         """End the scan; how many exposures it recorded."""
-        with self._turning("Ending the scan ..."), self._lock:
+        with self._turning("Ending the scan ...", can_end=True), self._lock:
             try:
                 return self.scanning.end()
             except OutputError as error:
+                self._recover()
                 raise OutputError(
                     error.what, remedy="free some space, and scan the rest anew"
                 ) from error
-            finally:
-                self._recover()
 
     def calculate(self) -> None:
         """Run this step's job in its process, and show what it says."""
@@ -399,21 +406,23 @@ class ConsolePage:
     def _busy(self, words: str, *, can_end: bool = True) -> Iterator[None]:
         """Say what is under way; what was before it, and still is, is said again afterwards."""
         work = words, can_end
-        if not self._under_way:
-            put(self._bar, 0.0)
-        self._under_way.append(work)
-        self._show_work()
+        with self._showing:
+            if not self._under_way:
+                put(self._bar, 0.0)
+            self._under_way.append(work)
+            self._show_work()
         try:
             yield
         finally:
-            self._under_way.remove(work)
-            self._show_work()
+            with self._showing:
+                self._under_way.remove(work)
+                self._show_work()
 
     def _show_work(self) -> None:
         works = tuple(self._under_way)
         self._working.content = padded(paragraph(works[-1][0] if works else "", MUTED))
-        self._working.visible = bool(works)
-        self._calculate.disabled = self._take.disabled = bool(works)
+        self._working.visible = self._calculate.disabled = bool(works)
+        self._take.disabled = bool(works) and BY_NAME[self.step].filling == "placements"
         self._bar.visible = self._cancel.visible = any(can_end for _, can_end in works)
 
     def _open_chosen(self) -> None:
@@ -427,6 +436,7 @@ class ConsolePage:
             titles = tuple(step.title for step in self.journey.steps)
             if self._choice.options != titles:
                 self._choice.options = titles
+            self.seeing.renew()
             self.choose(self.journey.next_step())
             self._recover()
 
@@ -448,12 +458,11 @@ class ConsolePage:
             return ()
         try:
             seen = self.bench.look(step.name, self.journey.n_taken(step.name))
-            if self._is_viewing:
-                return seen
-            # it was ended meanwhile: what looked has lit the lasers anew
-            self.bench.rest()
-            return ()
+            return seen if self._is_viewing else ()
         finally:
+            if not self._is_viewing:
+                # it was ended meanwhile: what looked has lit the lasers anew
+                self.bench.rest()
             self._lock.release()
 
     def _scan_of(self, step: StepName) -> str:
@@ -474,6 +483,7 @@ class ConsolePage:
                 put(self._choice, step.title)
             self._guide.content = padded(self._instruction(state))
             self._arrange(state)
+            self._show_work()
             self._note.content = padded(self._told(state))
             known = tuple(one.name for one in sessions_in(self.journey.folder.resolve().parent))
             self._session_list.options = known or (self._name(),)

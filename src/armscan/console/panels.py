@@ -244,8 +244,12 @@ class SeeingPanel:
                 "As the rig says", self._forget, "", "What rig.toml says, or the twin"
             )
 
-    def _forget(self) -> None:
+    def renew(self) -> None:
+        """What is typed is of another session: show what holds in this one."""
         self._shown = None
+
+    def _forget(self) -> None:
+        self.renew()
         self._keep(None)
 
     def show(self, seeing: SeeingSettings, *, is_visible: bool) -> None:

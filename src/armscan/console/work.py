@@ -245,6 +245,9 @@ def run_step(
         (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix()
         for path in inputs
     ]
+    if journey.settings.needs_latency and step in (StepName.CHECK, StepName.SCAN):
+        # a latency that is found later changes the scanner, too
+        names = [TIMED_FILE if name == journey.scanner_file.name else name for name in names]
     used = USED.get(step, ()) if step is not StepName.INSPECT else USED_TO_COMPARE[compare]
     rests_on = {name: journey.digest(name) for name in (*names, *(SETTING + key for key in used))}
     try:

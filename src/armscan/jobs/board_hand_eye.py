@@ -281,7 +281,7 @@ def _scan_views(source: LookSource) -> _Views:
         poses=tuple(held),
         postures=tuple(postures),
         paths=tuple(folder / names[k] for k in chosen),
-        tables=(*recording_tables(folder), *(() if source.arm is None else (source.arm,))),
+        tables=recording_tables(folder, source.arm),
         is_simulated=recording.is_simulated,
         warnings=(
             *recording.warnings,

@@ -52,7 +52,8 @@ def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
             for k, path in enumerate(paths):
                 job.progress(ProgressEvent(STAGE, k, len(paths), path.name))
                 for piece in read_cloud_pieces(path):
-                    remarks += (f"{path.name}: {remark}" for remark in piece.remarks)
+                    told = (*piece.remarks, *piece.doubts)
+                    remarks += (f"{path.name}: {remark}" for remark in told)
                     with told_of(str(path)):
                         voxels.add(piece.cloud)
             job.progress(ProgressEvent(STAGE, len(paths), len(paths)))

@@ -421,7 +421,7 @@ def calibrate_latency(
         odd += ("the clocks are separate: the time holds for this recording, nothing is written",)
     is_simulated = recording.is_simulated or are_simulated([scanner])
     provenance = job.provenance(
-        [path for path in (*recording_tables(scan), scanner, arm) if path],
+        (*recording_tables(scan, arm), scanner),
         (stripe_options,),
         parents=(before.provenance,),
         warnings=odd,
@@ -516,8 +516,8 @@ def read_hand_eye_inputs(
     for recording in recordings:
         seen = observe_stripes(recording, sensor, measure, n_wanted=n_shown, progress=progress)
         groups.append((recording.name, _named(seen, _prefix(recording, len(recordings)))))
-    tables = [path for folder in source.scans for path in recording_tables(folder)]
-    files = [path for path in (*tables, source.sensor, artefact.plate, source.arm) if path]
+    tables = dict.fromkeys(p for one in source.scans for p in recording_tables(one, source.arm))
+    files = [path for path in (*tables, source.sensor, artefact.plate) if path]
     odd = [text for r in recordings for text in (*r.warnings, *r.session.assumed)]
     of_groups = [text for _, seen in groups for text in seen.warnings]
     if not sensor.has_camera_covariance:

@@ -516,10 +516,11 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
     n, n_faces = len(vertices.table), vertices.n_faces
     what = f"mesh, {n} vertices and {n_faces} faces" if n_faces else f"point cloud, {n} points"
     content: dict[str, Any] = {"what": what}
-    if "cov_xx_mm2" in fields:
+    if own := "cov_xx_mm2" in fields:
         content |= _carried(read_ply(path))
     if {"x", "y", "z"} <= set(fields):
         content |= _ranges(vertices.table[axis] for axis in "xyz")
+        content |= _notes((), () if own else read_cloud_file(path).doubts)
     content["properties"] = fields
     return content
 
@@ -530,7 +531,7 @@ def _cloud(found: CloudFile) -> dict[str, Any]:
         "what": f"point cloud, {len(cloud)} points",
         **_carried(cloud),
         **_ranges(cloud.points_mm.T),
-        **_notes((), found.remarks),
+        **_notes((), (*found.remarks, *found.doubts)),
     }
 
 

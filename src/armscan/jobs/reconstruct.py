@@ -435,9 +435,8 @@ def _scan(
             *filter(None, [about]),
             *scan.warnings,
         )
-        inputs = (*recording_tables(folder), calibration, arm)
         provenance = job.provenance(
-            [path for path in inputs if path is not None],
+            (*recording_tables(folder, arm), calibration),
             (options,),
             parents=(scanner.provenance,),
             warnings=warnings,

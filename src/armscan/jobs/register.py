@@ -229,7 +229,7 @@ def _read_cloud(path: Path, name: str, markers: MarkerList) -> _NamedCloud:
             where=f"{path} and {markers.path}",
             remedy="measure both in one frame, or correct '# frame =' in the list",
         )
-    return _NamedCloud(f"{name}.ply", path, cloud, found.remarks, found.n_points)
+    return _NamedCloud(f"{name}.ply", path, cloud, (*found.remarks, *found.doubts), found.n_points)
 
 
 def _different_names(paths: Sequence[Path]) -> tuple[str, ...]:

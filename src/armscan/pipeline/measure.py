@@ -673,8 +673,8 @@ def laser_warnings(
             f"no exposure can be measured: {next(iter(why.values()))}",
             remedy="leave --sheet out, or name the sheet of the laser that was on"
             if options.sheet
-            else "give the calibration of this head; a laser that was calibrated under another "
-            "name is taken for it by --sheet",
+            else "give the calibration of this head; calibrate the sheets of all lasers that were "
+            "on, or record with the calibrated ones alone",
         )
     warnings = [f"{named[on]} exposures were left out: {text}" for on, text in why.items() if text]
     unknown = {one for on, text in why.items() if not text for one in without_sheet(sensor, on)}

@@ -418,11 +418,11 @@ def _mirrored_images(scan: _Scan) -> Iterator[tuple[str, str, Stripes]]:
     camera = sensor.camera.camera
     size, start = (camera.width_px, camera.height_px), (0, 0)
     if setup is not None:
-        binning = setup.window.binning
-        size = (
-            binning * setup.width_px if setup.width_px else size[0],
-            binning * setup.height_px if setup.height_px else size[1],
-        )
+        binning, given = setup.window.binning, (setup.width_px or 0, setup.height_px or 0)
+        # the size is that of the images, or of the whole sensor
+        is_of_images = binning * given[0] <= size[0] and binning * given[1] <= size[1]
+        each = binning if is_of_images else 1
+        size = (each * given[0] or size[0], each * given[1] or size[1])
         start = (setup.window.x_px, setup.window.y_px)
     for axis, words in enumerate(("right to left", "bottom up")):
         pixels = scan.pixels.copy()

@@ -23,7 +23,12 @@ from armscan.reconstruction.labels import (
     without_sheet,
 )
 from armscan.reconstruction.segments import Pieces, cut_pieces
-from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange, intersect_sheets
+from armscan.reconstruction.triangulate import (
+    LABEL_DEPTHS,
+    MOST_MARGIN,
+    DepthRange,
+    intersect_sheets,
+)
 from armscan.records.profile import Profile
 
 FIELD_MM = 85.0
@@ -261,15 +266,16 @@ class Hypotheses:
         (H,) indices into the sensor's sheets.
     points_mm
         (H, S, 3) in Sensor.
-    is_met, is_inside
-        (S, H) True where the point exists, and where it lies within the depths accepted.
+    is_near, is_inside
+        (S, H) True where the point lies within the depths accepted or by their calibrated width
+        beyond them, and where within them.
     place_mm
         (H, S) coordinate along the sheet.
     """
 
     sheets: tuple[int, ...]
     points_mm: FloatArray
-    is_met: BoolArray
+    is_near: BoolArray
     is_inside: BoolArray
     place_mm: FloatArray
 
@@ -281,17 +287,18 @@ def hypothesise(
     depths: DepthRange,
 ) -> Hypotheses:
     """Intersect the rays of samples (S, 2) with each sheet."""
-    points, exists, inside, place = [], [], [], []
+    wider = DepthRange(min(depths.margin + 1.0, MOST_MARGIN))
+    points, near, inside, place = [], [], [], []
     for k in sheets:
         of_sheet = np.full(len(points_px), k)
         met, is_met = intersect_sheets(points_px, of_sheet, sensor)
         sheet = sensor.sheets[k].sheet
         points.append(met)
-        exists.append(is_met)
+        near.append(is_met & wider.holds(met, of_sheet, sensor))
         inside.append(is_met & depths.holds(met, of_sheet, sensor))
         place.append((met - sheet.origin_mm) @ sheet.axes[0])
     return Hypotheses(
-        sheets, np.array(points), np.array(exists).T, np.array(inside).T, np.array(place)
+        sheets, np.array(points), np.array(near).T, np.array(inside).T, np.array(place)
     )
 
 
@@ -546,12 +553,12 @@ class CrossLabeller:
         hypotheses = hypothesise(samples, possible, self._sensor, self._depths)
         posterior = self._posterior(samples, pieces, hypotheses, pose)
         best, margin = _best(posterior)
-        is_met, is_explained = (
+        is_near, is_explained = (
             np.take_along_axis(pieces.mean(flag.astype(np.float64)), best[:, None], 1)[:, 0] > 0.5
-            for flag in (hypotheses.is_met, hypotheses.is_inside)
+            for flag in (hypotheses.is_near, hypotheses.is_inside)
         )
         of_piece = np.where(margin >= MARGIN, PointStatus.MEASURED, PointStatus.AMBIGUOUS)
-        beyond = np.where(is_met, PointStatus.OUT_OF_DEPTH, PointStatus.STRAY)
+        beyond = np.where(is_near, PointStatus.OUT_OF_DEPTH, PointStatus.STRAY)
         of_piece[~is_explained] = beyond[~is_explained]
         accepted = pieces.of_point >= 0
         piece = pieces.of_point[accepted]

@@ -130,11 +130,13 @@ def read_cloud(path: Path) -> PointCloud:
 class CloudFile:
     """A cloud as a file held it, and columns that it does not carry.
 
-    ``n_points`` (N,) are the measured points that each of a fused cloud stands for, or None.
+    ``doubts`` are those of its unit, which who knows the size of things may settle. ``n_points``
+    (N,) are the measured points that each of a fused cloud stands for, or None.
     """
 
     cloud: PointCloud
     remarks: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()
     n_points: IntArray | None = None
 
@@ -160,8 +162,8 @@ def read_cloud_file(path: Path) -> CloudFile:
 def _as_read(found: CloudColumns, path: Path) -> CloudFile:
     cloud = cloud_of_columns(found, path)
     counts = found.columns.get(N_POINTS) if found.is_own else None
-    remarks = (*found.remarks, *(() if found.is_own else _of_units(cloud)))
-    return CloudFile(cloud, remarks, dropped_columns(found), counts)
+    doubts = () if found.is_own else _of_units(cloud)
+    return CloudFile(cloud, found.remarks, doubts, dropped_columns(found), counts)
 
 
 def _of_units(cloud: PointCloud) -> tuple[str, ...]:
@@ -242,7 +244,7 @@ def read_cloud_pieces(path: Path) -> Iterator[CloudFile]:
     for k, found in enumerate(pieces):
         piece = _as_read(found, path)
         # the few points of a last piece may well lie in one place
-        yield replace(piece, remarks=piece.remarks if k == 0 else ())
+        yield piece if k == 0 else replace(piece, remarks=(), doubts=())
 
 
 def cloud_losses(cloud: PointCloud, path: Path, dropped: Sequence[str] = ()) -> tuple[str, ...]:
@@ -326,7 +328,9 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         holds_sigma = SIGMA_LOSS not in losses
         losses = tuple(words for words in losses if words not in _never_had(found))
         without = (NO_SIGMA,) if holds_sigma and not cloud.covariance_mm2.any() else ()
-        conversion = Conversion(what, losses, (*found.remarks, *without), cloud.forced)
+        conversion = Conversion(
+            what, losses, (*found.remarks, *found.doubts, *without), cloud.forced
+        )
     else:
         calibration, losses = _camera(source)
         forced = calibration.provenance.forced

@@ -138,13 +138,14 @@ def _tip(table: CsvTable) -> tuple[float, bool]:
     for comment in table.comments:
         found = re.findall(r"(point|tip_diameter_mm)\s*=\s*([^,;]+)", comment)
         stated |= {key: value.strip() for key, value in found}
-        if not found and MEANS_TIP.search(comment):
-            raise FileFormatError(
-                f"the comment '{comment.strip()}' speaks of a tip and is not understood",
-                where=table.where,
-                remedy="write '# point = tip-centre, tip_diameter_mm = 6', or with surface where "
-                "the tip's radius is taken off; else leave the comment out",
-            )
+    unclear = [comment.strip() for comment in table.comments if MEANS_TIP.search(comment)]
+    if unclear and not stated:
+        raise FileFormatError(
+            f"the comment '{unclear[0]}' speaks of a tip and is not understood",
+            where=table.where,
+            remedy="write '# point = tip-centre, tip_diameter_mm = 6', or with surface where "
+            "the tip's radius is taken off; else leave the comment out",
+        )
     kind = stated.get("point", "tip-centre" if "tip_diameter_mm" in stated else "surface")
     is_surface = kind == "surface"
     if is_surface and "tip_diameter_mm" not in stated:

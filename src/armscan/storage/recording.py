@@ -385,10 +385,14 @@ def is_recording(folder: Path) -> bool:
     return is_file(folder / EXPOSURES_FILE) if packed is None else not packed[1]
 
 
-def recording_tables(folder: Path) -> tuple[Path, ...]:
-    """Its list of exposures, its arm's samples and geometry and its session, if there are any."""
-    places = (folder / name for name in (EXPOSURES_FILE, ARM_FILE, ARM_MODEL_FILE, SESSION_FILE))
-    return tuple(path for path in places if is_file(path))
+def recording_tables(folder: Path, other_arm: Path | None = None) -> tuple[Path, ...]:
+    """Its list of exposures, its arm's samples and geometry and its session, if there are any.
+
+    Where another geometry is used, that stands last, and its own is left out.
+    """
+    names = (EXPOSURES_FILE, ARM_FILE, "" if other_arm else ARM_MODEL_FILE, SESSION_FILE)
+    own = tuple(path for path in (folder / name for name in names if name) if is_file(path))
+    return own if other_arm is None else (*own, other_arm)
 
 
 def camera_tables(folder: Path) -> tuple[Path, ...]:

@@ -110,10 +110,10 @@ def test_poses_taken_for_something_else(scan: BallScan, wrong: Misread, words: s
     assert words in cause(misread(scan, wrong))
 
 
-@pytest.mark.parametrize("binning", [1, 2])
-def test_mirrored_images(scan: BallScan, binning: int) -> None:
-    """Stripes are in pixels of the full sensor, the size of binned images in their own."""
-    size = (CAMERA.width_px // binning, CAMERA.height_px // binning)
+@pytest.mark.parametrize(("binning", "told"), [(1, 1), (2, 2), (2, 1)])
+def test_mirrored_images(scan: BallScan, binning: int, told: int) -> None:
+    """Stripes are in pixels of the sensor, the size in those of binned images or the sensor's."""
+    size = (CAMERA.width_px // told, CAMERA.height_px // told)
     setup = CameraSetup(*size, window=SensorWindow(binning=binning))
     binned = replace(scan, session=Session(cameras=(setup,)))
     assert "mirrored, right to left" in cause(binned, mirrored=True)

@@ -117,6 +117,8 @@ def table(header: str, *row: object) -> str:
         (table("# metres", np.column_stack([TURN.as_matrix(), METRES]).ravel()), "intrinsic-xyz"),
         (table("# places in metres, angles in degrees", METRES, ANGLES), "extrinsic-xyz"),
         (table("# Unit: meters", METRES, ANGLES), "extrinsic-xyz"),
+        (table("# x y z (in metres), repeatability 0.1 mm", METRES, ANGLES), "extrinsic-xyz"),
+        (table("# x y z metres, angles in degrees", METRES, ANGLES), "extrinsic-xyz"),
         (table("# arm stands 3 metres from the door", PLACE, ANGLES), "extrinsic-xyz"),
         (table("# was in metres, is in mm now", PLACE, ANGLES), "extrinsic-xyz"),
         (table("# in metres\nx_mm,y_mm,z_mm,a_deg,b_deg,c_deg", PLACE, ANGLES), "extrinsic-xyz"),

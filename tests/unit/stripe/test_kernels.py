@@ -362,11 +362,10 @@ def test_a_narrow_section_is_told_however_far_is_looked() -> None:
     points = np.tile([200.0, 1.0, 1.0, 0.0, 0.0, 1.0], (1, 1))
     fits = np.array([[200.3, 100.0, 0.6, 0.1, 0.0, 1.0, 0.0, 0.0]])
     none, noise, section = np.zeros((1, 1), np.uint8), np.array([0.01, 0.1, 1.0]), np.full(4, 0.01)
-    told = []
+    told, sides = [], np.full((1, 2), 5.0)
     for reach in (12, 190):
         said, pixels = np.zeros((1, 8)), np.zeros((3, 2 * reach + 1))
-        beside = np.full(1, 0.6), np.full((1, 2), 5.0)
-        given = (image, none, EVEN, points, *beside, fits, noise, section)
+        given = (image, none, EVEN, points, np.full(1, 0.6), sides, fits, noise, section)
         n = weigh_section(*given, reach, said, pixels)
         told.append((said, pixels[:, :n]))
     for near, far in zip(*told, strict=True):

@@ -128,16 +128,19 @@ def test_points_that_are_asked_are_as_if_all_were() -> None:
 
 def test_no_more_is_smoothed_than_was_asked_for() -> None:
     """The sigma of white noise in a half window w falls as the root of 9/4 over its points."""
-    rng, n = np.random.default_rng(5), 3000
-    points = np.stack([np.arange(float(n)), rng.normal(0.0, 0.05, n)], axis=1)
+    rng, n, turn = np.random.default_rng(5), 3000, 0.1
+    along, normal = np.array([1.0, np.tan(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    off = rng.normal(0.0, 0.05, n)
+    points = np.arange(float(n))[:, None] * along + off[:, None] * normal
     course = Polyline(
-        points, np.tile([0.0, 1.0], (n, 1)), np.full(n, 0.05), np.zeros(n, np.int64), np.ones(n) > 0
+        points, np.tile(normal, (n, 1)), np.full(n, 0.05), np.zeros(n, np.int64), np.ones(n) > 0
     )
     stated = []
-    for largest_px in (2.0, 4.0, 12.0):
+    for largest_px in (1.0, 4.5, 12.5):
         found = smooth(course, largest_px)
         stated.append(float(np.median(found.sigma)))
-        assert np.std(found.points[:, 1]) == pytest.approx(stated[-1], rel=0.1)
-        expected = 0.05 * np.sqrt(9.0 / 4.0 / (2.0 * largest_px + 1.0))
+        assert np.std(found.points @ normal) == pytest.approx(stated[-1], rel=0.1)
+        n_points = 1 + 2 * int(max(largest_px, 3.2) * np.cos(turn))
+        expected = 0.05 * np.sqrt(9.0 / 4.0 / n_points)
         assert stated[-1] == pytest.approx(expected, rel=0.15)
     assert stated[0] > stated[1] > stated[2]

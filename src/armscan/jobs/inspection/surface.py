@@ -80,7 +80,7 @@ def draw_mesh(
     return Summary(
         title="Mesh" + (" (simulated data)." if is_simulated else "."),
         quantities=quantities,
-        warnings=sentences((*source.remarks, *_warnings(full), *rounded)),
+        warnings=sentences((*source.remarks, *source.doubts, *_warnings(full), *rounded)),
         written=written,
         next_step=f"open {job.output} in any program for meshes" if written else "",
         forced=cloud.forced,
@@ -160,7 +160,7 @@ def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
     found = clean_cloud(cloud, options)
     losses = cloud_losses(found.cloud, job.output, source.dropped)
     lost = (f"the new file does not hold: {', '.join(losses)}",) if losses else ()
-    warnings = (*source.remarks, *found.warnings, *lost)
+    warnings = (*source.remarks, *source.doubts, *found.warnings, *lost)
     provenance = job.provenance((path,), (options,), warnings=warnings, forced=cloud.forced)
     is_simulated = cloud.is_simulated or are_simulated((path,))
     page = cleaning_page(found, cloud.points_mm, provenance, is_simulated=is_simulated)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 
@@ -55,6 +55,7 @@ STOP_NS = 500_000_000
 """Standing still for so long ends a pass."""
 NEWER_NS = 1_000_000_000
 """An image that came so long after the last one that was measured is shown without stripes."""
+RANGE_NS = 2 * NEWER_NS
 SELDOM_NS = 500_000_000
 """While recording is behind, one instant in so long is measured: it needs the processor."""
 LATENCIES = 500
@@ -147,7 +148,7 @@ class LiveSnapshot:
     base_from_tool
         The latest pose; None where it is not known.
     range_mm
-        Median depth in Sensor of the latest points; None where none was placed for a second.
+        Median depth in Sensor of the latest points; None where none was placed for two seconds.
     n_passes, n_points
         Passes and shown points.
     cloud_version
@@ -274,7 +275,7 @@ class LiveSession:
         self._latest: Pose[Base, Tool] | None = None
         self._moved_ns = 0
         self._last_moved: Pose[Base, Tool] | None = None
-        self._range_mm, self._ranged_ns = cast(float | None, None), 0
+        self._ranged: tuple[int, float | None] = 0, None
         self._arrivals: deque[int] = deque(maxlen=LATENCIES)
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
         self._next_pass: int | None = 0
@@ -411,8 +412,7 @@ class LiveSession:
         if self._state in ("closed", "stopped"):
             return
         if self.options.exposure.mode != "fixed":
-            # a control waits for its camera, which may be unplugged
-            self._rig.darken()
+            self._rig.darken()  # a control waits for its camera, which may be unplugged
         for control in self._controls:
             control.stop()
         self._acquisition.stop()
@@ -450,7 +450,7 @@ class LiveSession:
                 state=self._state,
                 cameras=views,
                 base_from_tool=self._latest,
-                range_mm=self._range_mm if now_ns - self._ranged_ns < NEWER_NS else None,
+                range_mm=self._ranged[1] if now_ns - self._ranged[0] < RANGE_NS else None,
                 n_passes=len(self._passes),
                 n_points=sum(len(one.voxels) for one in self._passes),
                 cloud_version=self._version,
@@ -578,8 +578,8 @@ class LiveSession:
         if last is not None and _is_still(last, pose):
             if self._next_pass is None and t_ns - self._moved_ns > STOP_NS:
                 self._next_pass = number
-            if time.monotonic_ns() - self._ranged_ns < NEWER_NS:
-                self._ranged_ns = time.monotonic_ns()
+            if time.monotonic_ns() - self._ranged[0] < RANGE_NS:
+                self._ranged = time.monotonic_ns(), self._ranged[1]
             return LiveStatus.STILL
         self._last_moved, self._moved_ns = pose, t_ns
         return LiveStatus.NOT_SHOWN if number % self.options.measured_every else None
@@ -644,8 +644,7 @@ class LiveSession:
         self, one: MeasuredInstant, waiting: WaitingInstant, transform: BaseTransform
     ) -> None:
         """Put the points of an instant into the pass that it belongs to."""
-        number, instant = waiting.number, waiting.instant
-        pose = instant.pose
+        number, instant, pose = waiting.number, waiting.instant, waiting.instant.pose
         if pose is None:
             return
         clouds, depths = [], []
@@ -674,8 +673,7 @@ class LiveSession:
                     view = CameraView(frame.image, pixels[seen], sheet[seen])
                     self._measured[camera] = frame.t_host_ns, view
             depth = np.concatenate(depths)
-            self._range_mm = float(np.median(depth)) if len(depth) else None
-            self._ranged_ns = time.monotonic_ns()
+            self._ranged = time.monotonic_ns(), float(np.median(depth)) if len(depth) else None
             self._counts[LiveStatus.PLACED] += 1
             self._version += 1
             taken_ns = instant.t_ns or max(one.t_host_ns for one in instant.frames if one)
@@ -693,8 +691,8 @@ class LiveSession:
 
 
 def _is_still(one: Pose[Base, Tool], other: Pose[Base, Tool]) -> bool:
-    path = float(np.linalg.norm(one.translation_mm - other.translation_mm))
-    return path < STILL_MM and _turn_rad(one, other) < STILL_RAD
+    moved = one.translation_mm - other.translation_mm
+    return float(np.linalg.norm(moved)) < STILL_MM and _turn_rad(one, other) < STILL_RAD
 
 
 def _turn_rad(one: Pose[Base, Tool], other: Pose[Base, Tool]) -> float:

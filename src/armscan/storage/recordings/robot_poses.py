@@ -189,7 +189,8 @@ HEADERS = (
 METRES = re.compile(r"^x[_ (\[]*m\b", re.IGNORECASE)
 """The first word of a header whose positions are in metres."""
 METRES_COMMENT = re.compile(
-    rb"^[ \t]*(?!.*(?:mm\b|millimet))#(?:.*(?:\bin|\bare|\bis|[:=(\[]))?[ \t]*met(?:re|er)s\b",
+    rb"^[ \t]*(?!.*(?:\b(?:in|is|are|to)|[:=(\[])[ \t]*(?:mm\b|millimet))"
+    rb"#(?:.*(?:\b(?:in|are|units?|positions?|places?|[xyz])|[:=(\[]))?[ \t]*met(?:re|er)s\b",
     re.IGNORECASE | re.MULTILINE,
 )
 """A comment which says that positions are in metres; others tell of metres beside the subject."""

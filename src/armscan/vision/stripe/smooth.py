@@ -26,8 +26,6 @@ from armscan.kernels.stripe.smoothing import (
 )
 
 SMALLEST_WINDOW_PX = 3.2
-LEAST_WINDOW_PX = 1.0
-"""However little smoothing is asked for."""
 WINDOW_RATIO = 1.6
 CONFIDENCE = 2.2
 LAGS = 6
@@ -149,8 +147,8 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     The noise of neighbours is measured from the residuals, not assumed: its size corrects the
     sigmas, and its correlation widens those of the smoothed centres.
 
-    ``course``: The centres. ``largest_px``: Largest half window; 0 only measures the noise, which
-    is done in windows of twice `SMALLEST_WINDOW_PX` at least.
+    ``course``: The centres. ``largest_px``: Largest half window, `SMALLEST_WINDOW_PX` at least, as
+    a parabola needs its points; 0 only measures the noise, in windows of twice that or more.
     """
     half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
     around = Neighbourhoods(course, half)
@@ -165,7 +163,7 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
         around.leave_out(dropped)
     found = noise_correlation(course, half[-1])
     if 0.0 < largest_px < half[-1]:
-        half = windows(max(largest_px, LEAST_WINDOW_PX))
+        half = windows(max(largest_px, SMALLEST_WINDOW_PX))
         around = Neighbourhoods(course, half)
     is_measured = found is not None
     correlation = WHITE if found is None else found

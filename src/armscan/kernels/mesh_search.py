@@ -232,32 +232,12 @@ def _triangle_distance(
     return square
 
 
-ALIKE = 1e-12
-"""Squared distances that differ by less, in parts of them, are the same but for rounding."""
-
-
-@compiled(error_model="numpy")
-def _lean(x: float, y: float, z: float, triangles: Table, i: int, found: Floats) -> float:
-    """How far a point lies off the plane of a triangle: most for the one that it lies above.
-
-    ``found``: (3,) of `_triangle_distance`, which says where the closest point is.
-    """
-    off = 0.0
-    for k, at in enumerate((x, y, z)):
-        place = triangles[i, k] + found[0] * triangles[i, 3 + k] + found[1] * triangles[i, 6 + k]
-        off += triangles[i, 9 + k] * (at - place)
-    return abs(off)
-
-
 @compiled(error_model="numpy")
 def find_closest(
     points: Table, order: Ints, towards: Table, least_cosine: float, reach: float, nodes: Table,
     links: IntTable, triangles: Table, face: IntsOut, place: IntsOut, closest: TableOut,
 ) -> None:  # fmt: skip
     """Closest point of a mesh to each of some points.
-
-    Of triangles that share the closest point, on an edge or in a corner, the one counts off whose
-    plane the point lies most, and of these the first.
 
     ``points``: (N, 3). ``order``: (M,) rows to do, neighbours beside each other: each begins with
     the triangle of the one before. ``towards``: (N, 3) unit normals of the points, or (0, 3):
@@ -280,6 +260,7 @@ def find_closest(
         best = reach * reach
         best_face = -1
         if last >= 0:
+            # of triangles that are as near, beyond an edge, this one is kept
             bound = _triangle_distance(x, y, z, triangles, last, found)
             is_open = True
             if is_gated:
@@ -293,13 +274,12 @@ def find_closest(
                 kept[0] = found[0]
                 kept[1] = found[1]
                 kept[2] = found[2]
-        limit = best + ALIKE * best
         n_open = 1
         open_node[0] = 0
         open_distance[0] = 0.0
         while n_open > 0:
             n_open -= 1
-            if open_distance[n_open] > limit:
+            if open_distance[n_open] >= best:
                 continue
             node = open_node[n_open]
             while links[node, 0] >= 0:
@@ -310,11 +290,11 @@ def find_closest(
                 if far_distance < near_distance:
                     near, far = far, near
                     near_distance, far_distance = far_distance, near_distance
-                if far_distance <= limit and n_open < STACK:
+                if far_distance < best and n_open < STACK:
                     open_node[n_open] = far
                     open_distance[n_open] = far_distance
                     n_open += 1
-                if near_distance > limit:
+                if near_distance >= best:
                     node = -1
                     break
                 node = near
@@ -329,17 +309,8 @@ def find_closest(
                     if cosine < least_cosine:
                         continue
                 distance = _triangle_distance(x, y, z, triangles, f, found)
-                if distance > limit or f == best_face:
-                    continue
-                is_nearer = distance < (best if best_face < 0 else best - ALIKE * best)
-                if best_face >= 0 and not is_nearer:
-                    more = _lean(x, y, z, triangles, f, found)
-                    more -= _lean(x, y, z, triangles, best_face, kept)
-                    is_same = abs(more) <= math.sqrt(ALIKE * best)
-                    is_nearer = f < best_face if is_same else more > 0.0
-                if is_nearer:
+                if distance < best:
                     best = distance
-                    limit = best + ALIKE * best
                     best_face = f
                     kept[0] = found[0]
                     kept[1] = found[1]

@@ -327,8 +327,7 @@ class ConsolePage:
 
     def start_or_pause(self) -> None:
         """Begin a scan, pause it, or go on."""
-        # before the lock: what waited for the end of this scan does not begin another
-        live = self.live
+        live = self.live  # what waited for the end of this one does not begin another
         with self._lock:
             if live is None:
                 self._begin()
@@ -422,7 +421,8 @@ class ConsolePage:
         works = tuple(self._under_way)
         self._working.content = padded(paragraph(works[-1][0] if works else "", MUTED))
         self._working.visible = self._calculate.disabled = bool(works)
-        self._take.disabled = bool(works) and BY_NAME[self.step].filling == "placements"
+        is_worked_for = BY_NAME[self.step].filling == "placements"
+        self._take.disabled = self.controls.is_busy or bool(works and is_worked_for)
         self._bar.visible = self._cancel.visible = any(can_end for _, can_end in works)
 
     def _open_chosen(self) -> None:

@@ -140,6 +140,11 @@ class Controls:
                 button.disabled = False
             self._hand.release()
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether something is being done that is alone."""
+        return self._hand.locked()
+
     def tried(self, work: Callable[[], object], *, is_answer: bool = False) -> None:
         """Do what a button asks for; `is_answer` if it may be the answer to a question."""
         try:

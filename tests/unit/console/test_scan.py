@@ -164,7 +164,7 @@ def test_an_arms_button_counts_from_the_begin_on(tmp_path: Path) -> None:
     # what came a minute ago is neither the rate nor the distance of now
     minute_ago_ns = time.monotonic_ns() - 60 * 10**9
     live.session._arrivals.extend(minute_ago_ns + 10**7 * k for k in range(500))
-    live.session._range_mm, live.session._ranged_ns = 130.0, minute_ago_ns
+    live.session._ranged = minute_ago_ns, 130.0
     assert live.snapshot.rate_hz < 10.0 and live.snapshot.range_mm is None
     live.session.stop()
 

@@ -153,14 +153,11 @@ def test_a_step_by_its_buttons_alone_and_a_browser_closed_and_a_job_killed(
     "ARMSCAN_JOURNEY" not in os.environ, reason="minutes long, the whole journey: make journey"
 )
 @pytest.mark.parametrize(
-    ("rig", "verdicts"),
-    # with two cameras the target's turns and the lines' spacing leave remarks
-    [(RIG, {"good"}), (RIG.replace("single", "multi"), {"good", "doubtful"})],
+    "rig",
+    [RIG, RIG.replace("single", "multi")],
     ids=["one-camera", "two-cameras"],
 )
-def test_a_new_user_gets_from_an_empty_folder_to_a_report(
-    tmp_path: Path, rig: str, verdicts: set[str]
-) -> None:
+def test_a_new_user_gets_from_an_empty_folder_to_a_report(tmp_path: Path, rig: str) -> None:
     with (
         open_console(tmp_path / "first", rig, port=0) as (page, address),
         operator(tmp_path / "browser", address) as one,
@@ -200,7 +197,8 @@ def test_a_new_user_gets_from_an_empty_folder_to_a_report(
         if step.name is not StepName.CHECK
     }
     # 24 of the ball's 70 exposures leave the check inconclusive as often as not
-    assert set(states.values()) <= verdicts
+    # the target's residuals and turns, and the spacing of lines, may leave remarks
+    assert set(states.values()) <= {"good", "doubtful"}
     assert all(states[name] == "good" for name in (StepName.HAND_EYE, StepName.SCAN))
 
 

@@ -79,7 +79,7 @@ NotUsed = Annotated[
 Distortion = Annotated[
     str | None,
     typer.Option(
-        help="auto, none, k1, k1k2, k1k2p1p2, k1k2p1p2k3 or fisheye.",
+        help="auto (of a pair: all), none, k1, k1k2, k1k2p1p2, k1k2p1p2k3 or fisheye.",
         show_default=DefaultOf("armscan.calibration.cameras.result:CameraOptions.distortion"),
     ),
 ]

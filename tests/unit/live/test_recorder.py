@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from armscan.devices.clocks import ElementStatus
-from armscan.devices.matching import MatchedInstant, TimedSample
+from armscan.devices.matching import InstantMatcher, MatchedInstant, TimedSample
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
 from armscan.errors import EstimationError, InputError
+from armscan.geometry.poses import Base, Pose, Tool
 from armscan.jobs.info import describe_recording
 from armscan.models.arm import forward, thesis_arm
 from armscan.pipeline.live.acquire import LiveEvent
@@ -226,6 +227,30 @@ def test_frames_before_the_first_trigger_are_listed_and_get_no_pose(tmp_path: Pa
     poses = exposure_poses(recorded.rows, recorded.arm, recorded.session.clock)
     none, found = int(PoseStatus.NO_TRIGGER), int(PoseStatus.FOUND)
     assert poses.status.tolist() == [none, none, found, found, found]
+
+
+def test_counts_that_both_begin_anew_give_the_poses_that_were_shown(tmp_path: Path) -> None:
+    # the camera was away for triggers 3 and 4 of the first count; x is the number of the step
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    matcher = InstantMatcher(is_triggered=True, has_controller=False)
+    shown: list[float] = []
+    for k in range(12):
+        number, t_ns = k % 6, 10**10 + 10**9 * k
+        pose = Pose[Base, Tool](np.eye(3), np.array([float(k), 0.0, 0.0]))
+        sample = ArmSample(k, t_ns, t_ns + 5_000_000, pose, trigger_id=number)
+        recorder.add_samples(matcher.add_samples((sample,)))
+        if k not in (3, 4):
+            matcher.add_frame(Frame(IMAGES[0], k, t_ns, t_ns + 6_000_000, trigger_id=number))
+        for one in matcher.take(t_ns + 10**9):
+            recorder.add_instant(one)
+            shown += [] if one.pose is None else [float(one.pose.translation_mm[0])]
+    recorder.close()
+    recorded = read_recording(tmp_path / "scan.mcap")
+    poses = exposure_poses(recorded.rows, recorded.arm, recorded.session.clock)
+    assert shown == [0, 1, 2, 5, 6, 7, 8, 9, 10, 11]
+    assert poses.has_pose.all() and poses.translations_mm[:, 0].tolist() == shown
+    assert recorded.warnings == poses.warnings == ()
 
 
 @pytest.mark.parametrize("has_none", ["frames", "samples"])

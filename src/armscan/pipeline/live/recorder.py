@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,9 @@ class LiveRecorder:
     the recording says that its clocks are separate: nothing is placed by them. A frame that no
     table may place is written with its pixels, its flag (``incomplete``, ``no-time``, ``late``,
     ``back``) and the time of the frame before it, 0 for the first: whoever reads the recording sets
-    it aside, and counts it.
+    it aside, and counts it. Where the arm counts its triggers from the first one again, the ids of
+    the tables go on after those before, of its samples and of the frames that came since: no id is
+    there twice.
 
     Parameters
     ----------
@@ -90,6 +93,8 @@ class LiveRecorder:
         self._last_sample_ns = -1
         self._last_device_ns = 0
         self._samples: list[TimedSample] = []
+        self._arm_id = self._highest_id = -1
+        self._ids_from = 0
 
     def begin(self) -> None:
         """Make the file.
@@ -163,11 +168,24 @@ class LiveRecorder:
 
     def add_samples(self, samples: tuple[TimedSample, ...]) -> None:
         """Keep those of the arm, some together."""
-        self._samples += samples
+        self._samples += map(self._numbered, samples)
         if self._samples:
             first, last = (self._samples[k].sample.t_host_ns for k in (0, -1))
             if last - first >= BATCH_NS:
                 self._write_samples()
+
+    def _numbered(self, one: TimedSample) -> TimedSample:
+        """A sample with the id that the tables give its trigger."""
+        number = one.sample.trigger_id
+        if number is None or not self._is_triggered or one.status in _REPEATED:
+            return one
+        if number < self._arm_id:
+            self._ids_from = self._highest_id + 1
+        self._arm_id = number
+        self._highest_id = max(self._highest_id, self._ids_from + number)
+        if not self._ids_from:
+            return one
+        return replace(one, sample=replace(one.sample, trigger_id=self._ids_from + number))
 
     def add_events(self, events: tuple[LaserEvent, ...]) -> None:
         """Keep what was on, with the controller's own count and times."""
@@ -216,13 +234,17 @@ class LiveRecorder:
             # a clock that was related anew; by time such a frame belongs nowhere
             t_ns, flags = (last_ns + 1, flags) if self._is_triggered else (None, [*flags, "back"])
         self.n_aside += t_ns is None
+        trigger_id = None
+        if self._is_triggered and frame.trigger_id is not None:
+            trigger_id = self._ids_from + frame.trigger_id
+            self._highest_id = max(self._highest_id, trigger_id)
         row = ExposureRow(
             self._index,
             last_ns if t_ns is None else t_ns,
             camera,
             f"images/{self._index:06d}.png",
             lasers,
-            frame.trigger_id if self._is_triggered else None,
+            trigger_id,
         )
         self._writer.add_exposure(row, frame.image, flags)
         self._index += 1

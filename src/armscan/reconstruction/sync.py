@@ -168,9 +168,9 @@ def exposure_poses(
     The arm's track is checked by itself (`armscan.reconstruction.track_faults`): exposures at
     samples that cannot be right get no pose.
 
-    Trigger ids decide if exposures and samples have them, but for those of another count, as times of
-    one clock show. Else the pose is interpolated in time
-    between two neighbouring known samples: the rotation by SLERP, the place along a straight line.
+    Trigger ids decide if exposures and samples have them, but for those of another count, as times
+    of one clock show. Else the pose is interpolated in time between two neighbouring known samples:
+    the rotation by SLERP, the place along a straight line.
     An exposure that was to have an id and has none gets no pose: its time may only order.
 
     Parameters

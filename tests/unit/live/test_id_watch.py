@@ -14,6 +14,7 @@ from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame
 from armscan.pipeline.live.acquire import (
     FRAMES_WITHOUT,
+    IDS_APART,
     LASERS_MIXED,
     LASERS_UNTOLD,
     SAMPLES_WITHOUT,
@@ -61,8 +62,9 @@ def test_an_arm_without_ids_is_told_of_once_images_bear_some() -> None:
     watch.see_frame(frame(20, 1), 0)
     assert watch.see_samples([sample(21, None)]) == ""
     assert watch.see_samples([sample(25, None)]) == SAMPLES_WITHOUT
-    assert watch.see_samples([sample(26, None), sample(26, 7)]) == ""
-    assert watch.see_samples([sample(40, None)]) == ""
+    assert watch.see_samples([sample(26, None), sample(26, 7)]) == IDS_APART
+    assert watch.see_samples([sample(40, 1)]) == ""
+    assert watch.see_samples([sample(41, 8)]) == ""
 
 
 def test_lasers_that_are_never_known_are_told_of() -> None:

@@ -253,6 +253,38 @@ def test_counts_that_both_begin_anew_give_the_poses_that_were_shown(tmp_path: Pa
     assert recorded.warnings == poses.warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("is_triggered", "changes", "reason"),
+    [
+        (True, {}, ""),
+        (True, {"trigger_id": 10**6}, "no trigger's id is that of an image"),
+        (True, {"trigger_id": None}, "no sample of the arm bears"),
+        (True, {"pose": None}, "none of 5 samples of the arm has a pose"),
+        (False, {}, ""),
+        (False, {"pose": None}, "none of 5 samples of the arm has a pose"),
+        (False, {"t_host_ns": 10**9}, "none came while the arm sent"),
+        (False, {"t_host_ns": None}, "the arm sent no sample"),
+    ],
+)
+def test_why_nothing_can_be_placed_is_known_at_the_end(
+    is_triggered: bool, changes: dict[str, Any], reason: str, tmp_path: Path
+) -> None:
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=is_triggered))
+    recorder.begin()
+    for k in range(5):
+        t_ns = 5_000_000_000 + 10**7 * k
+        recorder.add_instant(instant(k, t_ns))
+        pose = triggered_scan(5).truth[k]
+        sample = replace(ArmSample(k, 1, t_ns, pose, trigger_id=k + 3), **changes)
+        if sample.t_host_ns is not None:
+            timed = TimedSample(sample, sample.t_host_ns + k, ElementStatus.USABLE, sample.pose)
+            recorder.add_samples((timed,))
+    recorder.close()
+    assert recorder.n_usable == 5
+    words = recorder.unplaced[0]
+    assert words.startswith(reason) if reason else recorder.unplaced == ("", "")
+
+
 @pytest.mark.parametrize("has_none", ["frames", "samples"])
 def test_times_that_only_order_give_no_pose_where_no_id_is(tmp_path: Path, has_none: str) -> None:
     recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))

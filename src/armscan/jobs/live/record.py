@@ -259,7 +259,7 @@ class _Recording:
                 + (f"; {self._why_ended}" if self._why_ended else ""),
                 remedy="check camera and trigger; `armscan devices` lists what answers",
             )
-        if not self._recorder.n_usable:
+        if not self._recorder.n_usable or any(self._recorder.unplaced):
             raise self._useless()
         if not is_kept:
             raise DeviceError(
@@ -292,6 +292,8 @@ class _Recording:
             ),
         )
         _, fact, remedy = max(reasons, key=lambda reason: reason[0])
+        if recorder.n_usable:
+            fact, remedy = recorder.unplaced
         return DeviceError(
             f"none of {self._end.n_written} exposures can be used: {fact}"
             + (f"; {self._why_ended}" if self._why_ended else ""),
@@ -456,12 +458,6 @@ class _Recording:
                 0,
                 f"{self._recorder.n_aside} of {self._end.n_written} exposures are kept and not to "
                 "be used: parts of them were lost, or their clock was not known",
-            )
-        if self._recorder.n_samples and not self._recorder.n_posed:
-            warnings.insert(
-                0,
-                f"none of {self._recorder.n_samples} samples of the arm has a pose: reference the "
-                "arm, let it send poses, or name its arm_model in rig.toml, and record again",
             )
         if self._recorder.n_untriggered:
             warnings.insert(

@@ -57,6 +57,10 @@ SAMPLES_WITHOUT = (
     "images bear triggers' ids, and none of its samples does: no image gets a pose; let the arm "
     "send a sample with the id at each trigger, or leave is_common_trigger out"
 )
+IDS_APART = (
+    "no trigger's id of its samples is that of an image: no image gets a pose; let camera and arm "
+    "count the same triggers from the same one on, or leave is_common_trigger out"
+)
 LASERS_MIXED = (
     "what lasers were on is not known: the images bear no trigger's id, and the lasers change "
     f"within {LASER_BOUND_NS / 1e6:g} ms; such images are kept and not measured: use a schedule "
@@ -152,6 +156,22 @@ class _Stream:
     seen_ns: int = 0
 
 
+class CommonIds:
+    """Whether an id of a trigger came both with an image and with a sample of the arm."""
+
+    def __init__(self) -> None:
+        self._seen: tuple[set[int], set[int]] = (set(), set())
+        self.is_found = False
+
+    def see(self, trigger_id: int | None, *, is_arm: bool) -> None:
+        """Take what came."""
+        if trigger_id is None or self.is_found:
+            return
+        self._seen[is_arm].add(trigger_id)
+        if trigger_id in self._seen[not is_arm]:
+            self.is_found, self._seen = True, (set(), set())
+
+
 class IdWatch:
     """Looks at all that arrives and tells what will not be matched; called from one thread.
 
@@ -170,11 +190,13 @@ class IdWatch:
         self._cameras_with_ids: set[int] = set()
         self._triggered_ns: int | None = None
         self._has_arm_ids = False
+        self._ids = CommonIds()
         self._unknown_ns: int | None = None
 
     def see_frame(self, frame: Frame, camera: int) -> str:
         """What a person should know of this camera now; empty for nothing."""
         begun_ns = self._begun_ns.setdefault(camera, frame.t_host_ns)
+        self._ids.see(frame.trigger_id, is_arm=False)
         if frame.trigger_id is not None:
             self._cameras_with_ids.add(camera)
             if self._triggered_ns is None:
@@ -184,11 +206,14 @@ class IdWatch:
 
     def see_samples(self, samples: Sequence[ArmSample]) -> str:
         """The same of the arm."""
-        self._has_arm_ids |= any(one.trigger_id is not None for one in samples)
+        for one in samples:
+            self._has_arm_ids |= one.trigger_id is not None
+            self._ids.see(one.trigger_id, is_arm=True)
         since_ns = self._triggered_ns
-        if not self._is_triggered or self._has_arm_ids or since_ns is None or not samples:
+        if not self._is_triggered or self._ids.is_found or since_ns is None or not samples:
             return ""
-        return SAMPLES_WITHOUT if samples[-1].t_host_ns > since_ns + WATCHED_NS else ""
+        text = IDS_APART if self._has_arm_ids else SAMPLES_WITHOUT
+        return text if samples[-1].t_host_ns > since_ns + WATCHED_NS else ""
 
     def see_instant(self, instant: MatchedInstant) -> str:
         """The same of the laser controller; what has no time yet tells nothing."""

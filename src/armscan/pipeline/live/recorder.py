@@ -19,7 +19,7 @@ from armscan.devices.matching import MatchedInstant, TimedSample
 from armscan.devices.protocols import Frame, LaserEvent
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray
-from armscan.pipeline.live.acquire import LiveEvent
+from armscan.pipeline.live.acquire import CommonIds, LiveEvent
 from armscan.pipeline.live.rig import Rig
 from armscan.records.recording import (
     LASER_UNKNOWN,
@@ -93,8 +93,10 @@ class LiveRecorder:
         self._last_sample_ns = -1
         self._last_device_ns = 0
         self._samples: list[TimedSample] = []
+        self._first_ns, self._first_sample_ns = 2**63, -1
         self._arm_id = self._highest_id = -1
         self._ids_from = 0
+        self._ids = CommonIds()
 
     def begin(self) -> None:
         """Make the file.
@@ -121,6 +123,48 @@ class LiveRecorder:
     def n_exposures(self) -> int:
         """Exposures that came; the next one has this index."""
         return self._index
+
+    @property
+    def unplaced(self) -> tuple[str, str]:
+        """Why no exposure can have a pose, and what to do; empty where some can, or without arm.
+
+        It is known once the recording is closed.
+        """
+        is_apart = max(self._last_ns) < self._first_sample_ns or (
+            self._last_sample_ns < self._first_ns
+        )
+        reasons = (
+            (
+                not self.n_samples,
+                "the arm sent no sample",
+                "see that the arm sends while images come",
+            ),
+            (
+                not self.n_posed,
+                f"none of {self.n_samples} samples of the arm has a pose",
+                "reference the arm, let it send poses, or name its arm_model in rig.toml",
+            ),
+            (
+                self._is_triggered and self._arm_id < 0,
+                "no sample of the arm bears a trigger's id, and ids alone give poses",
+                "let the arm send a sample with the id at each trigger, or record without "
+                "is_common_trigger",
+            ),
+            (
+                self._is_triggered and not self._ids.is_found,
+                "no trigger's id is that of an image and of a sample of the arm",
+                "let camera and arm count the same triggers from the same one on, or record "
+                "without is_common_trigger",
+            ),
+            (
+                not self._is_triggered and is_apart,
+                "none came while the arm sent samples whose time is known",
+                "see that the arm sends while images come",
+            ),
+        )
+        if self._rig.arm is None:
+            return "", ""
+        return next(((fact, remedy) for is_so, fact, remedy in reasons if is_so), ("", ""))
 
     def take_back(self, since: int, until: int) -> None:
         """Have no reader list exposures that came, by index, ``until`` not among them.
@@ -183,6 +227,7 @@ class LiveRecorder:
             self._ids_from = self._highest_id + 1
         self._arm_id = number
         self._highest_id = max(self._highest_id, self._ids_from + number)
+        self._ids.see(self._ids_from + number, is_arm=True)
         if not self._ids_from:
             return one
         return replace(one, sample=replace(one.sample, trigger_id=self._ids_from + number))
@@ -238,6 +283,9 @@ class LiveRecorder:
         if self._is_triggered and frame.trigger_id is not None:
             trigger_id = self._ids_from + frame.trigger_id
             self._highest_id = max(self._highest_id, trigger_id)
+        if t_ns is not None:
+            self._first_ns = min(self._first_ns, t_ns)
+            self._ids.see(trigger_id, is_arm=False)
         row = ExposureRow(
             self._index,
             last_ns if t_ns is None else t_ns,
@@ -282,6 +330,8 @@ class LiveRecorder:
                 times.append(t_ns)
                 kept.append(one)
                 self._last_sample_ns = t_ns
+                if self._first_sample_ns < 0:
+                    self._first_sample_ns = t_ns
         if not kept:
             return None
         n = len(kept)

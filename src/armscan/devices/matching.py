@@ -93,6 +93,8 @@ class MatchedInstant:
         How many instants the matcher handed out before it.
     are_lasers_mixed
         True where its lasers are not known because events so near in time name several.
+    times_ns
+        As ``t_ns``, of each camera by its own clock; empty where nobody told.
     """
 
     frames: tuple[Frame | None, ...]
@@ -103,6 +105,7 @@ class MatchedInstant:
     status: PoseStatus
     number: int = 0
     are_lasers_mixed: bool = False
+    times_ns: tuple[int | None, ...] = ()
 
 
 @dataclass(slots=True)
@@ -113,6 +116,7 @@ class _Open:
     t_ns: int | None
     trigger_id: int | None
     is_passed: list[bool] = field(default_factory=list)
+    times_ns: list[int | None] = field(default_factory=list)
     is_timed: bool = True
 
     @property
@@ -218,9 +222,10 @@ class InstantMatcher:
         partner = self._partner(frame, camera, t_ns)
         if partner is None:
             frames: list[Frame | None] = [None] * len(self.cameras)
-            partner = _Open(frames, t_ns, frame.trigger_id, [False] * len(frames))
+            n = len(frames)
+            partner = _Open(frames, t_ns, frame.trigger_id, [False] * n, [None] * n)
             self._open.append(partner)
-        partner.frames[camera] = frame
+        partner.frames[camera], partner.times_ns[camera] = frame, t_ns
         # where one frame's middle is not sure, the other's time is not that of both
         partner.is_timed &= frame.is_timed
         if t_ns is not None and (camera == 0 or partner.t_ns is None):
@@ -256,6 +261,7 @@ class InstantMatcher:
                     status=status,
                     number=self._n_taken,
                     are_lasers_mixed=are_mixed,
+                    times_ns=tuple(first.times_ns) if first.is_timed else (),
                 )
             )
             self._n_taken += 1

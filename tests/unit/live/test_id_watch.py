@@ -12,12 +12,15 @@ import pytest
 
 from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame
+from armscan.pipeline.instants import SAME_TIME_NS
 from armscan.pipeline.live.acquire import (
+    EXPOSED_APART,
     FRAMES_WITHOUT,
     IDS_APART,
     LASERS_MIXED,
     LASERS_UNTOLD,
     SAMPLES_WITHOUT,
+    TIMES_APART,
     WATCHED_NS,
     IdWatch,
     LiveEvent,
@@ -82,6 +85,29 @@ def test_lasers_that_are_never_known_are_told_of() -> None:
     # a controller that is silent, or idle, is no matter of its schedule
     assert [see(k) for k in range(28, 33)] == [""] * 4 + [LASERS_UNTOLD]
     assert "schedule" not in LASERS_UNTOLD and see(33, **mixed) == LASERS_MIXED
+
+
+@pytest.mark.parametrize(
+    ("is_free", "apart_ns", "exposed_ns", "said"),
+    [
+        (True, SAME_TIME_NS, 0, ""),
+        (True, SAME_TIME_NS + 1, 0, TIMES_APART),
+        # one wire: transports differ, exposures may not
+        (False, 7_000_000, 400_000, ""),
+        (False, 0, 2_400_001, EXPOSED_APART),
+        (False, 0, 0, ""),
+    ],
+)
+def test_cameras_that_do_not_see_one_moment_are_told_of(
+    is_free: bool, apart_ns: int, exposed_ns: int, said: str
+) -> None:
+    watch = IdWatch(is_triggered=False, has_controller=False, is_free=is_free)
+    pair = tuple(replace(frame(1, None), exposure_ns=one) for one in (400_000, exposed_ns))
+    one = MatchedInstant(
+        pair, STEP_NS, (), None, None, PoseStatus.GAP, times_ns=(STEP_NS, STEP_NS + apart_ns)
+    )
+    assert watch.see_pair(one) == said
+    assert watch.see_pair(replace(one, frames=(None, pair[1]))) == ""
 
 
 class Dated(Device):

@@ -18,6 +18,7 @@ from armscan.errors import EstimationError, InputError
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.jobs.info import describe_recording
 from armscan.models.arm import forward, thesis_arm
+from armscan.pipeline.instants import group_instants
 from armscan.pipeline.live.acquire import LiveEvent
 from armscan.pipeline.live.recorder import LiveRecorder
 from armscan.pipeline.live.rig import Rig, RigDescription
@@ -283,6 +284,30 @@ def test_why_nothing_can_be_placed_is_known_at_the_end(
     assert recorder.n_usable == 5
     words = recorder.unplaced[0]
     assert words.startswith(reason) if reason else recorder.unplaced == ("", "")
+
+
+@pytest.mark.parametrize(("trigger", "n_instants"), [("free", 80), ("external", 40)])
+def test_cameras_of_their_own_clock_keep_their_times(
+    trigger: Any, n_instants: int, tmp_path: Path
+) -> None:
+    """7 ms apart at 30 Hz: a wire says that they are of one moment, their own clocks that not."""
+    cameras: Any = [Device(f"camera {k}", [], setup=CameraSetup(16, 12)) for k in (0, 1)]
+    rig = Rig(cameras, description=RigDescription(("c", "d"), trigger=trigger))
+    recorder = LiveRecorder(tmp_path / "scan.mcap", rig)
+    recorder.begin()
+    matcher = InstantMatcher(2, has_arm=False, has_controller=False)
+    for k in range(80):
+        for camera in (0, 1):
+            t_ns = 10**10 + 33_000_000 * k + 7_000_000 * camera
+            matcher.add_frame(Frame(IMAGES[camera], k, t_ns, t_ns + 12_000_000), camera)
+        for one in matcher.take(t_ns):
+            if k >= 40:
+                recorder.add_instant(one)
+    recorder.close()
+    rows = read_recording(tmp_path / "scan.mcap").rows
+    assert len(rows) == 80 and len(group_instants(rows, "")) == n_instants
+    apart_ns = {b.t_ns - a.t_ns for a, b in zip(rows[::2], rows[1::2], strict=True)}
+    assert apart_ns == {7_000_000 if trigger == "free" else 0}
 
 
 @pytest.mark.parametrize("has_none", ["frames", "samples"])

@@ -19,6 +19,7 @@ from armscan.devices.clocks import ElementStatus, StreamMonitor
 from armscan.devices.matching import LASER_BOUND_NS, InstantMatcher, MatchedInstant, TimedSample
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
 from armscan.errors import ArmscanError, DeviceStoppedError
+from armscan.pipeline.instants import SAME_TIME_NS
 from armscan.pipeline.live.rig import Rig, told_as_fault_of
 from armscan.records.exposure import Exposure
 from armscan.records.recording import CameraSetup
@@ -70,6 +71,15 @@ LASERS_UNTOLD = (
     "what lasers were on is not known: the images bear no trigger's id, and within "
     f"{LASER_BOUND_NS / 1e6:g} ms of them it told nothing whose time is known; such images are "
     "kept and not measured: see that it triggers and answers"
+)
+TIMES_APART = (
+    f"images of the cameras are more than {SAME_TIME_NS / 1e6:g} ms apart, and no pair to "
+    "reconstruct: cameras that are to measure together need one trigger"
+)
+EXPOSED_APART = (
+    f"exposure times of the cameras differ by more than {2 * SAME_TIME_NS / 1e6:g} ms, so that the "
+    "middles of what one trigger takes lie apart, and points are wrong while the head moves: give "
+    "both cameras one exposure time"
 )
 STRAINED = {
     ArmFlag.INACCURATE: "it says of itself that its poses are inaccurate: they are not used",
@@ -181,9 +191,12 @@ class IdWatch:
         True if ids alone decide which pose belongs to a frame.
     has_controller
         True if a laser controller tells what was on.
+    is_free
+        True if each camera takes images by its own clock.
     """
 
-    def __init__(self, *, is_triggered: bool, has_controller: bool) -> None:
+    def __init__(self, *, is_triggered: bool, has_controller: bool, is_free: bool = False) -> None:
+        self._is_free = is_free
         self._is_triggered = is_triggered
         self._has_controller = has_controller
         self._begun_ns: dict[int, int] = {}
@@ -227,6 +240,17 @@ class IdWatch:
         if instant.t_ns <= self._unknown_ns + WATCHED_NS:
             return ""
         return LASERS_MIXED if instant.are_lasers_mixed else LASERS_UNTOLD
+
+    def see_pair(self, instant: MatchedInstant) -> str:
+        """What a person should know of the times of two cameras."""
+        first, *others = (frame for frame in instant.frames if frame is not None)
+        if not others:
+            return ""
+        if self._is_free:
+            known = [t_ns for t_ns in instant.times_ns if t_ns is not None]
+            return TIMES_APART if known and max(known) - min(known) > SAME_TIME_NS else ""
+        long = [frame.exposure_ns for frame in (first, *others)]
+        return EXPOSED_APART if min(long) and max(long) - min(long) > 2 * SAME_TIME_NS else ""
 
 
 class Acquisition:
@@ -272,6 +296,7 @@ class Acquisition:
         self._watch = IdWatch(
             is_triggered=rig.description.is_common_trigger and rig.arm is not None,
             has_controller=rig.lasers is not None,
+            is_free=rig.description.trigger == "free",
         )
         self.faults: dict[tuple[str, int], str] = {}
         self._recording: _Recording | None = None
@@ -508,6 +533,7 @@ class Acquisition:
         for instant in self.matcher.take(seen_ns):
             self._deliver(instant)
             self._record_instant(instant)
+            self._warn(self._watch.see_pair(instant))
             if self.rig.lasers is not None:
                 self._warn(self._watch.see_instant(instant), self.rig.lasers.name)
 

@@ -79,6 +79,8 @@ class LiveRecorder:
         self.n_samples = self.n_posed = 0
         self._writer = RecordingWriter(path, options)
         self._rig, self._is_triggered = rig, rig.description.is_common_trigger
+        # what one wire triggers is of one time, however their transports differ
+        self._is_free = rig.description.trigger == "free" and not self._is_triggered
         by_joints = rig.arm is not None and rig.arm.pose_form == "joints"
         self._form: PoseForm = "joints" if by_joints else "quaternion"
         self._session = Session(
@@ -251,6 +253,8 @@ class LiveRecorder:
             # where ids decide, or there is no arm, a time orders the exposures and places nothing
             may_guess = self._is_triggered or self._rig.arm is None
             t_ns = frame.t_host_ns if instant.t_ns is None and may_guess else instant.t_ns
+            if self._is_free and instant.times_ns:
+                t_ns = instant.times_ns[camera] or t_ns
             flags = [] if frame.is_complete else ["incomplete"]
             flags += ["no-time"] if t_ns is None else []
             is_usable = frame.is_complete and t_ns is not None

@@ -12,7 +12,7 @@ seen; it stays in the offset, is as constant as the transport, and is what
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from math import hypot, inf, sqrt
 
@@ -181,13 +181,8 @@ class ClockModel:
         if last - first > WINDOW_NS:
             del self._blocks[0]
             return
-        pairs = zip(self._blocks[::2], self._blocks[1::2], strict=False)
-        odd = self._blocks[-1:] if len(self._blocks) % 2 else []
-        self._blocks = [min(pair, key=self._excess) for pair in pairs] + odd
+        self._blocks = _merged(self._blocks, self._slope)
         self._block_size *= 2
-
-    def _excess(self, block: tuple[int, int]) -> float:
-        return block[1] - block[0] - self._slope * (block[0] - self._blocks[0][0])
 
     def _refit(self) -> None:
         self.fit = fit_clock(self._blocks)
@@ -204,17 +199,41 @@ def _limit_ns(fit: ClockFit, block: tuple[int, int]) -> float:
     return max(SMALLEST_JUMP_NS, JUMP_SIGMAS * (fit.scatter_ns + fit.sigma_ns(block[0])))
 
 
+def _merged(fastest: list[tuple[int, int]], slope: float) -> list[tuple[int, int]]:
+    """The faster one of each two blocks, and the last one where it is alone."""
+    device0 = fastest[0][0]
+    pairs = zip(fastest[::2], fastest[1::2], strict=False)
+    odd = fastest[-1:] if len(fastest) % 2 else []
+    return [min(p, key=lambda b: b[1] - b[0] - slope * (b[0] - device0)) for p in pairs] + odd
+
+
 def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
     """Fit the line of two clocks under pairs of times.
+
+    Delays whose least ones are rare lie under no sharp limit: the line sinks as blocks grow. By how
+    much it would if they were twice as long counts in the sigma of the offset.
+
+    Pairs of times (device, other) in ns are in time order, each the fastest of a block.
+    """
+    fit = _fit(fastest, FEWEST_BLOCKS)
+    if isinstance(fit, FitFailure):
+        return fit
+    longer = _fit(_merged(fastest, fit.drift), FEWEST_BLOCKS // 2)
+    if isinstance(longer, FitFailure):
+        return fit
+    sunk = longer.to_other_ns(fit.device_ns) - fit.other_ns
+    return replace(fit, sigma_offset_ns=hypot(fit.sigma_offset_ns, sunk))
+
+
+def _fit(fastest: list[tuple[int, int]], fewest: int) -> ClockFit | FitFailure:
+    """The line, and the sigma of a sharp limit.
 
     Starts from the edge of the lower convex hull over the middle, below which no pair lies;
     leaves out pairs that are late as a whole; then fits by least squares and lowers the line by
     the scatter, by which the mean of delays with a hard lower limit lies above that limit.
-
-    Pairs of times (device, other) in ns are in time order, each the fastest of a block.
     """
-    if len(fastest) < FEWEST_BLOCKS:
-        return FitFailure(f"{len(fastest)} of {FEWEST_BLOCKS} blocks of elements are complete")
+    if len(fastest) < fewest:
+        return FitFailure(f"{len(fastest)} of {fewest} blocks of elements are complete")
     device0, other0 = fastest[len(fastest) // 2]
     x = np.array([device - device0 for device, _ in fastest], dtype=np.float64)
     y = np.array([other - other0 for _, other in fastest], dtype=np.float64) - x
@@ -222,8 +241,8 @@ def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
     above = y - low - slope * x
     is_kept = above <= SLOWEST * np.median(above) + RESOLUTION_NS
     n = int(is_kept.sum())
-    if n < FEWEST_BLOCKS:
-        return FitFailure(f"{n} of {FEWEST_BLOCKS} blocks of elements came without long delay")
+    if n < fewest:
+        return FitFailure(f"{n} of {fewest} blocks of elements came without long delay")
     x, y = x[is_kept], y[is_kept]
     middle = float(x.mean())
     spread = float(((x - middle) ** 2).sum())
@@ -231,7 +250,7 @@ def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
     residual = y - y.mean() - drift * (x - middle)
     # of few blocks the scatter itself is badly known: Student's variance in place of the normal's
     scatter = sqrt(float(residual @ residual) / (n - 2)) + RESOLUTION_NS
-    known = scatter * sqrt((n - 2) / (n - 4))
+    known = scatter * sqrt((n - 2) / max(n - 4, 1))
     if abs(drift) > LARGEST_DRIFT:
         return FitFailure(f"it would drift by {drift * 1e6:.0f} ppm, more than a clock does")
     offset = round(middle)

@@ -20,7 +20,7 @@ import pytest
 from armscan.cli import main
 from armscan.devices.matching import MatchedInstant
 from armscan.devices.protocols import ArmFlag, ArmSample, LaserEvent
-from armscan.errors import DeviceError, DeviceStoppedError, OutputError
+from armscan.errors import ArmscanError, DeviceError, DeviceStoppedError, OutputError
 from armscan.jobs.live.record import RecordRequest, _Recording, record_scan
 from armscan.pipeline.live.acquire import BEHIND, JUMPED, MATCHING, LiveEvent
 from armscan.pipeline.live.recorder import LiveRecorder
@@ -367,6 +367,18 @@ def test_an_address_of_the_simulator_is_a_rig(
     found = RecordRequest(address).description()
     assert found.cameras == cameras and found.is_common_trigger == is_common
     assert found.arm == found.lasers == address
+
+
+@pytest.mark.parametrize(("mode", "is_told"), [("automatic", True), ("fixed", False)])
+def test_a_common_trigger_with_a_changing_exposure_is_warned_of(
+    mode: str, is_told: bool, rig: Path
+) -> None:
+    text = RIG.replace("twin:", "no-driver:") + f'[exposure]\nmode = "{mode}"\n'
+    rig.write_text(text)
+    told: list[str] = []
+    with pytest.raises(ArmscanError):
+        record_scan(RecordRequest(str(rig)), rig.parent / "x.mcap", told.append)
+    assert any("a pose is that of the trigger" in one for one in told) is is_told
 
 
 def test_a_stripe_band_is_recorded_and_said(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:

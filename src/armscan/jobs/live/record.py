@@ -41,6 +41,10 @@ CLOCKS_S = 5.0
 """Recording begins when the devices' clocks are known, or after so long with those that are."""
 LOOK_S = 0.02
 TWIN = "twin:"
+TRIGGER_AND_EXPOSURE = (
+    "with a common trigger a pose is that of the trigger, and the middle of an exposure moves "
+    'against it as its time changes: set mode = "fixed" in [exposure]'
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +171,8 @@ def record_scan(
         )
     scanner = None if place is None else read_scanner_calibration(place)
     tell("opening the devices ...")
+    if description.is_common_trigger and description.arm and description.exposure.mode != "fixed":
+        tell(f"warning: {TRIGGER_AND_EXPOSURE}")
     with Rig.open(description, open_device) as rig:
         rig.set_windows()
         options = WriterOptions(is_stripe_band=request.is_stripe_band)

@@ -330,16 +330,19 @@ def _trigger(table: CsvTable, triggers: IntArray | None, row: int) -> int | None
     return int(triggers[row])
 
 
-def has_band(row: ExposureRow, setup: CameraSetup) -> bool:
-    """Whether extraction takes this image as it is: of a view, the one without laser comes off."""
-    return bool(row.lasers) and row.view is None and setup.colour == "mono"
+def has_band(row: ExposureRow, setup: CameraSetup, *, is_lit: bool = False) -> bool:
+    """Whether extraction takes this image as it is: of a view, the one without laser comes off.
+
+    ``is_lit``: also if it names no laser.
+    """
+    return (bool(row.lasers) or is_lit) and row.view is None and setup.colour == "mono"
 
 
 def banded_image(
-    row: ExposureRow, image: ImageArray | bytes, setup: CameraSetup
+    row: ExposureRow, image: ImageArray | bytes, setup: CameraSetup, *, is_lit: bool = False
 ) -> ImageArray | None:
     """Pixels near stripes; None for images that stay whole."""
-    if isinstance(image, bytes) or image.ndim != 2 or not has_band(row, setup):
+    if isinstance(image, bytes) or image.ndim != 2 or not has_band(row, setup, is_lit=is_lit):
         return None
     bits = setup.bits_used if setup.align == "low" else 8 * image.dtype.itemsize
     keep = near_lines(image.astype(np.float32) * np.float32(255.0 / ((1 << bits) - 1)))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from armscan.reconstruction.track_faults import check_track
 from armscan.records.recording import LASER_UNKNOWN, CameraSetup
 from armscan.storage.recording import read_recording, write_recording
 from armscan.storage.recordings.read_mcap import ReadBack, extract_recording
+from armscan.storage.recordings.write_mcap import WriterOptions
 from armscan.storage.tables import read_csv
 from rigs.scan_fake import scanner
 from unit.live.test_session import ALL, Device, rig_of, triggered_scan, waited
@@ -308,6 +310,36 @@ def test_cameras_of_their_own_clock_keep_their_times(
     assert len(rows) == 80 and len(group_instants(rows, "")) == n_instants
     apart_ns = {b.t_ns - a.t_ns for a, b in zip(rows[::2], rows[1::2], strict=True)}
     assert apart_ns == {7_000_000 if trigger == "free" else 0}
+
+
+def test_a_band_is_kept_where_no_controller_says_that_a_laser_is_on(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(1).integers(8, 12, (120, 160)).astype(np.uint8)
+    pixels[58:62] = 200
+    for k, lasers in enumerate((None, ("A",), ())):
+        path = tmp_path / f"{k}.mcap"
+        rig: Any = Rig([Device("camera 0", [], setup=CameraSetup(160, 120))])  # type: ignore[list-item]
+        recorder = LiveRecorder(path, rig, options=WriterOptions(is_stripe_band=True))
+        recorder.begin()
+        one = instant(0, 10**9, image=pixels, lasers=lasers)
+        recorder.add_instant(replace(one, lasers=lasers))
+        recorder.close()
+        is_dark = lasers == ()
+        assert (read_recording(path).exposure(0).image == 0).any() != is_dark
+
+
+def test_the_last_pose_of_a_slow_arm_is_written_when_it_is_old(tmp_path: Path) -> None:
+    """One pose a posture: it must not wait for the next one, which may never come."""
+    recorder = LiveRecorder(tmp_path / "scan.mcap", small_rig(is_triggered=True))
+    recorder.begin()
+    now_ns = time.monotonic_ns()
+    pose = triggered_scan(1).truth[0]
+    sample = ArmSample(0, now_ns, now_ns, pose, trigger_id=3)
+    recorder.add_samples((TimedSample(sample, now_ns, ElementStatus.USABLE, pose),))
+    assert recorder.n_samples == 0
+    time.sleep(0.11)
+    recorder.add_frame(0, Frame(IMAGES[0], 0, now_ns, now_ns), ElementStatus.USABLE)
+    assert recorder.n_samples == 1
+    recorder.close()
 
 
 @pytest.mark.parametrize("has_none", ["frames", "samples"])

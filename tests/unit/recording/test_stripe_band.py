@@ -134,6 +134,18 @@ def test_a_recording_is_converted_to_its_band(
     assert "--stripe-band: a stripe band is for recordings" in capsys.readouterr().err
 
 
+def test_a_band_is_said_only_where_one_is_kept(tmp_path: Path) -> None:
+    scan = tmp_path / "scan"
+    (scan / "images").mkdir(parents=True)
+    cv2.imwrite(str(scan / "images/0.png"), lit_image(0))
+    (scan / "exposures.csv").write_text("index,t_ns,camera,file,lasers\n0,5,0,images/0.png,\n")
+    (scan / "session.toml").write_text(session_text())
+    assert main(["convert", str(scan), str(tmp_path / "a.mcap"), "--stripe-band"]) == 0
+    found = read_recording(tmp_path / "a.mcap")
+    assert not found.session.is_stripe_band
+    np.testing.assert_array_equal(found.exposure(0).image, lit_image(0))
+
+
 def test_a_recording_is_not_replaced_by_its_band(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -95,6 +95,7 @@ class LiveRecorder:
         self._last_sample_ns = -1
         self._last_device_ns = 0
         self._samples: list[TimedSample] = []
+        self._samples_since_ns = 0
         self._first_ns, self._first_sample_ns = 2**63, -1
         self._arm_id = self._highest_id = -1
         self._ids_from = 0
@@ -209,16 +210,21 @@ class LiveRecorder:
             "trigger_id": frame.trigger_id,
         }
         self._writer.add_event(frame.t_host_ns, "frame", facts)
+        self._write_old_samples()
         if status == ElementStatus.LATE:
             self._add(camera, frame, None, (), ["late"])
 
     def add_samples(self, samples: tuple[TimedSample, ...]) -> None:
         """Keep those of the arm, some together."""
+        if not self._samples:
+            self._samples_since_ns = time.monotonic_ns()
         self._samples += map(self._numbered, samples)
-        if self._samples:
-            first, last = (self._samples[k].sample.t_host_ns for k in (0, -1))
-            if last - first >= BATCH_NS:
-                self._write_samples()
+        self._write_old_samples()
+
+    def _write_old_samples(self) -> None:
+        # by now, not by the next sample: that of an arm which sends one a posture is a minute away
+        if self._samples and time.monotonic_ns() - self._samples_since_ns >= BATCH_NS:
+            self._write_samples()
 
     def _numbered(self, one: TimedSample) -> TimedSample:
         """A sample with the id that the tables give its trigger."""
@@ -298,7 +304,9 @@ class LiveRecorder:
             lasers,
             trigger_id,
         )
-        self._writer.add_exposure(row, frame.image, flags)
+        # reconstruct takes images of a rig without controller as lit, too
+        is_lit = self._rig.lasers is None and frame.lasers is None
+        self._writer.add_exposure(row, frame.image, flags, is_lit=is_lit)
         self._index += 1
         self._last_ns[camera] = max(row.t_ns, last_ns)
         return t_ns is not None

@@ -314,7 +314,8 @@ def record_folder(
 
     Of ``most`` exposures, the first ones, with what the arm reported a second before and after
     them; of all if None. ``edit`` says what becomes of each document. With ``is_stripe_band``
-    (`WriterOptions`) grey pixels are written raw, not as their files.
+    (`WriterOptions`) grey pixels are written raw, not as their files; nothing changes, and none is
+    said to be kept, where no exposure has one.
     """
     recording = read_recording(folder)
     session = written_session(recording)
@@ -328,6 +329,7 @@ def record_folder(
     by_index = {row.index: row for row in recording.rows[:most]}
     kept = [k for k, index in enumerate(table.ints("index").tolist()) if index in by_index]
     rows = [by_index[int(table.columns["index"][k])] for k in kept]
+    is_stripe_band &= any(has_band(row, session.cameras[row.camera]) for row in rows)
     columns = {name: [cells[k] for k in kept] for name, cells in table.columns.items()}
     arm, arm_cells = recording.arm, {}
     if arm is not None:

@@ -74,8 +74,9 @@ class WriterOptions:
     queue_bytes
         Images that may wait; a caller waits when they are that many.
     is_stripe_band
-        Grey pixels of exposures with a laser and without a view are kept near what could be a
-        stripe, and zero elsewhere; see `near_lines`. What is extracted from them stays the same.
+        Grey pixels of exposures with a laser (``is_lit``) and without a view are kept near what
+        could be a stripe, and zero elsewhere; see `near_lines`. What is extracted from them stays
+        the same.
     """
 
     compression: Compression = "auto"
@@ -229,6 +230,8 @@ class RecordingWriter:
         image: ImageArray | bytes,
         flags: Sequence[str] = (),
         cells: Mapping[str, str] | None = None,
+        *,
+        is_lit: bool = False,
     ) -> float:
         """Record one exposure; its pixels are copied, the caller may use the array again.
 
@@ -242,6 +245,8 @@ class RecordingWriter:
             Marks of the synchronisation, as ``no-pose``.
         cells
             Its line of ``exposures.csv`` as it stands there; made of ``row`` if None.
+        is_lit
+            A laser is on, though the row names none; the band is kept of it, too.
 
         Returns
         -------
@@ -251,7 +256,8 @@ class RecordingWriter:
         if not 0 <= row.camera < len(self._session.cameras):
             raise InputError(f"camera {row.camera} is not among those of the session")
         setup = self._session.cameras[row.camera]
-        banded = banded_image(row, image, setup) if self._options.is_stripe_band else None
+        is_band = self._options.is_stripe_band
+        banded = banded_image(row, image, setup, is_lit=is_lit) if is_band else None
         pieces, facts = image_message(row, image if banded is None else banded, self._session)
         facts |= {} if banded is None else {"outside_band": "zero"}
         topic = f"/camera/{row.camera}/" + facts["stored"]

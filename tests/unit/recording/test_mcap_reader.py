@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ import pytest
 
 from armscan.errors import ArmscanError, FileFormatError, OutputError
 from armscan.jobs.live.recordings import recover_recording
-from armscan.records.recording import CameraSetup, PixelColour, Session
+from armscan.records.recording import ArmTrack, CameraSetup, PixelColour, Session
 from armscan.report.quantity import summary_json
 from armscan.storage.recording import read_recording
 from armscan.storage.recordings import write_mcap
@@ -147,6 +148,27 @@ def test_recovery_goes_on_after_a_damaged_chunk(
     for k in (0, 1, 2, *range(6, 12)):
         pixels = cv2.imread(str(saved / row(k).source), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(pixels, image(k))
+
+
+def test_what_makes_no_file_is_told_to_be_saved_as_a_folder(tmp_path: Path) -> None:
+    """The poses of the ids that came back are lost: a folder of it can be mended."""
+    path = tmp_path / "scan.mcap"
+    with RecordingWriter(path) as writer:
+        writer.begin(replace(SESSION, clock="separate"))
+        for k in range(3):
+            writer.add_exposure(replace(row(k), trigger_id=k), image(k))
+        track = ArmTrack(
+            t_ns=np.arange(3) + 1,
+            rotations=np.tile(np.eye(3), (3, 1, 1)),
+            translations_mm=np.zeros((3, 3)),
+            is_known=np.ones(3, dtype=bool),
+            trigger_ids=np.arange(3) + 50,
+        )
+        writer.add_arm_samples(track)
+    with pytest.raises(OutputError, match=r"no trigger_id is in both.*as a folder.*-o \S*saved\.$"):
+        recover_recording(path, tmp_path / "saved.mcap")
+    assert not (tmp_path / "saved.mcap").exists()
+    assert recover_recording(path, tmp_path / "saved").data["exposures"] == 3
 
 
 @pytest.mark.parametrize(("is_gap", "shown"), [(False, "not known"), (True, "at least 3")])

@@ -141,7 +141,15 @@ def recover_recording(source: Path, output: Path, *, is_overwriting: bool = Fals
         folder = scratch / "recording"
         found = extract_recording(source, folder, is_recovering=True)
         poses = _lost_poses(folder, found)
-        record_folder(folder, output)
+        try:
+            record_folder(folder, output)
+        except FileFormatError as error:
+            raise OutputError(
+                f"what came back is no recording to be read ({error.what})",
+                where=path_text(source),
+                remedy="save it as a folder, which you can mend: armscan recover "
+                f"{path_text(source)} -o {path_text(output.with_suffix(''))}",
+            ) from error
     return _summary(title, found, output, poses)
 
 

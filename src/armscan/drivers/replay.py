@@ -105,6 +105,7 @@ class Playback:
         ids = [row.trigger_id for row in source.rows if row.trigger_id is not None]
         self._ids_of_round = max(ids) - min(ids) + 1 if ids else 0
         self._is_loop = is_loop
+        self._lasers = _lasers_of(source.rows)
         self._plays = _plays(source)
         own_ns = _usual_step_ns(source)
         self._slower = 1.0 if rate_hz == 0.0 else 1e9 / rate_hz / own_ns
@@ -122,7 +123,7 @@ class Playback:
         self.lines: dict[str, FaultyLine[Any]] = {
             name: FaultyLine(
                 f"replay {source.name} {name}",
-                _MOST[name.rstrip("01")],
+                _MOST[name.rstrip("0123456789")],
                 clock,
                 delay_ns=0,
                 spread_ns=0,
@@ -285,12 +286,12 @@ class Playback:
         trigger_id = None if row.trigger_id is None else row.trigger_id + passed
         if device == "lasers":
             counted = what + number * len(rows) if trigger_id is None else trigger_id
-            return LaserEvent(counted, 0, 0, row.lasers)
+            return LaserEvent(counted, 0, 0, self._lasers[what])
         seen = self._next_image()
         if isinstance(seen, Exposure):
             # where no row names a laser nobody knows, and it is taken to have been on
             is_known = self._are_lasers_told and LASER_UNKNOWN not in row.flags
-            lasers = row.lasers if is_known else None
+            lasers = self._lasers[what] if is_known else None
             return Frame(seen.image, 0, 0, 0, trigger_id, lasers, seen.window)
         if seen is not None:
             self.lines[device].inbox.fail(DeviceError(seen.what, where=seen.where))
@@ -330,7 +331,7 @@ def _plays(source: ScanSource) -> list[Play]:
     lights, last = [], None
     are_told = _are_lasers_told(source.rows)
     for k, row in enumerate(source.rows):
-        moment = row.t_ns, row.trigger_id
+        moment = _moment(row)
         if are_told and LASER_UNKNOWN not in row.flags and moment != last:
             lights.append((row.t_ns, "lasers", k))
             last = moment
@@ -339,6 +340,17 @@ def _plays(source: ScanSource) -> list[Play]:
         samples = [(int(t_ns), "arm", k) for k, t_ns in enumerate(source.arm.t_ns)]
     every = list(merge(sorted(frames), sorted(lights), samples, key=lambda play: play[0]))
     return [(t_ns - every[0][0], device, what) for t_ns, device, what in every]
+
+
+def _moment(row: ExposureRow) -> tuple[int | None, int]:
+    """Alike for the rows of two cameras at one instant."""
+    return row.trigger_id, row.t_ns if row.trigger_id is None else 0
+
+
+def _lasers_of(rows: Sequence[ExposureRow]) -> list[tuple[str, ...]]:
+    """(N,) lasers of each row's instant, of which the row of one camera is enough."""
+    named = {_moment(row): row.lasers for row in rows if row.lasers}
+    return [row.lasers or named.get(_moment(row), ()) for row in rows]
 
 
 def _are_lasers_told(rows: Sequence[ExposureRow]) -> bool:

@@ -118,6 +118,35 @@ def test_a_recording_that_names_no_lasers_does_not_say_that_they_were_off(tmp_pa
     camera.close()
 
 
+@pytest.mark.parametrize("has_ids", [False, True])
+def test_the_lasers_of_an_instant_are_those_of_any_of_its_rows(
+    tmp_path: Path, has_ids: bool
+) -> None:
+    """Of three cameras the last one's row names them; with ids its time may differ."""
+    lines = [f"index,t_ns,camera,file,lasers{',trigger_id' * has_ids}"]
+    for k in range(9):
+        shot, camera = divmod(k, 3)
+        lit = "A" if camera == 2 and shot else ""
+        t_ns = TIMES[shot] + 7 * camera * has_ids
+        lines.append(f"{k},{t_ns},{camera},images/{shot}.png,{lit}{f',{shot}' * has_ids}")
+    table = "\n".join(lines) + "\n"
+    folder = lab_folder(tmp_path / "scan", exposures=table, arm=None, session=None)
+    cameras = [open_device("camera", f"replay:{folder}?camera={k}") for k in range(2)]
+    lasers: Any = open_device("lasers", f"replay:{folder}")
+    for one in cameras:
+        one.start("external")
+    lasers.start(None)
+    frames = [[one.read(20.0) for _ in range(3)] for one in cameras]
+    events: list[LaserEvent] = []
+    while len(events) < 3:
+        events += lasers.read(1.0)
+    told = [(), ("A",), ("A",)]
+    assert [[frame and frame.lasers for frame in own] for own in frames] == [told] * 2
+    assert [event.lasers for event in events] == told
+    for one in (*cameras, lasers):
+        one.close()
+
+
 def test_a_row_without_lasers_among_others_was_dark(tmp_path: Path) -> None:
     dark = EXPOSURES.replace(",A+B,", ",,")
     camera = open_device(

@@ -18,7 +18,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.registration import spread_mm
 from armscan.jobs.job import Job
-from armscan.markers.join_views import JoinedViews
+from armscan.markers.join_views import UNLIKELY, JoinedViews
 from armscan.pipeline.register import (
     BY_ID,
     UNCHECKED,
@@ -68,8 +68,6 @@ from armscan.storage.image_paths import are_simulated
 from armscan.storage.points import MarkerList, markers_csv, read_marker_list
 
 DOCUMENT, PAGE, MARKERS = "registration.json", "registration.html", "markers.csv"
-UNLIKELY = 1e-3
-"""Chance of the residuals below which the stated uncertainty is called too small."""
 WEAK_SHARE = 0.05
 """Markers whose width is a smaller share of their length lie nearly on a line."""
 LEAST_MM = 1e-6
@@ -260,8 +258,8 @@ def _too_small(chi2_sum: float, degrees_of_freedom: int) -> tuple[str, ...]:
         return ()
     ratio = float(np.sqrt(chi2_sum / degrees_of_freedom))
     return (
-        f"the residuals are {ratio:.2g} times what the covariances let expect: the stated "
-        "uncertainty is too small by about that factor",
+        f"the residuals are {ratio:.2g} times what the covariances let expect: the registration's "
+        "uncertainty is stated larger by that factor, that of the markers is too small by it",
     )
 
 

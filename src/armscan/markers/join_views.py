@@ -36,6 +36,14 @@ NOTED_GAIN = 1e-2
 """Fall of chi2 at the last step, a sighting, from which on a map counts as not settled."""
 OUTLIER_LEVEL = 1e-3
 """Chance that any observation of a whole map without a moved marker is left out."""
+UNLIKELY = 1e-3
+"""Chance of residuals below which the covariances that are given are taken for too small."""
+LEAST_TO_PLACE = 4
+
+
+def most_left_out(n_common: int) -> int:
+    """Of so many common markers, how many may have moved: a quarter, or two if four stay."""
+    return max(min(max(n_common // 4, 2), n_common - LEAST_TO_PLACE), 0)
 
 
 class MarkerObservations(RowRecord):
@@ -375,9 +383,6 @@ def chain_markers(views: Sequence[MarkerSet], links: Sequence[Link]) -> Tracks:
         for view, markers in enumerate(views)
     )
     return Tracks(of_view, len(number), n_contradictions)
-
-
-LEAST_TO_PLACE = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)

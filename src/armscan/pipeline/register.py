@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, fdtri
 
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -21,7 +21,13 @@ from armscan.geometry.registration import (
     register_points,
 )
 from armscan.markers.alignments import MarkerMatchOptions, Matched
-from armscan.markers.join_views import JoinedViews, join_views
+from armscan.markers.join_views import (
+    LEAST_TO_PLACE,
+    UNLIKELY,
+    JoinedViews,
+    join_views,
+    most_left_out,
+)
 from armscan.markers.match_3d import match_markers
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.cloud import CloudFrame, PointCloud
@@ -33,7 +39,10 @@ MOVED_LEVEL = 1e-3
 """Chance that any marker of a list in which none moved is called moved."""
 MOVED_WITHIN_MM = 5.0
 """Two markers without partner that lie this near to each other are one that moved."""
-LEAST_LEFT = 4
+STATED_FREEDOM = 6
+"""What the lists state of their scatter counts as so many observations that show it."""
+MOST_TOO_SMALL = 10.0
+"""Residuals so many times what the covariances let expect are no scatter: nothing is believed."""
 BY_ID, UNCHECKED = -1, -2
 """In place of a count of rivals: ids said which markers are common, or nothing was checked."""
 THESIS_SIGMAS = 8.0
@@ -137,20 +146,32 @@ def register_place(
         If ids are asked for that a list does not give.
     """
     options = options or RegisterOptions()
+    a, b = old.markers, new.markers
     pairs, n_rival = _common(old, new, options)
-    fit, is_used, moved = _without_moved(old.markers, new.markers, pairs)
-    everything = _pairs(old.markers, new.markers, pairs)
-    pose = fit.value
-    carried = everything.points_b_mm @ pose.rotation.T + pose.translation_mm
-    strays, only_old, only_new = _without_partner(old.markers, new.markers, pairs, pose)
+    fit, is_used, moved = _without_moved(a, b, pairs)
+    near, apart = pairs[:0], np.zeros((0, 3))
+    # ids say that markers without partner are not the same
+    while not options.is_by_id:
+        near, apart = _nearest(a, b, pairs, fit)
+        are_gone = _have_moved(a, b, near, apart, fit)
+        if are_gone.all():
+            break
+        pairs = np.concatenate([pairs, near[~are_gone]])
+        fit, is_used, moved = _without_moved(a, b, pairs)
+    strays = [
+        MovedMarker(int(a.ids[i]), int(b.ids[k]), offset)
+        for (i, k), offset in zip(near, apart, strict=True)
+    ]
+    everything = _pairs(a, b, pairs)
+    carried = fit.value.apply(everything.points_b_mm)
     return PlaceRegistration(
         fit,
         pairs,
         everything.points_a_mm - carried,
         is_used,
         (*moved, *strays),
-        only_old,
-        only_new,
+        tuple(np.delete(a.ids, np.append(pairs[:, 0], near[:, 0])).tolist()),
+        tuple(np.delete(b.ids, np.append(pairs[:, 1], near[:, 1])).tolist()),
         n_rival,
     )
 
@@ -183,9 +204,9 @@ def _common(old: MarkerList, new: MarkerList, options: RegisterOptions) -> tuple
         return _same_ids(old, new), BY_ID
     if options.is_by_thesis:
         pairs = match_after_thesis(old.markers, new.markers, THESIS_SIGMAS * options.sigma_mm)
-        if len(pairs) < LEAST_LEFT:
+        if len(pairs) < LEAST_TO_PLACE:
             raise EstimationError(
-                f"the eight steps pair {len(pairs)} markers, {LEAST_LEFT} are needed",
+                f"the eight steps pair {len(pairs)} markers, {LEAST_TO_PLACE} are needed",
                 where=f"{old.path} and {new.path}",
                 remedy="leave --method thesis out",
             )
@@ -221,56 +242,121 @@ def _pairs(old: MarkerSet, new: MarkerSet, pairs: IntArray) -> PointPairs:
     )
 
 
+def _where(old: MarkerSet, new: MarkerSet) -> str:
+    return f"{old.source} and {new.source}"
+
+
+def _least_moved(fit: Estimate[Pose[Base, Base]], n: int) -> float:
+    """Square of an offset, in units of its covariance, from which on one of ``n`` markers moved.
+
+    The markers of the fit say by their own scatter how much another may be off, if they scatter
+    more than is stated.
+    """
+    freedom = fit.degrees_of_freedom + STATED_FREEDOM
+    scale = max((fit.chi2 + STATED_FREEDOM) / freedom, 1.0)
+    return 3.0 * scale * float(fdtri(3, freedom, 1.0 - MOVED_LEVEL / n))
+
+
 def _without_moved(
     old: MarkerSet, new: MarkerSet, pairs: IntArray
 ) -> tuple[Estimate[Pose[Base, Base]], BoolArray, list[MovedMarker]]:
-    """Register; the marker that fits worst is left out as long as it does not fit."""
-    is_used = np.ones(len(pairs), dtype=bool)
-    moved: list[MovedMarker] = []
+    """Register without the markers that moved, `most_left_out` at most.
+
+    Markers are left out, the worst first; those up to the last one that is off by more than the
+    scatter of the others have moved (Rosner's test, in which no outlier hides another). If all
+    scatter alike, none has. Residuals that are still unlikely enlarge the covariance.
+    """
+    left, n_moved = np.arange(len(pairs)), 0
+    first: Estimate[Pose[Base, Base]] | FitFailure = register_points(_pairs(old, new, pairs))
+    if isinstance(first, FitFailure):
+        raise EstimationError(first.reason, where=_where(old, new), remedy=first.remedy)
+    fit = kept = first
+    out: list[tuple[int, MovedMarker]] = []
     while True:
-        used = pairs[is_used]
-        data = _pairs(old, new, used)
-        fit: Estimate[Pose[Base, Base]] | FitFailure = register_points(data)
-        if isinstance(fit, FitFailure):
-            raise EstimationError(
-                fit.reason, where=f"{old.source} and {new.source}", remedy=fit.remedy
-            )
-        misfit = misfits(data, fit)
+        misfit = misfits(_pairs(old, new, pairs[left]), fit)
         worst = misfit.moved(MOVED_LEVEL)
-        if worst is None:
-            return fit, is_used, moved
-        i, k = (int(index) for index in used[worst])
-        if len(used) <= LEAST_LEFT:
-            raise EstimationError(
-                f"marker {old.ids[i]} (new {new.ids[k]}) does not fit the others, and of "
-                f"{len(pairs)} common markers only {len(used)} are left to tell which moved",
-                where=f"{old.source} and {new.source}",
-                remedy="measure more markers, take those out that moved, or state larger "
-                "uncertainties",
-            )
-        moved.append(MovedMarker(int(old.ids[i]), int(new.ids[k]), -misfit.offset_mm[worst]))
-        is_used[np.flatnonzero(is_used)[worst]] = False
+        if worst is None or len(out) == most_left_out(len(pairs)):
+            break
+        i, k = pairs[left[worst]]
+        offset = MovedMarker(int(old.ids[i]), int(new.ids[k]), -misfit.offset_mm[worst])
+        out.append((int(left[worst]), offset))
+        left = np.delete(left, worst)
+        again: Estimate[Pose[Base, Base]] | FitFailure = register_points(
+            _pairs(old, new, pairs[left])
+        )
+        if isinstance(again, FitFailure):
+            break
+        fit = again
+        if misfit.chi2[worst] > _least_moved(fit, len(pairs)):
+            kept, n_moved = fit, len(out)
+    if len(pairs) == LEAST_TO_PLACE and worst is not None:
+        i, k = pairs[worst]
+        raise _no_fit(
+            old,
+            new,
+            f"marker {old.ids[i]} (new {new.ids[k]}) does not fit the others, and {len(pairs)} "
+            "common markers are too few to tell which moved",
+        )
+    is_used = np.ones(len(pairs), dtype=bool)
+    is_used[[index for index, _ in out[:n_moved]]] = False
+    return _enlarged(old, new, kept), is_used, [item for _, item in out[:n_moved]]
 
 
-def _without_partner(
-    old: MarkerSet, new: MarkerSet, pairs: IntArray, pose: Pose[Base, Base]
-) -> tuple[list[MovedMarker], tuple[int, ...], tuple[int, ...]]:
-    """Of the markers that were not matched: those that moved a little, and the others."""
+def _enlarged(
+    old: MarkerSet, new: MarkerSet, fit: Estimate[Pose[Base, Base]]
+) -> Estimate[Pose[Base, Base]]:
+    """The fit, with the covariance that its residuals show if they are unlikely as stated."""
+    if chdtrc(fit.degrees_of_freedom, fit.chi2) >= UNLIKELY:
+        return fit
+    scale, n = fit.chi2 / fit.degrees_of_freedom, len(fit.residuals)
+    if n < LEAST_TO_PLACE or scale > MOST_TOO_SMALL**2:
+        raise _no_fit(
+            old,
+            new,
+            f"the {n} common markers do not fit each other: the residuals are {scale**0.5:.2g} "
+            "times what the covariances let expect",
+        )
+    return replace(fit, covariance=scale * fit.covariance)
+
+
+def _no_fit(old: MarkerSet, new: MarkerSet, reason: str) -> EstimationError:
+    return EstimationError(
+        reason,
+        where=_where(old, new),
+        remedy="measure more markers, take those out that moved, or state larger uncertainties",
+    )
+
+
+def _nearest(
+    old: MarkerSet, new: MarkerSet, pairs: IntArray, fit: Estimate[Pose[Base, Base]]
+) -> tuple[IntArray, FloatArray]:
+    """Markers without partner that are one that moved a little, or was not matched.
+
+    Their (K, 2) indices, and (K, 3) by how much the new one is off the old one.
+    """
     lonely_old = np.setdiff1d(np.arange(len(old)), pairs[:, 0])
     lonely_new = np.setdiff1d(np.arange(len(new)), pairs[:, 1])
-    carried = new.points_mm[lonely_new] @ pose.rotation.T + pose.translation_mm
+    carried = fit.value.apply(new.points_mm[lonely_new])
     apart = carried[None] - old.points_mm[lonely_old][:, None]
     distance = np.linalg.norm(apart, axis=2)
-    moved: list[MovedMarker] = []
+    near: list[tuple[int, int]] = []
     while distance.size and float(distance.min()) < MOVED_WITHIN_MM:
         i, k = (int(index) for index in np.unravel_index(np.argmin(distance), distance.shape))
-        ids = int(old.ids[lonely_old[i]]), int(new.ids[lonely_new[k]])
-        moved.append(MovedMarker(*ids, apart[i, k]))
+        near.append((i, k))
         distance[i], distance[:, k] = np.inf, np.inf
-    gone = {item.old_id for item in moved}, {item.new_id for item in moved}
-    only_old = tuple(int(n) for n in old.ids[lonely_old] if int(n) not in gone[0])
-    only_new = tuple(int(n) for n in new.ids[lonely_new] if int(n) not in gone[1])
-    return moved, only_old, only_new
+    rows, columns = np.array(near, dtype=np.int64).reshape(-1, 2).T
+    return np.stack([lonely_old[rows], lonely_new[columns]], axis=1), apart[rows, columns]
+
+
+def _have_moved(
+    old: MarkerSet, new: MarkerSet, near: IntArray, apart: FloatArray, fit: Estimate[Any]
+) -> BoolArray:
+    """(K,) whether markers are off by more than those of the fit scatter."""
+    covariance = old.covariance_mm2[near[:, 0]] + carried_covariance_mm2(
+        new.points_mm[near[:, 1]], new.covariance_mm2[near[:, 1]], fit.value, fit.covariance
+    )
+    square = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart)
+    return np.asarray(square > _least_moved(fit, len(fit.residuals) + len(near)))
 
 
 def carry_cloud(

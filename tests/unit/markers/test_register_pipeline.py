@@ -16,7 +16,14 @@ from armscan.pipeline.register import RegisterOptions, carry_cloud, register_pla
 from armscan.records.points import MarkerSet
 from armscan.storage.points import MarkerList
 from rigs.inspection_clouds import cloud_of
-from rigs.marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
+from rigs.marker_scenes import (
+    NOISE_MM,
+    TwoViews,
+    marker_set,
+    random_pose,
+    scattered,
+    two_views,
+)
 
 SIZE = np.array([400.0, 300.0, 80.0])
 
@@ -79,6 +86,48 @@ def test_a_marker_that_moved_is_named_among_those_with_ids() -> None:
     assert moved.old_id == moved.new_id == int(scene.true_a[scene.a.ids == old_id][0])
     np.testing.assert_allclose(moved.offset_mm, step, atol=6.0 * NOISE_MM)
     assert int(place.is_used.sum()) == 8
+
+
+def numbered(points_a_mm: FloatArray, points_b_mm: FloatArray) -> tuple[MarkerList, MarkerList]:
+    """Two lists in which equal numbers are one marker."""
+    sets = marker_set(points_a_mm), marker_set(points_b_mm)
+    old, new = (listed(item, name, has_ids=True) for item, name in zip(sets, "ab", strict=True))
+    return old, new
+
+
+@pytest.mark.parametrize(("is_by_id", "n_seeds"), [(False, 2), (True, 20)])
+def test_markers_that_all_scatter_more_than_stated_are_not_said_to_have_moved(
+    is_by_id: bool, n_seeds: int
+) -> None:
+    """Three times the noise stated, twelve markers: all count, and the covariance says so."""
+    squares = []
+    for seed in range(n_seeds):
+        generator = np.random.default_rng(seed)
+        points, pose = scattered(generator, 12, SIZE), random_pose(generator)
+        noise = generator.normal(0.0, 3.0 * NOISE_MM, (2, 12, 3))
+        old, new = numbered(pose.apply(points) + noise[0], points + noise[1])
+        place = register_place(old, new, RegisterOptions(is_by_id=is_by_id))
+        assert not place.moved
+        assert len(place.pairs) == place.is_used.sum() == 12
+        e = pose.step_from(place.fit.value)
+        squares.append(float(e @ np.linalg.solve(place.fit.covariance, e)))
+    assert np.mean(squares) < 6.0 + 3.3 * np.sqrt(12.0 / len(squares))
+
+
+def test_two_of_six_that_moved_are_named_and_three_of_seven_are_too_many() -> None:
+    generator = np.random.default_rng(6)
+    points, pose = scattered(generator, 7, SIZE), random_pose(generator)
+    noise = generator.normal(0.0, NOISE_MM, (2, 7, 3))
+    moved = points + noise[1]
+    moved[:2] += [[2.0, 1.0, 0.0], [-4.0, 3.0, 2.0]]
+    by_id = RegisterOptions(is_by_id=True)
+    old, new = numbered((pose.apply(points) + noise[0])[:6], moved[:6])
+    place = register_place(old, new, by_id)
+    assert sorted(item.old_id for item in place.moved) == [1, 2]
+    moved[2] += [0.0, 9.0, 4.0]
+    old, new = numbered(pose.apply(points) + noise[0], moved)
+    with pytest.raises(EstimationError, match="do not fit each other: the residuals are"):
+        register_place(old, new, by_id)
 
 
 def test_a_marker_that_does_not_fit_three_others_is_named() -> None:

@@ -470,7 +470,13 @@ def _views_warnings(
         found.append(
             f"{joined.n_contradictions} pairs of markers contradict stronger ones and were dropped"
         )
-    return (*found, *_too_small(joined.map.chi2, joined.map.degrees_of_freedom))
+    found += [
+        f"the markers of {names[view]} scatter {factor:.2g} times as much as its covariances let "
+        "expect: its uncertainty is taken for so much larger"
+        for view, factor in zip(joined.placed, joined.map.factor, strict=True)
+        if factor > 1.0
+    ]
+    return tuple(found)
 
 
 def _join_place(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri, fdtri
 
 from armscan.geometry.arrays import (
     ArrayRecord,
@@ -24,7 +24,13 @@ from armscan.geometry.arrays import (
 )
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Part, Pose, Sensor
-from armscan.geometry.registration import PointPairs, carried_covariance_mm2, register_points
+from armscan.geometry.registration import (
+    LEAST_SPREAD_SIGMAS,
+    PointPairs,
+    carried_covariance_mm2,
+    register_points,
+    spread_mm,
+)
 from armscan.geometry.rotations import skew
 from armscan.markers.alignments import MarkerMatchOptions, Matched, NotUnique
 from armscan.markers.match_3d import match_markers
@@ -38,12 +44,27 @@ OUTLIER_LEVEL = 1e-3
 """Chance that any observation of a whole map without a moved marker is left out."""
 UNLIKELY = 1e-3
 """Chance of residuals below which the covariances that are given are taken for too small."""
+STATED_FREEDOM = 6
+"""What is stated of the scatter of markers counts as so many observations that show it."""
+SCALE_SETTLED = 0.1
+"""Share by which a view's variances still change when they are settled."""
 LEAST_TO_PLACE = 4
 
 
 def most_left_out(n_common: int) -> int:
     """Of so many common markers, how many may have moved: a quarter, or two if four stay."""
     return max(min(max(n_common // 4, 2), n_common - LEAST_TO_PLACE), 0)
+
+
+def least_moved(squares: float, freedom: float, n: int) -> float:
+    """Square of what one of ``n`` markers is off, in units of its covariance, if it has moved.
+
+    The others say by their own scatter how much it may be off, if they scatter more than is stated:
+    their ``squares`` are those of residuals of so many degrees of ``freedom``.
+    """
+    freedom += STATED_FREEDOM
+    scale = max((squares + STATED_FREEDOM) / freedom, 1.0)
+    return 3.0 * scale * float(fdtri(3, freedom, 1.0 - OUTLIER_LEVEL / n))
 
 
 class MarkerObservations(RowRecord):
@@ -79,8 +100,11 @@ class JointMap(ArrayRecord):
         (K, 3) carried sighting minus marker, in the frame of the map.
     is_used
         (K,) False where a sighting did not fit and was left out: its marker moved, or was mistaken.
+    factor
+        (V,) by which each view's sightings scatter more than their covariances say; the map counts
+        with covariances so enlarged.
     chi2, degrees_of_freedom
-        Of the sightings used.
+        Of the sightings used, with the covariances as given.
     is_settled
         False if the adjustment was stopped before the minimum.
     """
@@ -91,9 +115,42 @@ class JointMap(ArrayRecord):
     marker_covariance_mm2: FloatArray = floats("M", 3, 3)
     residual_mm: FloatArray = floats("K", 3)
     is_used: BoolArray = bools("K")
+    factor: FloatArray = floats("V")
     chi2: float
     degrees_of_freedom: int
     is_settled: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Misfit:
+    """Of K sightings: their views, squares of what they are off where the others put their markers,
+    squares of their residuals, and what these should be; all in units of the covariances.
+    """
+
+    view: IntArray
+    score: FloatArray
+    squares: FloatArray
+    expected: FloatArray
+
+    def worst(self, ignored: BoolArray) -> int | None:
+        """The sighting that fits worst, if the chance of it is below `OUTLIER_LEVEL`.
+
+        ``ignored`` (V,) says of which views none is looked at.
+        """
+        score = np.where(ignored[self.view], 0.0, self.score)
+        k = int(np.argmax(score))
+        return k if score[k] > float(chdtri(3, OUTLIER_LEVEL / len(score))) else None
+
+    def by_view(self, n_views: int) -> tuple[FloatArray, FloatArray]:
+        """(V,) sums of the squares of a view's residuals; (V,) what they should be."""
+        squares = np.bincount(self.view, self.squares, minlength=n_views)
+        return squares, np.bincount(self.view, self.expected, minlength=n_views)
+
+
+def _fix_a_pose(seen: MarkerObservations) -> bool:
+    """Whether sightings of one view spread in two directions."""
+    noise = float(np.sqrt(np.linalg.eigvalsh(seen.covariance_mm2).max()))
+    return bool(spread_mm(seen.point_mm)[1] > LEAST_SPREAD_SIGMAS * noise)
 
 
 def adjust_jointly(
@@ -114,30 +171,83 @@ def adjust_jointly(
     -------
     JointMap
         The worst sighting is left out, and all solved again, until every one fits at
-        `OUTLIER_LEVEL`; a marker needs two other sightings for that.
+        `OUTLIER_LEVEL`; a marker needs two other sightings for that. Of one view `most_left_out` of
+        the markers it shares are: a view of which more do not fit, or whose others still scatter
+        more than given, keeps them all, with its covariances enlarged by what the residuals show.
     """
-    is_used = np.ones(len(sightings), dtype=bool)
-    problem = _Problem(sightings, tuple(start), np.array(markers_mm))
-    while True:
-        problem, is_settled = replace(problem, sightings=sightings.select(is_used)).solved()
-        worst = problem.worst()
-        if worst is None:
-            break
-        is_used[np.flatnonzero(is_used)[worst]] = False
+    problem, is_used, scale, is_settled = _weighed(
+        sightings, _Problem(sightings, tuple(start), np.array(markers_mm))
+    )
     poses, covariance, own = problem.covariances()
     residual = replace(problem, sightings=sightings).residuals()
     used = sightings.select(is_used)
+    freedom = 3 * len(used) - 6 * (len(start) - 1) - 3 * len(covariance)
+    rest = problem.squares() / max(freedom, 1)
+    if chdtrc(max(freedom, 1), problem.squares()) >= UNLIKELY:
+        rest = 1.0
     return JointMap(
         part_from_view=problem.poses,
-        pose_covariance=poses,
+        pose_covariance=rest * poses,
         markers_mm=problem.markers_mm,
-        marker_covariance_mm2=own,
+        marker_covariance_mm2=rest * own,
         residual_mm=residual,
         is_used=is_used,
-        chi2=problem.squares(),
-        degrees_of_freedom=3 * len(used) - 6 * (len(start) - 1) - 3 * len(covariance),
+        factor=np.sqrt(rest * scale),
+        chi2=replace(problem, sightings=used).squares(),
+        degrees_of_freedom=freedom,
         is_settled=is_settled,
     )
+
+
+def _weighed(
+    sightings: MarkerObservations, problem: _Problem
+) -> tuple[_Problem, BoolArray, FloatArray, bool]:
+    """Solve with the sightings that fit, and covariances as the residuals of each view show them.
+
+    Also returns which sightings are used (K,), by what each view's covariances are multiplied (V,),
+    and whether the last solution settled.
+    """
+    n_views, view = len(problem.poses), sightings.view
+    is_shared = np.bincount(sightings.marker)[sightings.marker] > 1
+    n_shared = np.bincount(view[is_shared], minlength=n_views).tolist()
+    is_used, score = np.ones(len(sightings), dtype=bool), np.zeros(len(sightings))
+    scatters, scale, n_scaled = np.zeros(n_views, dtype=bool), np.ones(n_views), 0
+    while True:
+        enlarged = scale[view][:, None, None] * sightings.covariance_mm2
+        seen = replace(sightings, covariance_mm2=enlarged).select(is_used)
+        problem, is_settled = replace(problem, sightings=seen).solved()
+        misfit = problem.misfit()
+        squares, expected = misfit.by_view(n_views)
+        ratio = np.where(expected > 1.0, squares / np.maximum(expected, 1.0), 1.0)
+        next_scale = np.where(scatters, np.maximum(scale * ratio, 1.0), scale)
+        is_near = np.abs(next_scale / scale - 1.0) < SCALE_SETTLED
+        if n_scaled < MAX_ROUNDS * n_views and not is_near.all():
+            scale, n_scaled = next_scale, n_scaled + 1
+            continue
+        before = scatters.copy()
+        worst = misfit.worst(scatters)
+        if worst is not None:
+            k = int(np.flatnonzero(is_used)[worst])
+            others = is_used & is_shared & (view == view[k])
+            others[k] = False
+            n_left_out = int((~is_used & (view == view[k])).sum())
+            if n_left_out < most_left_out(n_shared[view[k]]) and _fix_a_pose(
+                sightings.select(others)
+            ):
+                is_used[k], score[k] = False, misfit.score[worst]
+                continue
+            scatters[view[k]] = True
+        else:
+            for one in np.unique(view[~is_used]):
+                limit = least_moved(float(squares[one]), float(expected[one]), n_shared[one])
+                scatters[one] = score[~is_used & (view == one)].max() <= limit
+            new = (ratio > 1.0) & (chdtrc(expected, squares) < UNLIKELY / n_views) & ~scatters
+            # alike ones together: of two views alone nothing tells which scatters
+            scatters |= new & (ratio >= 0.5 * np.max(ratio, where=new, initial=0.0))
+        if np.array_equal(scatters, before):
+            return problem, is_used, scale, is_settled
+        # what did not fit such a view was perhaps no fault of the others
+        is_used[:] = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,8 +354,8 @@ class _Problem:
         own = given + np.einsum("pmi,pq,qmj->mij", spread, joint, spread)
         return poses, np.asarray(given, dtype=np.float64), np.asarray(own)
 
-    def worst(self) -> int | None:
-        """The sighting that fits worst, if the chance of it is below `OUTLIER_LEVEL`."""
+    def misfit(self) -> _Misfit:
+        """How well each sighting fits the others."""
         seen = self.sightings
         residual, weights, jacobian = self.residuals(), self.weights(), self.jacobian()
         normal = self.normal()
@@ -262,11 +372,12 @@ class _Problem:
         scale = np.trace(weights, axis1=1, axis2=2) / 3.0
         along = np.einsum("kij,ki->kj", vectors, np.einsum("kij,kj->ki", weights, residual))
         redundancy = values / scale[:, None]
+        squares = np.einsum("ki,kij,kj->k", residual, weights, residual)
+        share = np.einsum("kij,kji->k", weights, own)
         score = np.where(redundancy > 1e-3, along**2 / np.maximum(values, 1e-300), 0.0).sum(axis=1)
         n_seen = np.bincount(seen.marker, minlength=len(self.markers_mm))[seen.marker]
         score[n_seen < 3] = 0.0
-        k = int(np.argmax(score))
-        return k if score[k] > float(chdtri(3, OUTLIER_LEVEL / len(seen))) else None
+        return _Misfit(seen.view, score, squares, share)
 
 
 def _reduced(normal: _Normal) -> tuple[FloatArray, FloatArray]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtrc, fdtri
+from scipy.special import chdtrc
 
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -26,6 +26,7 @@ from armscan.markers.join_views import (
     UNLIKELY,
     JoinedViews,
     join_views,
+    least_moved,
     most_left_out,
 )
 from armscan.markers.match_3d import match_markers
@@ -39,8 +40,6 @@ MOVED_LEVEL = 1e-3
 """Chance that any marker of a list in which none moved is called moved."""
 MOVED_WITHIN_MM = 5.0
 """Two markers without partner that lie this near to each other are one that moved."""
-STATED_FREEDOM = 6
-"""What the lists state of their scatter counts as so many observations that show it."""
 MOST_TOO_SMALL = 10.0
 """Residuals so many times what the covariances let expect are no scatter: nothing is believed."""
 BY_ID, UNCHECKED = -1, -2
@@ -246,17 +245,6 @@ def _where(old: MarkerSet, new: MarkerSet) -> str:
     return f"{old.source} and {new.source}"
 
 
-def _least_moved(fit: Estimate[Pose[Base, Base]], n: int) -> float:
-    """Square of an offset, in units of its covariance, from which on one of ``n`` markers moved.
-
-    The markers of the fit say by their own scatter how much another may be off, if they scatter
-    more than is stated.
-    """
-    freedom = fit.degrees_of_freedom + STATED_FREEDOM
-    scale = max((fit.chi2 + STATED_FREEDOM) / freedom, 1.0)
-    return 3.0 * scale * float(fdtri(3, freedom, 1.0 - MOVED_LEVEL / n))
-
-
 def _without_moved(
     old: MarkerSet, new: MarkerSet, pairs: IntArray
 ) -> tuple[Estimate[Pose[Base, Base]], BoolArray, list[MovedMarker]]:
@@ -287,7 +275,7 @@ def _without_moved(
         if isinstance(again, FitFailure):
             break
         fit = again
-        if misfit.chi2[worst] > _least_moved(fit, len(pairs)):
+        if misfit.chi2[worst] > least_moved(fit.chi2, fit.degrees_of_freedom, len(pairs)):
             kept, n_moved = fit, len(out)
     if len(pairs) == LEAST_TO_PLACE and worst is not None:
         i, k = pairs[worst]
@@ -356,7 +344,8 @@ def _have_moved(
         new.points_mm[near[:, 1]], new.covariance_mm2[near[:, 1]], fit.value, fit.covariance
     )
     square = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart)
-    return np.asarray(square > _least_moved(fit, len(fit.residuals) + len(near)))
+    n = len(fit.residuals) + len(near)
+    return np.asarray(square > least_moved(fit.chi2, fit.degrees_of_freedom, n))
 
 
 def carry_cloud(

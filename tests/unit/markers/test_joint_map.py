@@ -143,6 +143,47 @@ def test_a_moved_marker_is_left_out_and_the_rest_stays() -> None:
     np.testing.assert_allclose(np.linalg.norm(again.residual_mm[row]), 0.27, atol=6 * NOISE_MM)
 
 
+def test_a_view_that_scatters_more_than_stated_counts_whole_and_as_uncertain() -> None:
+    """Eight times the noise stated: none of its markers moved, and the other views stay as sure."""
+    scene = walk(np.random.default_rng(4), 4, step_mm=20.0)
+    clean = joined(scene)
+    is_its = clean.sightings.view == 1
+    true = truth(scene, clean.placed[1])
+    squares = []
+    for seed in range(6):
+        noise = np.random.default_rng(seed).normal(
+            0.0, 8.0 * NOISE_MM, clean.sightings.point_mm.shape
+        )
+        point = clean.sightings.point_mm + noise * is_its[:, None]
+        again = adjust_jointly(
+            replace(clean.sightings, point_mm=point), clean.chain, clean.map.markers_mm
+        )
+        assert again.is_used.all()
+        assert 4.0 < again.factor[1] < 14.0
+        assert again.factor[[0, 2, 3]].max() < 1.5
+        e = error(again.part_from_view[1], true)
+        squares.append(float(e @ np.linalg.solve(again.pose_covariance[1], e)))
+    assert np.mean(squares) < 6.0 + 3.3 * np.sqrt(12.0 / len(squares))
+
+
+def test_a_view_keeps_the_four_markers_that_fix_it() -> None:
+    """Its pose would otherwise be that of two or three markers, off by metres and called joined."""
+    clean = joined(walk(np.random.default_rng(4), 4, step_mm=20.0))
+    seen = clean.sightings
+    n_seen = np.bincount(seen.marker)[seen.marker]
+    shared = np.flatnonzero((seen.view == 3) & (n_seen >= 3))[:4]
+    assert len(shared) == 4
+    is_kept = (seen.view != 3) | (n_seen == 1)
+    is_kept[shared] = True
+    point = np.array(seen.point_mm)
+    point[shared[:2]] += [[0.3, 0.0, 0.2], [-0.2, 0.3, 0.0]]
+    less = replace(seen, point_mm=point).select(is_kept)
+    again = adjust_jointly(less, clean.chain, clean.map.markers_mm)
+    assert again.is_used[less.view == 3].all()
+    assert again.factor[3] > 2.0
+    assert 0.0 < np.sqrt(np.diag(again.pose_covariance[3])[3:]).max() < 20.0
+
+
 def test_views_that_cannot_be_joined_are_named() -> None:
     scene = walk(np.random.default_rng(2), 3)
     stranger = marker_set(scattered(np.random.default_rng(9), 12, np.array([80.0, 55.0, 20.0])))

@@ -167,6 +167,12 @@ def test_what_cannot_be_joined_gets_one_sentence(
     )
     assert "leave no check" in fails("register", *views, "--least-common", 3, "-o", folder)
     assert "--sigma-mm" in fails("register", *views, "--sigma-mm=nan", "-o", folder)
+    assert "without effect: all lists give the covariances" in fails(
+        "register", *views, "--sigma-mm", 0.1, "-o", folder, writes=tmp_path
+    )
+    assert "the markers are in Sensor, and an arm that moved" in fails(
+        "register", views[0], "--moved", views[1], "-o", folder, writes=tmp_path
+    )
     assert "there is no such file" in fails("register", *views, tmp_path / "no.csv", "-o", folder)
     views[1].with_suffix(".ply").write_bytes(ply_bytes(cloud_in(PATCH, "Base")))
     assert "the cloud is in Base, its markers are in Sensor" in fails(
@@ -175,6 +181,18 @@ def test_what_cannot_be_joined_gets_one_sentence(
     folder.mkdir()
     (folder / "mine.txt").write_text("keep")
     assert "not empty" in fails("register", *views, "-o", folder)
+
+
+def test_views_whose_lists_name_different_frames_are_warned_of(
+    views: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A list in Base may be joined by views, but is no view of a sensor itself."""
+    views[1].with_suffix(".ply").unlink()
+    views[1].write_text(views[1].read_text().replace("frame = Sensor", "frame = Base"))
+    assert main(["register", *map(str, views[:2]), "-o", str(tmp_path / "one")]) == 0
+    assert "view2.csv is in Base and view1.csv in Sensor" in capsys.readouterr().out
+    assert main(["register", *map(str, views[1::-1]), "-o", str(tmp_path / "other")]) == 0
+    assert "is in Sensor and" not in capsys.readouterr().out
 
 
 def test_a_damaged_registration_is_refused(

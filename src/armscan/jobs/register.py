@@ -65,7 +65,7 @@ from armscan.storage.documents import (
 )
 from armscan.storage.files import check_new_folder, new_folder, path_text, write_files
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.points import MarkerList, markers_csv, read_marker_list
+from armscan.storage.points import ASSUMED_SIGMA_MM, MarkerList, markers_csv, read_marker_list
 
 DOCUMENT, PAGE, MARKERS = "registration.json", "registration.html", "markers.csv"
 WEAK_SHARE = 0.05
@@ -211,6 +211,18 @@ def _check(
         raise OptionError("the list is given twice", where=str(twice[0]), remedy="name it once")
 
 
+def _refuse_vain_sigma(lists: Sequence[MarkerList], options: RegisterOptions) -> None:
+    """Raise if a standard deviation is given for markers that all have a covariance."""
+    if options.sigma_mm == ASSUMED_SIGMA_MM or options.is_by_thesis:
+        return
+    if not any(item.is_sigma_assumed for item in lists):
+        raise OptionError(
+            "without effect: all lists give the covariances of their markers",
+            where="--sigma-mm",
+            remedy="leave out --sigma-mm, or the six covariances of the lists",
+        )
+
+
 def _cloud_beside(path: Path) -> Path | None:
     """The cloud ``NAME.ply`` beside the list ``NAME.csv``, if there is one."""
     beside = path.with_suffix(".ply")
@@ -283,6 +295,7 @@ def _rms(residual_mm: FloatArray) -> float:
 
 def _join_views(job: Job, paths: Sequence[Path], options: RegisterOptions) -> _Joined:
     lists = [read_marker_list(path, frame="Sensor", sigma_mm=options.sigma_mm) for path in paths]
+    _refuse_vain_sigma(lists, options)
     names = _different_names(paths)
     clouds = {
         k: _read_cloud(path, names[k], item)
@@ -456,6 +469,13 @@ def _views_warnings(
     found = [
         f"{names[item.view]} is not joined: {item.reason}; {item.remedy}" for item in joined.left
     ]
+    first = lists[0].markers.frame
+    found += [
+        f"{item.path.name} is in {item.markers.frame} and {lists[0].path.name} in {first}: the "
+        "result is in the frame of the first list, so name that first whose frame it should have"
+        for item in lists[1:]
+        if item.markers.frame not in (first, "Sensor")
+    ]
     assumed = [item for item in lists if item.is_sigma_assumed]
     if assumed:
         found.append(f"{len(assumed)} lists give no covariance: {_assumed_sigma(assumed)}")
@@ -486,6 +506,14 @@ def _join_place(
         read_marker_list(path, frame="Base", sigma_mm=options.sigma_mm)
         for path in (old_path, new_path)
     )
+    _refuse_vain_sigma((old, new), options)
+    for item in (old, new):
+        if item.markers.frame == "Sensor":
+            raise InputError(
+                "the markers are in Sensor, and an arm that moved has measured them in its Base",
+                where=str(item.path),
+                remedy="leave --moved out for views of a sensor, or correct '# frame =' there",
+            )
     if not paths and (beside := _cloud_beside(new_path)) is not None:
         paths = (beside,)
     clouds = [

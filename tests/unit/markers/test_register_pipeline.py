@@ -130,6 +130,25 @@ def test_two_of_six_that_moved_are_named_and_three_of_seven_are_too_many() -> No
         register_place(old, new, by_id)
 
 
+def test_by_id_a_lost_and_a_new_marker_stay_two() -> None:
+    """A new marker 3 mm beside the place of a lost one is no moved one if its number differs."""
+    generator = np.random.default_rng(7)
+    points, pose = scattered(generator, 8, SIZE), random_pose(generator)
+    old, new = numbered(pose.apply(points), points + np.eye(8, 3, -7) * [3.0, 0.0, 0.0])
+    new = replace(new, markers=replace(new.markers, ids=np.array([1, 2, 3, 4, 5, 6, 7, 20])))
+    place = register_place(old, new, RegisterOptions(is_by_id=True))
+    assert (place.moved, place.only_old, place.only_new) == ((), (8,), (20,))
+
+
+def test_three_markers_that_do_not_fit_are_refused() -> None:
+    triangle = np.array([[0.0, 0.0, 0.0], [150.0, 0.0, 0.0], [0.0, 120.0, 0.0]])
+    by_id = RegisterOptions(is_by_id=True)
+    assert not register_place(*numbered(triangle, triangle + 5.0), by_id).moved
+    off = triangle * [1.0 + 1.0 / 150.0, 1.0, 1.0]
+    with pytest.raises(EstimationError, match="the 3 common markers do not fit each other"):
+        register_place(*numbered(triangle, off), by_id)
+
+
 def test_a_marker_that_does_not_fit_three_others_is_named() -> None:
     """Four markers are the least; with one of them moved there is no registration to believe."""
     scene = two_views(np.random.default_rng(4), 4, SIZE, missing=0.0, extra=0.0)

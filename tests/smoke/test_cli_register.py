@@ -195,6 +195,18 @@ def test_views_whose_lists_name_different_frames_are_warned_of(
     assert "is in Sensor and" not in capsys.readouterr().out
 
 
+def test_flat_lists_without_a_frame_are_joined_whatever_side_their_origin_is_on(
+    tmp_path: Path,
+) -> None:
+    """A sensor sees a plate from the front; a table of its holes may count from behind it."""
+    points = walk(np.random.default_rng(1), 4).views[0].points_mm * [1.0, 1.0, 0.0]
+    paths = tmp_path / "table.csv", tmp_path / "seen.csv"
+    for path, height in zip(paths, (40.0, -140.0), strict=True):
+        rows = np.add(points, [3.0, 2.0, height]).tolist()
+        path.write_text("x_mm,y_mm,z_mm\n" + "".join(f"{x},{y},{z}\n" for x, y, z in rows))
+    assert main(["register", *map(str, paths), "-o", str(tmp_path / "joined")]) == 0
+
+
 def test_a_damaged_registration_is_refused(
     views: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

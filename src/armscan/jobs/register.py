@@ -302,7 +302,10 @@ def _join_views(job: Job, paths: Sequence[Path], options: RegisterOptions) -> _J
         for k, item in enumerate(lists)
         if (path := _cloud_beside(item.path)) is not None
     }
-    views = [item.markers for item in lists]
+    # only a list that says so is known to have been seen from the origin of its frame
+    views = [
+        replace(item.markers, frame="") if item.is_frame_assumed else item.markers for item in lists
+    ]
     joined = register_views(views, options, job.progress)
     found, frame = joined.map, _common_frame(lists[0])
     carried = [

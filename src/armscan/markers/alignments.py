@@ -453,7 +453,8 @@ def keeps_side(first: LabelledMarkers, translation: FloatArray, flat_below_mm: f
 
     A flat set and its mirror image differ by half a turn only. A camera stands in the origin of
     its frame and sees markers from their front, so half a turn that would show it their back is
-    none. True throughout where the set is not flat.
+    none. True throughout where the set is not flat, or an origin lies in its plane: that is the
+    frame of a drawing or of the plate itself.
     """
     points = first.points_mm
     if spread_mm(points)[2] > flat_below_mm:
@@ -461,7 +462,9 @@ def keeps_side(first: LabelledMarkers, translation: FloatArray, flat_below_mm: f
     middle = points.mean(axis=0)
     normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
     here = float(normal @ middle)
-    return np.asarray(here * ((middle - translation) @ normal) > 0.0)
+    there = (middle - translation) @ normal
+    in_plane = np.minimum(abs(here), np.abs(there)) <= flat_below_mm
+    return np.asarray((here * there > 0.0) | in_plane)
 
 
 def _is_subset(part: IntArray, whole: IntArray) -> bool:

@@ -194,6 +194,8 @@ class MarkerList:
         True if the list holds no covariance.
     is_simulated
         True if the list says that it was measured on rendered images.
+    is_frame_assumed
+        True if the list names no frame.
     """
 
     markers: MarkerSet
@@ -201,6 +203,7 @@ class MarkerList:
     has_ids: bool
     is_sigma_assumed: bool
     is_simulated: bool = False
+    is_frame_assumed: bool = False
 
 
 def markers_csv(markers: MarkerSet, *, is_simulated: bool = False) -> bytes:
@@ -280,7 +283,7 @@ def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_
             source=path_text(path),
         )
     is_simulated = SIMULATED in (text.strip() for text in table.comments)
-    return MarkerList(markers, path, "id" in table, not has_covariance, is_simulated)
+    return MarkerList(markers, path, "id" in table, not has_covariance, is_simulated, not frames)
 
 
 def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> FloatArray:

@@ -97,6 +97,21 @@ def test_a_flat_set_is_not_matched_with_its_back_by_two_sensors() -> None:
     assert isinstance(match_markers(marker_set(points), marker_set(mirrored)), Matched)
 
 
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_flat_set_in_its_own_plane_is_matched_with_what_a_sensor_saw(is_first: bool) -> None:
+    """A plate's drawing has its origin in the plate: from which side it is seen is not said."""
+    generator = np.random.default_rng(2)
+    points = scattered(generator, 9, FLAT)
+    noise = generator.normal(0.0, NOISE_MM, points.shape)
+    drawn = marker_set(points, frame="Sensor")
+    for _ in range(3):
+        pose = random_pose(generator)
+        seen = marker_set(pose.apply(points) + noise, frame="Sensor")
+        found = match_markers(*((drawn, seen) if is_first else (seen, drawn)))
+        assert isinstance(found, Matched), found
+        assert len(found.alignment) == 9
+
+
 @pytest.mark.parametrize("missing", [0.0, 0.3])
 def test_a_grid_is_not_unique(missing: float) -> None:
     generator = np.random.default_rng(1)

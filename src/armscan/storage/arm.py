@@ -192,7 +192,7 @@ def read_arm_table(
         found = [_compared(table, track, chosen, (other, rotation), arm) for other in others]
     else:
         found = [_left(table, chosen, other) for other in others if other != "joints"]
-    return ArmTable(track, chosen, extra, (*found, *_warnings(track, table.where)))
+    return ArmTable(track, chosen, extra, (*found, *_warnings(track, table.where, arm)))
 
 
 def arm_columns(
@@ -393,7 +393,7 @@ def _from_joints(
     return is_known, rotations, positions
 
 
-def _warnings(track: ArmTrack, where: str) -> list[str]:
+def _warnings(track: ArmTrack, where: str, arm: ArmModel | None) -> list[str]:
     found = []
     n_gaps = int((~track.is_known).sum())
     if n_gaps:
@@ -406,6 +406,14 @@ def _warnings(track: ArmTrack, where: str) -> list[str]:
         known = track.joints_rad[track.is_known]
         if known.size and float(np.nanmax(np.abs(known))) > WARN_TURNS_RAD:
             found.append(f"{where}: a joint angle exceeds one turn: are they in degrees?")
+        if arm is not None and known.shape[1] == arm.n_axes:
+            low, high = arm.joint_limits_rad
+            n_beyond = ((known < low) | (known > high)).sum(axis=0)
+            found += [
+                f"{where}: joint j{k + 1}_rad is beyond its limits in arm.toml in {n_beyond[k]} of "
+                f"{len(known)} samples"
+                for k in np.flatnonzero(n_beyond)
+            ]
     return found
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -275,6 +276,30 @@ def test_unknown_columns_of_the_arm_are_kept_and_warned_of(tmp_path: Path) -> No
     scan = read_recording(lab_folder(tmp_path, arm=text + "\n"))
     assert scan.arm_columns == {"force_n": ("1", "", "x")}
     assert any("arm.csv: columns not known, kept: force_n" in item for item in scan.warnings)
+
+
+def test_joints_beyond_the_limits_of_their_arm_are_warned_of_by_name(tmp_path: Path) -> None:
+    limits = np.full(7, 1.0)
+    limits[5] = np.inf
+    free = thesis_arm((300, 0, 300, 100), (20, 30, 20))
+    model = replace(free, joint_min_rad=-limits, joint_max_rad=limits)
+    joints = np.array([[0.1] * 7, [0.1, 1.1, 0.1, 0.1, 0.1, 3.0, -1.2], [0.1] * 6 + [-1.3]])
+    rows = [
+        f"{500 + 1500 * k}," + ",".join(map(repr, row)) for k, row in enumerate(joints.tolist())
+    ]
+    text = table("t_ns," + ",".join(f"j{k}_rad" for k in range(1, 8)), *rows)
+    folder = lab_folder(tmp_path, arm=text, session=SESSION.replace("quaternion", "joints"))
+    said = {}
+    for one in (free, model):
+        (folder / "arm.toml").write_bytes(arm_model_toml(one))
+        said[one is model] = [
+            item for item in read_recording(folder).warnings if "beyond its limits" in item
+        ]
+    assert not said[False]
+    assert [item.split(": ")[1] for item in said[True]] == [
+        "joint j2_rad is beyond its limits in arm.toml in 1 of 3 samples",
+        "joint j7_rad is beyond its limits in arm.toml in 2 of 3 samples",
+    ]
 
 
 def test_an_arms_geometry_comes_back_bit_by_bit(tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def with_printed_centres(view: TargetView, exposure: Exposure) -> TargetView:
         raise InputError("no edges of circles are known", where=view.source)
     window = exposure.window.to_image(view.points_px)
     offsets = [edges.points_px[edges.circle == k] - view.points_px[k] for k in range(len(view))]
-    shapes = np.array([2.0 * np.cov(offset.T) for offset in offsets])
+    shapes = np.array([2.0 * np.cov(offset.T) for offset in offsets]) / exposure.window.binning**2
     grey = to_grey8(grey_channels(exposure)[0], exposure.full_scale)
     centres = thesis_centres(grey, window, shapes)
     found = np.asarray(np.isfinite(centres).all(axis=1))

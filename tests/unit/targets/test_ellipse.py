@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from armscan.geometry.estimate import FitFailure
+from armscan.records.exposure import SensorWindow
 from armscan.simulation.objects.boards import CirclePattern
 from armscan.thesis.ellipse import (
     ellipse_centre,
@@ -174,6 +175,10 @@ def test_a_view_with_printed_centres_keeps_its_numbers_and_loses_its_edges() -> 
     seen = exposure(scene.image)
     view = detect_target(seen, CircleGrid(9, 7, 10.0))
     assert isinstance(view, TargetView)
+    binned = exposure(scene.image, window=SensorWindow(binning=2))
+    twice = detect_target(binned, CircleGrid(9, 7, 10.0))
+    assert isinstance(twice, TargetView)
+    assert len(with_printed_centres(twice, binned)) == len(twice)
     printed = with_printed_centres(view, seen)
     assert printed.edges is None
     assert len(printed) == len(view)

@@ -264,6 +264,16 @@ def _assumed_sigma(lists: Sequence[MarkerList]) -> str:
     return f"{sigma:g} mm an axis is assumed for a marker"
 
 
+def _uncounted(lists: Sequence[MarkerList]) -> tuple[str, ...]:
+    """Warn of errors that markers of such lists have in common, and that are not counted so."""
+    return tuple(
+        f"markers of {item.path.name} were carried by a move and share its error, which is counted "
+        "as one only of the old list of --moved: the stated uncertainty is too small"
+        for item in lists
+        if item.markers.common is not None
+    )
+
+
 def _too_small(chi2_sum: float, degrees_of_freedom: int) -> tuple[str, ...]:
     """Warn of residuals that the stated covariances do not allow."""
     if float(chdtrc(max(degrees_of_freedom, 1), chi2_sum)) >= UNLIKELY:
@@ -293,6 +303,11 @@ def _rms(residual_mm: FloatArray) -> float:
     return float(np.sqrt((residual_mm**2).sum(axis=1).mean()))
 
 
+def _to_match(item: MarkerList) -> MarkerSet:
+    """The markers; only of a list that says so were they seen from the origin of its frame."""
+    return replace(item.markers, frame="") if item.is_frame_assumed else item.markers
+
+
 def _join_views(job: Job, paths: Sequence[Path], options: RegisterOptions) -> _Joined:
     lists = [read_marker_list(path, frame="Sensor", sigma_mm=options.sigma_mm) for path in paths]
     _refuse_vain_sigma(lists, options)
@@ -302,10 +317,7 @@ def _join_views(job: Job, paths: Sequence[Path], options: RegisterOptions) -> _J
         for k, item in enumerate(lists)
         if (path := _cloud_beside(item.path)) is not None
     }
-    # only a list that says so is known to have been seen from the origin of its frame
-    views = [
-        replace(item.markers, frame="") if item.is_frame_assumed else item.markers for item in lists
-    ]
+    views = [_to_match(item) for item in lists]
     joined = register_views(views, options, job.progress)
     found, frame = joined.map, _common_frame(lists[0])
     carried = [
@@ -499,7 +511,7 @@ def _views_warnings(
         for view, factor in zip(joined.placed, joined.map.factor, strict=True)
         if factor > 1.0
     ]
-    return tuple(found)
+    return (*found, *_uncounted(lists))
 
 
 def _join_place(
@@ -660,7 +672,7 @@ def _place_warnings(old: MarkerList, new: MarkerList, place: PlaceRegistration) 
         "markers.csv has its new place"
         for item in place.moved
     ]
-    found += _too_small(place.fit.chi2, place.fit.degrees_of_freedom)
+    found += (*_uncounted([new]), *_too_small(place.fit.chi2, place.fit.degrees_of_freedom))
     across = spread_mm(old.markers.points_mm[place.pairs[place.is_used][:, 0]])
     if across[1] < WEAK_SHARE * across[0]:
         found.append(

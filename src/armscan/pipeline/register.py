@@ -20,6 +20,7 @@ from armscan.geometry.registration import (
     misfits,
     register_points,
 )
+from armscan.geometry.rotations import skew
 from armscan.markers.alignments import MarkerMatchOptions, Matched
 from armscan.markers.join_views import (
     LEAST_TO_PLACE,
@@ -32,7 +33,7 @@ from armscan.markers.join_views import (
 from armscan.markers.match_3d import match_markers
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.cloud import CloudFrame, PointCloud
-from armscan.records.points import MarkerSet
+from armscan.records.points import CommonErrors, MarkerSet
 from armscan.storage.points import ASSUMED_SIGMA_MM, MarkerList
 from armscan.thesis.two_cameras import match_after_thesis
 
@@ -157,6 +158,7 @@ def register_place(
             break
         pairs = np.concatenate([pairs, near[~are_gone]])
         fit, is_used, moved = _without_moved(a, b, pairs)
+    fit = _with_common_errors(a, b, pairs[is_used], fit)
     strays = [
         MovedMarker(int(a.ids[i]), int(b.ids[k]), offset)
         for (i, k), offset in zip(near, apart, strict=True)
@@ -305,6 +307,37 @@ def _enlarged(
             "times what the covariances let expect",
         )
     return replace(fit, covariance=scale * fit.covariance)
+
+
+def _passed_on(
+    old: MarkerSet, new: MarkerSet, pairs: IntArray, pose: Pose[Base, Base]
+) -> FloatArray:
+    """(K, 6, 6 G) by how much the errors that old markers have in common turn and shift the pose.
+
+    Those of one marker each; their sum is what they do together.
+    """
+    data, common = _pairs(old, new, pairs), old.common
+    if common is None:
+        return np.zeros((len(pairs), 6, 0))
+    weights = np.linalg.inv(data.covariance_a_mm2 + pose.rotate_covariance(data.covariance_b_mm2))
+    jacobian = pose.jacobian(data.points_b_mm)
+    gain = np.swapaxes(jacobian, 1, 2) @ weights
+    normal = (gain @ jacobian).sum(axis=0)
+    by_errors = common.jacobian(old.ids[pairs[:, 0]], data.points_a_mm)
+    return np.asarray(np.linalg.solve(normal, gain @ by_errors))
+
+
+def _with_common_errors(
+    old: MarkerSet, new: MarkerSet, pairs: IntArray, fit: Estimate[Pose[Base, Base]]
+) -> Estimate[Pose[Base, Base]]:
+    """The fit, with a covariance that knows that errors of old markers do not average out."""
+    if old.common is None:
+        return fit
+    each, errors = _passed_on(old, new, pairs, fit.value), old.common.covariance
+    together = each.sum(axis=0)
+    # as independent ones they are in it already
+    counted = (each @ errors @ np.swapaxes(each, 1, 2)).sum(axis=0)
+    return replace(fit, covariance=fit.covariance + together @ errors @ together.T - counted)
 
 
 def _no_fit(old: MarkerSet, new: MarkerSet, reason: str) -> EstimationError:
@@ -493,11 +526,35 @@ def joint_markers(old: MarkerList, new: MarkerList, place: PlaceRegistration) ->
         points[i], covariances[i] = carried[k], covariance[k]
     added = np.isin(new.markers.ids, place.only_new)
     last = int(old.markers.ids.max())
+    new_ids = last + 1 + np.arange(int(added.sum()))
     return MarkerSet(
-        ids=np.concatenate([old.markers.ids, last + 1 + np.arange(int(added.sum()))]),
+        ids=np.concatenate([old.markers.ids, new_ids]),
         points_mm=np.concatenate([points, carried[added]]),
         covariance_mm2=np.concatenate([covariances, covariance[added]]),
         frame=old.markers.frame,
+        common=_joint_errors(old, new, place, new_ids),
+    )
+
+
+def _joint_errors(
+    old: MarkerList, new: MarkerList, place: PlaceRegistration, new_ids: IntArray
+) -> CommonErrors | None:
+    """What the errors of old markers, and of those carried now, have in common."""
+    known, pose = old.markers.common, place.fit.value
+    gone = {item.old_id for item in place.moved}
+    carried = (*sorted(gone), *new_ids.tolist())
+    if not carried:
+        return known
+    about_origin = np.eye(6)
+    about_origin[3:, :3] = skew(pose.translation_mm)
+    own = about_origin @ place.fit.covariance @ about_origin.T
+    if known is None:
+        return CommonErrors(groups=(carried,), covariance=own)
+    each = _passed_on(old.markers, new.markers, place.pairs[place.is_used], pose)
+    across = about_origin @ each.sum(axis=0) @ known.covariance
+    return CommonErrors(
+        groups=(*(tuple(n for n in one if n not in gone) for one in known.groups), carried),
+        covariance=np.block([[known.covariance, across.T], [across, own]]),
     )
 
 

@@ -8,7 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats, frozen_floats, ints
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    floats,
+    frozen_floats,
+    ints,
+)
+from armscan.geometry.rotations import skew
 
 
 class RingImages(RowRecord):
@@ -48,6 +57,36 @@ class RingImages(RowRecord):
         _check_covariances(self.covariance_px2, "covariance_px2", self.source)
 
 
+class CommonErrors(ArrayRecord):
+    """Errors that markers have in common because an arm was moved before they were measured.
+
+    Parameters
+    ----------
+    groups
+        Of each of G moves, the ids of the markers that it carried to the frame of their list.
+    covariance
+        (6 G, 6 G) of all moves together: of each a rotation vector about the frame's origin (rad)
+        and a shift (mm).
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    covariance: FloatArray = floats("P", "P")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.covariance) != 6 * len(self.groups):
+            raise InputError(
+                f"a covariance of {len(self.covariance)} numbers for {len(self.groups)} moves"
+            )
+
+    def jacobian(self, ids: IntArray, points_mm: FloatArray) -> FloatArray:
+        """(N, 3, 6 G) derivative of markers' places by these errors; zero for others' markers."""
+        shift = np.broadcast_to(np.eye(3), (len(ids), 3, 3))
+        own = np.concatenate([-skew(points_mm), shift], axis=2)
+        parts = [own * np.isin(ids, group)[:, None, None] for group in self.groups]
+        return np.concatenate(parts, axis=2)
+
+
 class MarkerSet(RowRecord):
     """Markers as points in space; they carry no code, so an id says nothing outside its set.
 
@@ -60,6 +99,8 @@ class MarkerSet(RowRecord):
     covariance_mm2
         (N, 3, 3) covariance of each centre, independent between markers: that of measuring its
         images. What a calibration adds is common to all markers and not in here.
+    common
+        What parts of these covariances are common to several markers, where that is known.
     frame
         Name of the coordinate frame, for example ``Sensor`` or ``Base``.
     source
@@ -71,6 +112,7 @@ class MarkerSet(RowRecord):
     covariance_mm2: FloatArray = floats("N", 3, 3)
     frame: str = "Sensor"
     source: str = ""
+    common: CommonErrors | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -16,7 +16,7 @@ import numpy as np
 
 from armscan.errors import FileFormatError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.records.points import MarkerSet, ProbedPoints
+from armscan.records.points import CommonErrors, MarkerSet, ProbedPoints
 from armscan.records.profile import PointProfile, Profile, StripeFlag
 from armscan.storage.files import is_folder, path_text, read_bytes, told_of
 from armscan.storage.image_paths import expand_paths, natural_key
@@ -27,6 +27,7 @@ from armscan.storage.tables import (
     CsvTable,
     csv_bytes,
     number_columns,
+    number_text,
     parse_csv,
     read_csv,
     refuse_beyond_reach,
@@ -175,6 +176,7 @@ ASSUMED_SIGMA_MM = 0.02
 """Standard deviation an axis of a marker about which a list says nothing: a probed point, or a
 ring's centre measured by two cameras."""
 FRAME = "frame ="
+COMMON_IDS, COMMON_COVARIANCE = "moved together =", "covariance of moves ="
 SIMULATED = "simulated"
 """Comment of a list that was measured on rendered images."""
 _UPPER = np.triu_indices(3)
@@ -217,7 +219,43 @@ def markers_csv(markers: MarkerSet, *, is_simulated: bool = False) -> bytes:
     columns |= number_columns(COORDINATES, markers.points_mm)
     columns |= number_columns(COVARIANCES, upper)
     marks = (SIMULATED,) if is_simulated else ()
-    return csv_bytes(columns, (f"{FRAME} {markers.frame}", *marks))
+    return csv_bytes(columns, (f"{FRAME} {markers.frame}", *marks, *_common_lines(markers)))
+
+
+def _common_lines(markers: MarkerSet) -> tuple[str, ...]:
+    """Comments from which `_common_errors` reads the same numbers."""
+    if markers.common is None:
+        return ()
+    covariance = markers.common.covariance
+    upper = covariance[np.triu_indices(len(covariance))]
+    return (
+        *(f"{COMMON_IDS} {' '.join(map(str, group))}" for group in markers.common.groups),
+        f"{COMMON_COVARIANCE} {' '.join(map(number_text, upper))}",
+    )
+
+
+def _common_errors(table: CsvTable) -> CommonErrors | None:
+    said = [
+        [text[len(key) :].split() for text in table.comments if text.startswith(key)]
+        for key in (COMMON_IDS, COMMON_COVARIANCE)
+    ]
+    if not any(said):
+        return None
+    groups, numbers = said
+    n = 6 * len(groups)
+    covariance = np.zeros((n, n))
+    try:
+        covariance[np.triu_indices(n)] = [float(word) for word in numbers[0]]
+        covariance = np.where(np.tri(n, dtype=bool), covariance.T, covariance)
+        return CommonErrors(
+            groups=tuple(tuple(map(int, group)) for group in groups), covariance=covariance
+        )
+    except (ValueError, IndexError) as error:
+        raise FileFormatError(
+            f"the comments '# {COMMON_IDS}' and '# {COMMON_COVARIANCE}' do not belong together",
+            where=table.where,
+            remedy="copy the list again; without these comments its markers count as independent",
+        ) from error
 
 
 def stripes_csv(profiles: Sequence[Profile], *, is_simulated: bool = False) -> bytes:
@@ -281,6 +319,7 @@ def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_
             covariance_mm2=_covariance(table, sigma_mm, has_covariance=has_covariance),
             frame=(*frames, frame)[0],
             source=path_text(path),
+            common=_common_errors(table),
         )
     is_simulated = SIMULATED in (text.strip() for text in table.comments)
     return MarkerList(markers, path, "id" in table, not has_covariance, is_simulated, not frames)

@@ -13,7 +13,7 @@ from armscan.errors import FileFormatError, InputError
 from armscan.jobs.info import describe_registration
 from armscan.jobs.job import Job
 from armscan.jobs.register import register
-from armscan.records.points import MarkerSet
+from armscan.records.points import CommonErrors, MarkerSet
 from armscan.storage.documents import read_registration
 from armscan.storage.points import markers_csv, read_marker_list
 from rigs.marker_scenes import walk
@@ -59,6 +59,25 @@ def test_other_tables_are_refused(tmp_path: Path, old: str, new: str, message: s
     path.write_text(markers_csv(some_markers()).decode().replace(old, new))
     with pytest.raises(FileFormatError, match=message):
         read_marker_list(path, frame="Sensor")
+
+
+def test_comments_about_moves_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
+    common = CommonErrors(groups=((1, 3), (2,)), covariance=np.diag(np.arange(1.0, 13.0)) + 0.1)
+    markers = MarkerSet(
+        ids=np.arange(1, 4),
+        points_mm=10.0 * np.eye(3),
+        covariance_mm2=np.tile(np.eye(3), (3, 1, 1)),
+        common=common,
+    )
+    path = tmp_path / "markers.csv"
+    path.write_bytes(markers_csv(markers))
+    read = read_marker_list(path, frame="Base").markers.common
+    assert read is not None
+    assert read.groups == common.groups
+    np.testing.assert_array_equal(read.covariance, common.covariance)
+    path.write_text(path.read_text().replace("# moved together = 2\n", ""))
+    with pytest.raises(FileFormatError, match="do not belong together"):
+        read_marker_list(path, frame="Base")
 
 
 def test_a_covariance_must_be_one() -> None:

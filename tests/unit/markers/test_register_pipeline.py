@@ -12,9 +12,14 @@ import pytest
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.markers.alignments import MarkerMatchOptions
-from armscan.pipeline.register import RegisterOptions, carry_cloud, register_place
+from armscan.pipeline.register import (
+    RegisterOptions,
+    carry_cloud,
+    joint_markers,
+    register_place,
+)
 from armscan.records.points import MarkerSet
-from armscan.storage.points import MarkerList
+from armscan.storage.points import MarkerList, markers_csv, read_marker_list
 from rigs.inspection_clouds import cloud_of
 from rigs.marker_scenes import (
     NOISE_MM,
@@ -147,6 +152,37 @@ def test_three_markers_that_do_not_fit_are_refused() -> None:
     off = triangle * [1.0 + 1.0 / 150.0, 1.0, 1.0]
     with pytest.raises(EstimationError, match="the 3 common markers do not fit each other"):
         register_place(*numbered(triangle, off), by_id)
+
+
+def test_the_third_place_of_an_arm_errs_as_much_as_said(tmp_path: Path) -> None:
+    """Each move sees the markers that the last one added, and some older; their list is a file."""
+    squares, pooled = [], []
+    by_id, path = RegisterOptions(is_by_id=True), tmp_path / "markers.csv"
+    for seed in range(40):
+        generator = np.random.default_rng(seed)
+        points = scattered(generator, 22, SIZE * [3.0, 1.0, 1.0])
+        points = points[points[:, 0].argsort()]
+        path.write_bytes(markers_csv(noisy(generator, points, range(8))))
+        for seen in (range(3, 14), range(6, 18), range(10, 22)):
+            pose = random_pose(generator)
+            new = noisy(generator, pose.inverse().apply(points), seen)
+            old = read_marker_list(path, frame="")
+            place = register_place(old, listed(new, "new", has_ids=True), by_id)
+            assert not place.moved
+            path.write_bytes(markers_csv(joint_markers(old, listed(new, "new"), place)))
+        e = pose.step_from(place.fit.value)
+        squares.append(float(e @ np.linalg.solve(place.fit.covariance, e)))
+        independent = replace(old, markers=replace(old.markers, common=None))
+        less = register_place(independent, listed(new, "new", has_ids=True), by_id).fit
+        pooled.append(float(e @ np.linalg.solve(less.covariance, e)))
+    assert abs(np.mean(squares) - 6.0) < 3.3 * np.sqrt(12.0 / len(squares))
+    assert np.mean(pooled) > 9.0
+
+
+def noisy(generator: np.random.Generator, points: FloatArray, seen: range) -> MarkerSet:
+    rows = np.array(seen)
+    noise = generator.normal(0.0, NOISE_MM, (len(rows), 3))
+    return replace(marker_set(points[rows] + noise), ids=rows + 1)
 
 
 def test_a_marker_that_does_not_fit_three_others_is_named() -> None:

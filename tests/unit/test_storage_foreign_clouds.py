@@ -84,6 +84,13 @@ def test_another_unit_in_the_heading_is_refused_alike_everywhere(
         assert said in str(caught.value)
 
 
+def test_micrometres_are_told_in_a_table_that_is_not_utf_8(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_bytes("X [\u00b5m];Y [\u00b5m];Z [\u00b5m]\n1500;2500;3500\n".encode("cp1252"))
+    with pytest.raises(FileFormatError, match="are in micrometres"):
+        read_cloud(path)
+
+
 @pytest.mark.parametrize("name", ["gap.csv", "gap.ply"])
 def test_points_without_a_place_are_counted_and_shown(tmp_path: Path, name: str) -> None:
     path = tmp_path / name

@@ -245,13 +245,17 @@ def test_decimal_commas_are_named_where_there_are_commas(tmp_path: Path) -> None
         ("// x_in,y_in,z_in", "inches"),
         ("# X Y Z (m)", "metres"),
         ("X,Y,Z [m]", "metres"),
+        ("X [\u00b5m],Y [\u00b5m],Z [\u00b5m]", "micrometres"),
+        ("x(\u03bcm);y(\u03bcm);z(\u03bcm)", "micrometres"),
+        ("# x_\u03bcm y_\u03bcm z_\u03bcm", "micrometres"),
+        ("X Y Z (\u00b5m)", "micrometres"),
         ("# x_m y_m z_m\n# made elsewhere", "metres"),
     ],
 )
 def test_another_unit_is_refused_in_every_kind_of_heading(
     tmp_path: Path, opening: str, unit: str
 ) -> None:
-    with pytest.raises(FileFormatError, match=f"x_[a-z]+, y_[a-z]+, z_[a-z]+ are in {unit}"):
+    with pytest.raises(FileFormatError, match=rf"x_\w+, y_\w+, z_\w+ are in {unit}"):
         read(tmp_path / "c.xyz", opening, POINTS)
 
 
@@ -275,3 +279,60 @@ def test_an_empty_value_and_short_rows_do_not_move_columns(tmp_path: Path) -> No
     assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS[:1]
     path.write_text("id,x,y,z,label\n1,1.5,-2,3.25\n")
     assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS[:1]
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize(
+    ("heading", "rows"),
+    [
+        (("Name", "X", "Y", "Z"), ["Punkt 1|1.5|-2|3.25", "P2|4|5|-6.5", "a b c 3|7|8.5|9"]),
+        (("Name", "X", "Y", "Z"), ["P1|1.5|-2|3.25", "Punkt 2|4|5|-6.5", "3 4 5 6|7|8.5|9"]),
+        (("Name", "X", "Y", "Z"), ["a 1 |1.5|-2|3.25|", "|4|5|-6.5", "3, c; 4\t|7|8.5|9"]),
+        (("# id", "x", "y", "z", "note"), ["1|1.5|-2|3.25|7", "2|4|5|-6.5|", "3 4|7|8.5|9|c"]),
+        (("x_mm", "note", "y_mm", "z_mm"), ["1.5|2 9|-2|3.25", " ", "4|a|5|-6.5", "7||8.5|9"]),
+        (("x_mm", "y_mm", "z_mm", "note"), ["1.5|-2|3.25|2 9", "4|5|-6.5|", "7|8.5|9|b c"]),
+        (("Name", "X", "Y", "Z", "note"), ["a b|1.5|-2|3.25", "c|4|5|-6.5|d", "e f|7|8.5|9|g"]),
+        (("X", "Y", "Z", "Name"), ['1.5|-2|3.25|"a|b"', '4|5|-6.5|5" 3', '"7"|8.5|9|']),
+    ],
+)
+def test_blanks_in_a_column_of_text_move_no_column(
+    tmp_path: Path, heading: tuple[str, ...], rows: list[str], separator: str
+) -> None:
+    """They moved all that follow: the point was `1.0 1.5 -2.0`, without a word."""
+    path = tmp_path / "c.csv"
+    others = ",;\t".replace(separator, "")
+    rows = [row.replace(",", others[0]).replace(";", others[1]) for row in rows]
+    rows = [row.replace("\t", "") if separator == "\t" else row for row in rows]
+    lines = [separator.join(heading), *(row.replace("|", separator) for row in rows)]
+    path.write_text("\n".join([*lines, ""]))
+    assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS
+
+
+def test_names_between_blanks_over_separated_rows_name_their_fields(tmp_path: Path) -> None:
+    path = tmp_path / "c.txt"
+    rows = "1{0}1.5{0}-2{0}3.25\nPunkt 2{0}4{0}5{0}-6.5\nP 3{0}7{0}8.5{0}9\n"
+    for separator in (",", ";", "\t"):
+        path.write_text("# columns: Name x y z\n" + rows.format(separator))
+        assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS
+
+
+def test_a_row_of_text_with_another_count_of_fields_is_refused_by_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text("Name;X;Y;Z\nP 1;1;2;3\nP 2 4 5 6\nP 3;1;2;3\n")
+    with pytest.raises(FileFormatError, match="line 3 is 'P 2 4 5 6'"):
+        read_cloud_file(path)
+    path.write_text("Name;X;Y;Z\nPunkt 1;1;2;3\nP2;1;2")
+    with pytest.raises(FileFormatError, match="it ends within line 3, 'P2;1;2'"):
+        read_cloud_file(path)
+    path.write_text("Name;X;Y;Z\nPunkt 1;1;2;3\nPunkt 2;;2;3\n")
+    with pytest.raises(FileFormatError, match=r"1 of 2 points .* empty or nan"):
+        read_cloud_file(path)
+
+
+def test_an_empty_last_value_is_none(tmp_path: Path) -> None:
+    """The table was refused where the last column is one that is read."""
+    path = tmp_path / "c.csv"
+    path.write_text("x,y,z,intensity\n1.5,-2,3.25,\n4,5,-6.5,7\n7,8.5,9, \n")
+    found = read_cloud_file(path).cloud
+    assert found.points_mm.tolist() == POINTS
+    assert found.intensity.tolist() == [0.0, 7.0, 0.0]

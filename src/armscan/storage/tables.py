@@ -32,12 +32,14 @@ COORDINATES = ("x_mm", "y_mm", "z_mm")
 OTHER_UNITS = {
     "m": ("metres", "1000"),
     "cm": ("centimetres", "10"),
-    "um": ("micrometres", "0.001"),
-    "µm": ("micrometres", "0.001"),
+    **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "\ufffdm"), ("micrometres", "0.001")),
     "in": ("inches", "25.4"),
     "inch": ("inches", "25.4"),
 }
-"""Units that columns of coordinates may have in place of mm, and how many mm they are."""
+"""Units that columns of coordinates may have in place of mm, and how many mm they are.
+
+The micro sign has two letters, and in a file that is not UTF-8 the one for what is not understood.
+"""
 MOST_COLUMNS, MOST_CELLS = 500, 20_000_000
 """No table of armscan has more; some gigabytes of memory hold so many cells."""
 MOST_QUOTED = 60

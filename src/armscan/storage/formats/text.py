@@ -63,6 +63,7 @@ KNOWN = {
 """Columns that are read, by their names in a heading; ``Points:0`` is ParaView's."""
 FIRST_THREE: Mapping[str, int] = {name: k for k, name in enumerate(POINT)}
 COMMENT_MARKS = ("#", "//")
+SEPARATORS = (",", ";", "\t")
 COLUMNS_ARE = re.compile(r"^(columns?|fields?|format|header)\s*[:=\s]\s*", re.IGNORECASE)
 """Before the names of columns in a comment: ``# columns: id x y z``."""
 NAMES_FOLLOW = re.compile(r"(columns?|fields?)\s*[:=]", re.IGNORECASE)
@@ -77,9 +78,9 @@ POINT_NUMBER = re.compile(
     r"((points?|pt|vertex|row)[ _.-]*)?(id|nr|no|num|number|index|idx|name)?\.?", re.IGNORECASE
 )
 """Names of a column that says which point it is; without the last part they are words of prose."""
-EMPTY_FIELD = re.compile(r"(^|[,;])[ \t]*(?=[,;])", re.MULTILINE)
+EMPTY_FIELD = re.compile(r"(^|[,;])[ \t]*(?=[,;])")
 """Nothing between two separators: a value that is missing, which must not move the next ones."""
-UNIT_IN_BRACKETS = re.compile(r"(\w)[ \t]*[\[(][ \t]*([A-Za-z]+)[ \t]*[\])]")
+UNIT_IN_BRACKETS = re.compile(r"(\w)[ \t]*[\[(][ \t]*([A-Za-z\u00b5\u03bc\ufffd]+)[ \t]*[\])]")
 """A column's name, its last character, and its unit: ``X [mm]``, ``y(m)``."""
 LEAST_COUNTED = 3
 """Rows from which numbers that go up by one are taken for numbers of points."""
@@ -136,17 +137,18 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
         _refuse_decimal_commas(line, path)
     n_named = len(words_of(opening.heading))
     may_have_commas = "," in filled[0] and "." not in filled[0]
-    if may_have_commas and n_named > 2 and len(words_of(filled[0])) == 2 * n_named:
+    if may_have_commas and n_named > 2 and len(_fields(filled[0], ",")) == 2 * n_named:
         raise FileFormatError(
             f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'",
             where=path_text(path),
             remedy="write numbers with points: 1.5,2.5,3.5",
         )
-    if not is_ended:
-        _refuse_cut_line(body[-1], filled[0], len(lines), path)
     named = named_columns(opening, filled, path)
-    numbers = tuple(named.numbers.values())
-    values = _values("\n".join(body), numbers, path, opening.n_lines + 1)
+    if not is_ended:
+        last, first = (_fields(line, named.separator) for line in (body[-1], filled[0]))
+        _refuse_cut_line(last, first, f"line {len(lines)}, '{lines[-1].strip()[:60]}'", path)
+    filled_body = "\n".join(line if line.strip() else "" for line in body)
+    values = _values(filled_body, named, path, opening.n_lines + 1)
     columns = {name: values[:, k] for k, name in enumerate(named.numbers)}
     notes = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
     _refuse_cut(notes, len(values), len(lines), path, is_ended=is_ended)
@@ -176,11 +178,16 @@ class Opening:
 
 @dataclass(frozen=True, slots=True)
 class NamedColumns:
-    """Numbers of the columns that are read, by name, and what to say of the others."""
+    """Numbers of the columns that are read, by name, and what to say of the others.
+
+    ``separator`` stands between the fields of the rows, which may hold blanks; where it is empty
+    blanks, commas and semicolons separate words.
+    """
 
     numbers: Mapping[str, int]
     passed_over: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    separator: str = ""
 
 
 def opening_of(lines: Sequence[str], path: Path) -> Opening:
@@ -250,7 +257,8 @@ def _named(text: str, rows: Sequence[str]) -> NamedColumns | None:
         return None
     read = set(numbers.values())
     passed_over = (word for k, word in enumerate(names) if k not in read and word)
-    return NamedColumns(numbers, tuple(passed_over))
+    separator = _separator(text, rows[0], len(names), numbers)
+    return NamedColumns(numbers, tuple(passed_over), separator=separator)
 
 
 def _is_prose(heading: str, numbers: Mapping[str, int], rows: Sequence[str]) -> bool:
@@ -301,12 +309,14 @@ def _by_heading(heading: str, rows: Sequence[str], path: Path) -> NamedColumns:
     """Columns of a bare heading that does not give x, y, z and all others one name each."""
     counts = _counts(rows[0])
     n_columns, words = len(words_of(rows[0])), words_of(heading)
-    for separator in (",", ";", "\t"):
-        numbers = _numbers(UNIT_IN_BRACKETS.sub(r"\1_\2", heading).split(separator))
+    for mark in SEPARATORS:
+        names = UNIT_IN_BRACKETS.sub(r"\1_\2", heading).split(mark)
+        numbers = _numbers(names)
         if set(POINT) <= set(numbers):
             if numbers["x"] == 0:
                 _refuse_numbers_first(heading, words, rows, path)
-            return NamedColumns(numbers)
+            separator = _separator(heading, rows[0], len(names), numbers)
+            return NamedColumns(numbers, separator=separator)
     numbers = _numbers(words)
     if set(POINT) <= set(numbers):
         if any(numbers[name] != k for name, k in FIRST_THREE.items()):
@@ -449,13 +459,13 @@ def _are_counted(rows: Sequence[str]) -> bool:
     """Whether rows begin with whole numbers that go up by one."""
     if len(rows) < 2 or not _are_whole(rows, 0):
         return False
-    first = [float(_fields(row)[0]) for row in rows]
+    first = [float(_words(row)[0]) for row in rows]
     return all(after - before == 1.0 for before, after in pairwise(first))
 
 
 def _are_whole(rows: Sequence[str], k: int) -> bool:
     """Whether column k holds whole numbers alone, however they are written, none below 0."""
-    words = [_fields(row)[k : k + 1] for row in rows]
+    words = [_words(row)[k : k + 1] for row in rows]
     return all(
         word and reads_as_float(word[0]) and float(word[0]).is_integer() and float(word[0]) >= 0.0
         for word in words
@@ -533,7 +543,7 @@ def _names(text: str, counts: set[int]) -> list[str]:
 def _separated(text: str, counts: set[int]) -> list[str]:
     """Fields of a line between separators that give each column one; empty without."""
     text = UNIT_IN_BRACKETS.sub(r"\1_\2", text).strip(" \r\n")
-    for separator in (",", ";", "\t"):
+    for separator in SEPARATORS:
         fields = [field.strip() for field in text.split(separator)]
         while len(fields) > 1 and len(fields) not in counts and not fields[-1]:
             fields.pop()
@@ -542,7 +552,31 @@ def _separated(text: str, counts: set[int]) -> list[str]:
     return []
 
 
-def _fields(row: str) -> list[str]:
+def _separator(heading: str, row: str, n_names: int, numbers: Mapping[str, int]) -> str:
+    """What stands between the fields of a row, by the names of its columns; empty for blanks.
+
+    That of the heading comes first, for fields of text may hold the others.
+    """
+    for mark in sorted(SEPARATORS, key=lambda mark: mark not in heading):
+        fields = row.split(mark)
+        if mark in heading and len(fields) > max(numbers.values()):
+            return mark
+        if len(fields) >= n_names and not "".join(fields[n_names:]).strip():
+            return mark
+    return ""
+
+
+def _fields(row: str, separator: str) -> list[str]:
+    """Fields of a row up to the last that is not empty; words where there is no separator."""
+    if not separator:
+        return words_of(row)
+    fields = [field.strip() for field in row.split(separator)]
+    while fields and not fields[-1]:
+        fields.pop()
+    return fields
+
+
+def _words(row: str) -> list[str]:
     """Words of a row, of which missing ones are kept."""
     return words_of(EMPTY_FIELD.sub(r"\1nan", row.strip()))
 
@@ -550,7 +584,7 @@ def _fields(row: str) -> list[str]:
 def _counts(row: str) -> set[int]:
     """How many columns a row may be said to have: empty ones at its end count or not."""
     filled = EMPTY_FIELD.sub(r"\1nan", row.strip())
-    separated = {filled.count(mark) + 1 for mark in ",;" if mark in filled}
+    separated = {filled.count(mark) + 1 for mark in SEPARATORS if mark in filled}
     return {len(words_of(filled)), *separated}
 
 
@@ -560,41 +594,48 @@ def words_of(line: str) -> list[str]:
     return [word for word in re.split(r"[,;\s]+", line.strip()) if word]
 
 
-def _values(body: str, columns: tuple[int, ...], path: Path, first: int) -> FloatArray:
-    """(N, C) numbers of some columns of lines that are numbered from ``first``."""
-    if EMPTY_FIELD.search(body):
-        body = EMPTY_FIELD.sub(r"\1nan", body)
-    body = body.replace(",", " ").replace(";", " ")
+def _values(body: str, named: NamedColumns, path: Path, first: int) -> FloatArray:
+    """(N, C) numbers of the named columns of lines that are numbered from ``first``."""
+    columns, separator = tuple(named.numbers.values()), named.separator
+    # an empty field is a value that is missing, which must not move the next ones
+    if separator != "\t":
+        body = body.replace("\t", " ")
+    mark = f"[{separator or ',;'}]"
+    body = re.sub(rf"^ *(?={mark})|(?<={mark}) *(?={mark}|$)", "nan", body, flags=re.MULTILINE)
+    if not separator:
+        body = body.replace(",", " ").replace(";", " ")
     try:
-        return np.loadtxt(io.StringIO(body), usecols=columns, ndmin=2)
+        lines, quotes = io.StringIO(body), '"' if separator else None
+        return np.loadtxt(
+            lines, delimiter=separator or None, usecols=columns, ndmin=2, quotechar=quotes
+        )
     except (ValueError, IndexError) as error:
         raise FileFormatError(
-            f"the points are not understood{_first_wrong(body, columns, first)}",
+            f"the points are not understood{_first_wrong(body, named, first)}",
             where=path_text(path),
             remedy="give one point a line: x y z in mm, with a point as decimal sign",
         ) from error
 
 
-def _first_wrong(body: str, columns: tuple[int, ...], first: int) -> str:
-    """Which line it is that holds no numbers in some columns."""
+def _first_wrong(body: str, named: NamedColumns, first: int) -> str:
+    """Which line it is that holds no numbers in the named columns."""
     for k, line in enumerate(body.split("\n")):
-        words = line.split()
+        fields = line.split(named.separator or None) if line.strip() else []
         try:
-            for column in columns if words else ():
-                float(words[column])
+            for column in named.numbers.values() if fields else ():
+                float(fields[column])
         except (ValueError, IndexError):
             return f": line {first + k} is '{line.strip()[:60]}'"
     return ""
 
 
-def _refuse_cut_line(last: str, first: str, number: int, path: Path) -> None:
+def _refuse_cut_line(fields: Sequence[str], wanted: Sequence[str], place: str, path: Path) -> None:
     """Raise for a last line without an end that holds less than the first one, or half a number."""
-    words, wanted = words_of(last), words_of(first)
-    pairs = zip(words, wanted, strict=False)
-    is_half = any(reads_as_float(other) and not reads_as_float(word) for word, other in pairs)
-    if words and (len(words) < len(wanted) or is_half):
+    pairs = zip(fields, wanted, strict=False)
+    is_half = any(reads_as_float(other) and not reads_as_float(one) for one, other in pairs)
+    if fields and (len(fields) < len(wanted) or is_half):
         raise FileFormatError(
-            f"the file seems cut: it ends within line {number}, '{last.strip()[:60]}'",
+            f"the file seems cut: it ends within {place}",
             where=path_text(path),
             remedy="copy or export it again; without that line the points before it can be read",
         )

@@ -135,6 +135,24 @@ def test_a_result_of_other_inputs_is_replaced_only_by_force(
     assert "data" in run("--force")[1]["scans"]["a"] and measured == ["a", "c"]
 
 
+def test_a_result_that_was_changed_since_is_replaced_only_by_force(
+    week: Path, run: Run, measured: list[str]
+) -> None:
+    run()
+    cloud = week.parent / "clouds" / "a.ply"
+    made = cloud.read_bytes()
+    cloud.write_bytes(b"cut by hand")
+    for _ in range(2):
+        measured.clear()
+        told = run()[1]["scans"]["a"]
+        assert told["failed"] == "a.ply was changed since it was made; --force replaces it"
+        assert cloud.read_bytes() == b"cut by hand" and measured == ["c"]
+    assert "data" in run("--force")[1]["scans"]["a"]
+    assert len(cloud.read_bytes()) == len(made) and run()[1]["scans"]["a"]["is_old"]
+    cloud.unlink()
+    assert "data" in run()[1]["scans"]["a"]
+
+
 def test_a_page_that_is_left_ends_no_other(week: Path, run: Run, measured: list[str]) -> None:
     clouds = week.parent / "clouds"
     clouds.mkdir()

@@ -210,7 +210,8 @@ class Batch:
     """Many results in one folder: what is done is not done again, a failure ends no other.
 
     ``batch.json`` in the folder says of each result which inputs it follows from and how large it
-    is. A result that stands there with other inputs is not replaced unless the job may overwrite.
+    is. A result that stands there with other inputs, or was changed since, is not replaced unless the
+    job may overwrite.
 
     Parameters
     ----------
@@ -234,7 +235,8 @@ class Batch:
         """Make what is not there yet; what is known of each result, by name.
 
         An entry has ``failed``, the reason, or ``seconds`` and ``data``, the result's own;
-        ``is_old`` where it was there before, and ``kept``, the file of other inputs that was left.
+        ``is_old`` where it was there before, and ``kept``, the file of other inputs, or changed
+        since, that was left.
 
         Raises
         ------
@@ -303,12 +305,16 @@ class Batch:
 
     def _result(self, item: BatchItem, total: int) -> LedgerEntry:
         place = self._place(item.name)
-        is_own = self._ledger.get(item.name, {}).get("mark") == item.mark
+        entry = self._ledger.get(item.name, {})
+        is_same = entry.get("mark") == item.mark
+        # a run that was interrupted told no size, nor did it leave a part of a result
+        is_changed = "bytes" in entry and place.is_file()
+        is_own = is_same and not is_changed
         there = [one for one in (place, place.with_suffix(".html")) if one.exists()]
         if there and not (is_own or self._job.is_overwriting):
             kept = there[0].name
-            reason = f"{kept} exists and is of other inputs; --force replaces it"
-            return {"failed": reason, "kept": kept}
+            why = "was changed since it was made" if is_same else "exists and is of other inputs"
+            return {"failed": f"{kept} {why}; --force replaces it", "kept": kept}
         self._write(item.name, {"mark": item.mark})
         own = replace(
             self._job,

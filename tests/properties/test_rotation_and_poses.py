@@ -15,6 +15,7 @@ from armscan.geometry.rotations import (
     rotation_from_vector,
     skew,
     vector_from_rotation,
+    vector_sigma,
 )
 
 ROUNDING = 1e-12
@@ -55,6 +56,24 @@ def test_half_turns(axis: list[float], short_of_half_turn_rad: float) -> None:
     assert np.abs(rotation_from_vector(back) - rotation).max() < 1e-8
     if short_of_half_turn_rad >= 1e-7:
         assert np.abs(back - vector).max() < 1e-6
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-5, 9e-4, 1.1e-3, 0.3, 1.6, 3.0, 3.141])
+def test_sigma_of_a_rotation_vector_is_that_of_differences(angle_rad: float) -> None:
+    """That of the increment was told in its place."""
+    vector = angle_rad * np.array([0.48, 0.6, -0.64])
+    factor = np.array([[2.0, 0.0, 0.0], [-0.5, 1.0, 0.0], [0.3, 0.7, 0.6]])
+    step = 1e-5
+    moved = [
+        [
+            vector_from_rotation(rotation_from_vector(s * row) @ rotation_from_vector(vector))
+            for row in step * np.eye(3)
+        ]
+        for s in (1.0, -1.0)
+    ]
+    jacobian = (np.array(moved[0]) - np.array(moved[1])).T / (2.0 * step)
+    expected = np.linalg.norm(jacobian @ factor, axis=1)
+    np.testing.assert_allclose(vector_sigma(vector, factor @ factor.T), expected, rtol=1e-5)
 
 
 @given(any_rotation_vector, lengths)

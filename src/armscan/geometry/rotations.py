@@ -12,6 +12,8 @@ from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 
 _SMALL_ANGLE_RAD = 1e-6
+_SMALL_FOR_SQUARES_RAD = 1e-3
+"""Below it the difference of nearly equal numbers over the angle's square loses digits."""
 
 
 def skew(vector: FloatArray) -> FloatArray:
@@ -57,6 +59,21 @@ def vector_from_rotation(rotation: FloatArray) -> FloatArray:
     if axis @ direction < 0.0:
         direction = -direction
     return np.asarray(angle * direction / np.linalg.norm(direction))
+
+
+def vector_sigma(rotation_vector_rad: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Standard deviations (3,) in rad of a rotation vector of at most half a turn.
+
+    ``covariance`` (3, 3) is of an increment of the rotation from the left, ``R <- exp(dr) R``. The
+    vector follows it by the inverse left Jacobian of SO(3), which is the identity for no turn.
+    """
+    cross = skew(rotation_vector_rad)
+    angle = float(np.linalg.norm(rotation_vector_rad))
+    square = 1.0 / 12.0
+    if angle > _SMALL_FOR_SQUARES_RAD:
+        square = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+    jacobian = np.eye(3) - 0.5 * cross + square * (cross @ cross)
+    return np.asarray(np.sqrt(np.diag(jacobian @ covariance @ jacobian.T)))
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from armscan.errors import ArmscanError, FileFormatError, listed
 from armscan.geometry.arrays import IntArray
 from armscan.geometry.least_squares import p_text
+from armscan.geometry.rotations import vector_sigma
 from armscan.models.calibration import (
     HAND_EYE_PARAMETER_NAMES,
     CameraCalibration,
@@ -164,8 +165,10 @@ def describe_scanner(path: Path) -> dict[str, Any]:
     sensor = calibration.sensor
     second = None if sensor is None else sensor.second
     sheets = "no images" if sensor is None else f"{len(sensor.sheets)} light sheets"
-    sigma = np.sqrt(np.diag(calibration.covariance)[-len(HAND_EYE_PARAMETER_NAMES) :])
-    pose = hand_eye.tool_from_sensor
+    n, pose = len(HAND_EYE_PARAMETER_NAMES), hand_eye.tool_from_sensor
+    covariance = calibration.covariance[-n:, -n:]
+    turn_sigma = vector_sigma(pose.rotation_vector_rad, covariance[:3, :3])
+    sigma = [*turn_sigma, *np.sqrt(np.diag(covariance)[3:])]
     values = [*pose.rotation_vector_rad, *pose.translation_mm]
     names = [name.replace("rotation_", "rotation_vector_") for name in HAND_EYE_PARAMETER_NAMES]
     known, timed = hand_eye.diagnostics, calibration.latency_sigma_ns

@@ -210,8 +210,8 @@ class Batch:
     """Many results in one folder: what is done is not done again, a failure ends no other.
 
     ``batch.json`` in the folder says of each result which inputs it follows from and how large it
-    is. A result that stands there with other inputs, or was changed since, is not replaced unless the
-    job may overwrite.
+    is. A result of other inputs, or one that was changed since, is not replaced unless the job may
+    overwrite.
 
     Parameters
     ----------

@@ -17,6 +17,7 @@ from scipy.special import chdtrc
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.registration import spread_mm
+from armscan.geometry.rotations import vector_sigma
 from armscan.jobs.job import Job
 from armscan.markers.join_views import UNLIKELY, JoinedViews
 from armscan.pipeline.register import (
@@ -594,9 +595,10 @@ def _join_place(
 def _place_quantities(
     old: MarkerList, new: MarkerList, place: PlaceRegistration, rms: float, at_markers: float
 ) -> tuple[Quantity, ...]:
-    pose, sigma = place.fit.value, place.fit.sigma
-    turns = np.degrees(pose.rotation_vector_rad), np.degrees(sigma[:3])
-    shift = zip(pose.translation_mm, sigma[3:], strict=True)
+    pose, vector = place.fit.value, place.fit.value.rotation_vector_rad
+    turn_sigma = vector_sigma(vector, place.fit.covariance[:3, :3])
+    turns = np.degrees(vector), np.degrees(turn_sigma)
+    shift = zip(pose.translation_mm, place.fit.sigma[3:], strict=True)
     rival = {
         BY_ID: "given by their ids",
         UNCHECKED: "paired by the thesis's eight steps, unchecked",

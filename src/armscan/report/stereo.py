@@ -16,7 +16,7 @@ from armscan.calibration.cameras.stereo_result import (
     right_camera_centre_mm,
 )
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.rotations import skew
+from armscan.geometry.rotations import skew, vector_sigma
 from armscan.models.calibration import Provenance
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.records.exposure import Exposure
@@ -119,7 +119,9 @@ def stereo_quantities(fit: StereoFit) -> tuple[Quantity, ...]:
 def _relative_quantities(fit: StereoFit) -> tuple[Quantity, ...]:
     """What relates the cameras."""
     pose, sigma = fit.views.right_from_left, fit.sigma[N_INTRINSICS:]
-    turns, turn_sigma = np.rad2deg(pose.rotation_vector_rad), np.rad2deg(sigma[:3])
+    vector, rows = pose.rotation_vector_rad, slice(N_INTRINSICS, N_INTRINSICS + 3)
+    turns = np.rad2deg(vector)
+    turn_sigma = np.rad2deg(vector_sigma(vector, fit.covariance[rows, rows]))
     return (
         Quantity("", "Baseline", *_baseline_mm(fit), "mm", "between the cameras' centres"),
         Quantity("", "Angle", *_angle_deg(fit), "°", "between their optical axes"),

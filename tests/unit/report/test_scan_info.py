@@ -24,12 +24,21 @@ from armscan.storage.points import markers_csv
 from rigs.calibration_documents import scanner_calibration
 from rigs.recording_folders import ARM, EXPOSURES, lab_folder
 
+ROOT = Path(__file__).parents[3]
+
 
 def described(path: Path) -> dict[str, object]:
     summary = describe_files([str(path)])
     assert summary_text(summary) and summary_json(summary)
     found: dict[str, object] = summary.data["items"][0]
     return found
+
+
+def test_sigmas_of_a_rotation_vector_are_its_own() -> None:
+    """Those of an increment of the rotation were told: 0.0026, 0.0013 and 0.0011 rad."""
+    found = described(ROOT / "tests" / "net" / "inputs" / "documents" / "scanner.json")
+    told = [found[f"rotation_vector_{axis}_tool_rad"] for axis in "xyz"]
+    assert told == ["0.3024 ± 0.0029", "-0.7999 ± 0.0020", "1.70023 ± 0.00061"]
 
 
 def test_a_recording_is_counted_and_what_is_odd_is_said(tmp_path: Path) -> None:

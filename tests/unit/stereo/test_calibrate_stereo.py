@@ -17,9 +17,11 @@ from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.calibration.cameras.stereo_result import StereoFit
 from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import IntrinsicsUse, TwoViews
+from armscan.report.stereo import stereo_quantities
 from rigs.fisheye import as_fisheye
 from rigs.stereo_rig import (
     CONVERGING,
@@ -62,6 +64,23 @@ def test_without_noise_the_truth_is_found() -> None:
     assert fit.rms_px < 1e-8
     assert np.abs(increments(scene.views, fit.views) / np.maximum(1.0, fit.parameters)).max() < 1e-6
     assert fit.epipolar_rms_px < 1e-8
+
+
+def test_sigmas_of_the_rotation_vector_are_its_own() -> None:
+    """Those of an increment of the rotation were told."""
+    scene = StereoScene(n_pairs=6)
+    fit = solved(make_pairs(scene, 0)[0], scene)
+    turn, step = fit.views.right_from_left.rotation, 1e-6
+    moved = [
+        vector_from_rotation(rotation_from_vector(row) @ turn)
+        for row in np.concatenate([step * np.eye(3), -step * np.eye(3)])
+    ]
+    jacobian = (np.array(moved[:3]) - np.array(moved[3:])).T / (2.0 * step)
+    own = np.sqrt(np.diag(jacobian @ fit.covariance[-6:-3, -6:-3] @ jacobian.T))
+    told = {one.label: one.sigma for one in stereo_quantities(fit)}
+    turns = [told[f"rotation {axis}"] for axis in "xyz"]
+    assert turns == pytest.approx(np.degrees(own).tolist(), rel=1e-6)
+    assert float(np.abs(own / fit.sigma[-6:-3] - 1.0).max()) > 0.02
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from armscan.cli import main
 from armscan.fusion.voxel_map import VoxelMap
 from armscan.reconstruction.place import merge_clouds
+from armscan.records.cloud import DELIVERED
 from armscan.storage import clouds as clouds_module
 from armscan.storage.clouds import ply_bytes, read_ply
 from armscan.storage.documents import scanner_document
@@ -72,6 +73,27 @@ def test_clouds_in_the_frame_of_a_sensor_that_may_have_moved_are_warned_of(
         told = json.loads(capsys.readouterr().out)["warnings"]
         warned.append(any("head and object stood still" in text for text in told))
     assert warned == [False, True]
+
+
+def test_noise_whose_reach_is_not_known_is_warned_of(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It averages out as if each point had its own, which the sigma says without a word."""
+    known = read_ply(folder / "a.ply")
+    known = replace(known, noise_length=np.ones(len(known)))
+    plain = replace(read_ply(folder / "b.ply"), noise_length=None)
+    (folder / "a.ply").write_bytes(ply_bytes(known))
+    (folder / "b.ply").write_bytes(ply_bytes(plain))
+    (folder / "c.ply").write_bytes(
+        ply_bytes(replace(plain, sheet_names=(DELIVERED,), sheet=np.zeros(len(plain), np.int64)))
+    )
+    words = ["fuse", *(str(folder / f"{name}.ply") for name in "abc"), "--voxel", "1.5", "--json"]
+    assert main([*words, "-o", str(folder / "fused.ply")]) == 0
+    told = json.loads(capsys.readouterr().out)["warnings"]
+    found = [text for text in told if "share the stripe's noise" in text]
+    assert [text[:6] for text in found] == ["b.ply:", "c.ply:"]
+    assert "reconstruct again" in found[0] and "delivers profiles does not tell" in found[1]
+    assert "share the stripe" in (folder / "fused.html").read_text(encoding="utf-8")
 
 
 def test_how_the_clouds_of_others_were_read_is_said(

@@ -13,7 +13,7 @@ from armscan.errors import InputError
 from armscan.fusion.digest import CloudDigest, percentiles
 from armscan.fusion.point_spool import PointSpool
 from armscan.fusion.voxel_map import VoxelMap
-from armscan.jobs.job import Job
+from armscan.jobs.job import Job, noise_remarks
 from armscan.models.calibration import Provenance
 from armscan.pipeline.progress import ProgressEvent
 from armscan.records.cloud import FUSED, PointCloud
@@ -52,7 +52,7 @@ def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
             for k, path in enumerate(paths):
                 job.progress(ProgressEvent(STAGE, k, len(paths), path.name))
                 for piece in read_cloud_pieces(path):
-                    told = (*piece.remarks, *piece.doubts)
+                    told = (*piece.remarks, *piece.doubts, *noise_remarks(piece.cloud))
                     remarks += (f"{path.name}: {remark}" for remark in told)
                     with told_of(str(path)):
                         voxels.add(piece.cloud)
@@ -61,7 +61,7 @@ def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
                 raise InputError("the clouds hold no point", where=", ".join(map(str, paths)))
             is_moved = voxels.frame == "Sensor" and len(paths) > 1
             warnings = (
-                *remarks,
+                *dict.fromkeys(remarks),
                 *((SENSOR_MOVES,) if is_moved else ()),
                 *(() if voxels.has_covariance else (NOT_KNOWN,)),
             )

@@ -25,7 +25,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.inspection.title_block import TitleBlock, calibration_state
 from armscan.models.calibration import Provenance
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import DELIVERED, PointCloud
 from armscan.report.inspection.delivery import Delivery, delivery_of, pdf_bytes, require_pdf
 from armscan.report.page import Page, render_page
 from armscan.report.quantity import Summary, fact, sentences, summary_json
@@ -373,6 +373,18 @@ def with_old_layout(summary: Summary, target: Target) -> Summary:
         return summary
     told = fact("target", describe_target(target))
     return replace(summary, quantities=(*summary.quantities, told))
+
+
+def noise_remarks(cloud: PointCloud) -> tuple[str, ...]:
+    """What to say where it is not known how far neighbours share the stripe's noise."""
+    if cloud.noise_length is not None or not cloud.sigma_noise_mm.any():
+        return ()
+    is_delivered = tuple(cloud.sheet_names) == (DELIVERED,)
+    why = "a sensor that delivers profiles does not tell" if is_delivered else "reconstruct again"
+    return (
+        "the cloud does not say how far neighbours share the stripe's noise: it is taken as new in "
+        f"every point, as if nothing had been smoothed along it; {why}",
+    )
 
 
 def was_simulated(before: Provenance, document: Path) -> bool:

@@ -22,7 +22,7 @@ from armscan.fusion.voxel_map import VoxelMap
 from armscan.geometry.arrays import Box
 from armscan.geometry.rotations import EulerConvention, check_convention
 from armscan.jobs.fuse import fused_marks, fused_pieces
-from armscan.jobs.job import Batch, BatchItem, Job
+from armscan.jobs.job import Batch, BatchItem, Job, noise_remarks
 from armscan.jobs.live.recordings import count_exposures, recording_mark, recordings_in
 from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
 from armscan.pipeline.cluster.extraction import ClusterAddress, ClusterReader
@@ -474,11 +474,15 @@ def _delivered(
     files = [path for name in names for path in profile_files(Path(name))]
     poses = read_robot_poses(table.path, table.euler, files)
     scan = place_profiles(profiles, poses, scanner, volume, points=points)
+    warnings = scan.warnings
+    if voxel_mm is not None:
+        told = (text for piece in points.pieces() for text in noise_remarks(piece.cloud))
+        warnings = (*warnings, *dict.fromkeys(told))
     provenance = job.provenance(
         (*files, table.path, calibration),
         (table,),
         parents=(scanner.provenance,),
-        warnings=scan.warnings,
+        warnings=warnings,
     )
     return _told(
         job,
@@ -487,7 +491,7 @@ def _delivered(
         points,
         exposures={},
         provenance=provenance,
-        warnings=scan.warnings,
+        warnings=warnings,
         scanner=scanner,
         voxel_mm=voxel_mm,
     )

@@ -50,7 +50,6 @@ from armscan.pipeline.progress import (
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan, doubt_times
 from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeCounts
 from armscan.reconstruction.place import (
-    DELIVERED,
     BaseTransform,
     cut_cloud,
     delivered_points,
@@ -65,7 +64,7 @@ from armscan.reconstruction.sync import (
     exposure_poses,
     stripes_at_equal_poses,
 )
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import DELIVERED, PointCloud
 from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
 from armscan.storage.detection_cache import DetectionCache

@@ -36,6 +36,7 @@ from armscan.reconstruction.triangulate import (
     stripe_cloud,
 )
 from armscan.records.cloud import (
+    DELIVERED,
     FIELD_POWERS,
     CalibrationErrors,
     PointCloud,
@@ -43,8 +44,6 @@ from armscan.records.cloud import (
 )
 from armscan.records.profile import PointProfile, Profile
 
-DELIVERED = "profile"
-"""Name of the one light sheet of a sensor that delivers points itself."""
 THIRD_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])
 """Blind to any parabola, so to the course of a profile over four points."""
 

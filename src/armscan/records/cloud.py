@@ -24,6 +24,8 @@ CloudFrame = Literal["Sensor", "Base", "Part", "Cad"]
 
 FUSED = "fused"
 """Name of the one sheet and the one exposure of a fused cloud: its points come from many."""
+DELIVERED = "profile"
+"""Name of the one light sheet of a sensor that delivers points itself."""
 SMALLEST_EXTENT_MM = 2.0
 """Points that all lie this near to each other are taken for metres: nothing that small is measured,
 probed to place a scanner or carries markers, and a plate in metres is not larger."""

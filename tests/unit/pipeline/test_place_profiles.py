@@ -119,3 +119,10 @@ def test_the_command_places_a_folder_of_profiles(
     cloud = read_ply(tmp_path / "cloud.ply")
     assert np.abs(cloud.points_mm - truth).max() < 6.0 * NOISE_MM
     assert (tmp_path / "cloud.html").is_file()
+    words[-2] = tmp_path / "fused.ply"
+    assert main([*map(str, words), "--voxel", "2"]) == 0
+    fused = json.loads(capsys.readouterr().out)
+    assert not any("share the stripe's noise" in text for text in told["warnings"])
+    (warned,) = (text for text in fused["warnings"] if "share the stripe's noise" in text)
+    assert "delivers profiles does not tell" in warned
+    assert "share the stripe" in (tmp_path / "fused.html").read_text("utf-8")

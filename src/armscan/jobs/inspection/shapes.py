@@ -30,8 +30,7 @@ from armscan.inspection.search import WantedFeature
 from armscan.inspection.selection import InspectionOptions, StepOptions
 from armscan.inspection.sphere import inspect_sphere as sphere_of
 from armscan.inspection.step import inspect_step as step_of
-from armscan.jobs.job import Job, solved
-from armscan.reconstruction.place import DELIVERED
+from armscan.jobs.job import Job, noise_remarks, solved
 from armscan.records.cloud import PointCloud
 from armscan.records.points import ProbedPoints
 from armscan.report.inspection.features import feature_report, relation_report
@@ -227,18 +226,7 @@ def finished_inspection(
 ) -> Summary:
     """Write the page, if one is wanted, and sum up."""
     is_simulated = cloud.is_simulated or are_simulated(inputs)
-    if cloud.noise_length is None and cloud.sigma_noise_mm.any():
-        is_delivered = tuple(cloud.sheet_names) == (DELIVERED,)
-        assumed = (
-            "the cloud does not say how far neighbours share the stripe's noise: it is taken as "
-            "new in every point, as if nothing had been smoothed along it; "
-            + (
-                "a sensor that delivers profiles does not tell"
-                if is_delivered
-                else "reconstruct again"
-            )
-        )
-        report = replace(report, warnings=(*report.warnings, assumed))
+    report = replace(report, warnings=(*report.warnings, *noise_remarks(cloud)))
     written: tuple[Path, ...] = ()
     delivery = job.delivery(cloud, inputs[0])
     if job.output is not None:

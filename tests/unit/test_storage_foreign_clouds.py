@@ -117,6 +117,24 @@ def test_a_ply_file_of_another_program(tmp_path: Path) -> None:
         read_cloud(path)
 
 
+@pytest.mark.parametrize("comment", ["calibration done", "calibration 3 scans", "forced cooling"])
+def test_comments_of_other_programs_are_no_marks_of_ours(tmp_path: Path, comment: str) -> None:
+    """The header was told as damaged."""
+    path = tmp_path / "other.xyz"
+    path.write_text(f"# {comment}\n1.5 -2 3.25\n4 5 -6.5\n")
+    assert read_cloud(path).points_mm.tolist() == POINTS.tolist()
+    path = tmp_path / "other.ply"
+    fields = "".join(f"property double {axis}\n" for axis in "xyz")
+    header = f"ply\nformat ascii 1.0\ncomment {comment}\nelement vertex 2\n{fields}end_header\n"
+    path.write_text(header + "1.5 -2 3.25\n4 5 -6.5\n")
+    found = read_cloud(path)
+    assert found.points_mm.tolist() == POINTS.tolist()
+    assert found.forced == () and found.calibrations == ()
+    path.write_bytes(ply_bytes(cloud_of(POINTS)).replace(b"unit mm", comment.encode(), 1))
+    with pytest.raises(FileFormatError, match="is damaged"):
+        read_cloud(path)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [

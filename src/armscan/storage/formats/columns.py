@@ -7,6 +7,7 @@ A format that keeps all columns and notes loses nothing; others keep those that 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -64,6 +65,8 @@ ARM_ERROR = "arm_error_mm"
 """Note of what the arm errs alike at all postures of a scan."""
 ERROR_MODES = "calibration_error_mm"
 """Note of a sheet's moves by the calibration's errors, of one product of powers: 3 K numbers."""
+OWN_MARK = re.compile(rf"({FORCED}|{CALIBRATION}) \d+ [\[\"]")
+"""How such notes begin; comments of other programs may begin with the word."""
 FOREIGN_FRAME: CloudFrame = "Part"
 """Frame of points about which a file says nothing."""
 
@@ -251,6 +254,7 @@ def cloud_of_columns(found: CloudColumns, path: Path) -> PointCloud:
     zeros = np.zeros(n, dtype=np.int64)
     exposure = found.columns.get("exposure") if found.sources else None
     has_intensity = "intensity" in found.columns
+    marks = [text for text in found.notes if OWN_MARK.match(text)]
     with told_of(where):
         return PointCloud(
             frame=_frame(found.notes) or FOREIGN_FRAME,
@@ -265,8 +269,8 @@ def cloud_of_columns(found: CloudColumns, path: Path) -> PointCloud:
             intensity=_finite(found.columns["intensity"]) if has_intensity else np.zeros(n),
             normals=_unit(found.columns),
             is_simulated=SIMULATED in found.notes,
-            forced=_names(found.notes, FORCED),
-            calibrations=_calibrations(found.notes),
+            forced=_names(marks, FORCED),
+            calibrations=_calibrations(marks),
         )
 
 

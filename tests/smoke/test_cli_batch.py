@@ -162,6 +162,14 @@ def test_a_page_that_is_left_ends_no_other(week: Path, run: Run, measured: list[
     assert (clouds / "a.html").read_text() == "mine" and "data" in told["b"]
 
 
+def test_what_is_hidden_is_no_recording(week: Path, run: Run, measured: list[str]) -> None:
+    for name in ("._a.mcap", ".scan.123.part", "._photo.png"):
+        (week / name).write_bytes(b"\0")
+    (week / ".trash").mkdir()
+    (week / ".trash" / "exposures.csv").write_text("index\n")
+    assert set(run()[1]["scans"]) == {"a", "b", "c"}
+
+
 def test_images_beside_recordings_are_told_of(
     week: Path, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:

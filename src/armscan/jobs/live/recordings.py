@@ -31,7 +31,7 @@ SUFFIX = ".mcap"
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Recordings in a folder that is none itself, by name.
+    """Recordings in a folder that is none itself, by name; what is hidden is left.
 
     Raises
     ------
@@ -40,7 +40,8 @@ def recordings_in(folder: Path) -> list[Path]:
     """
     if not is_folder(folder) or is_recording(folder):
         return []
-    there = sorted(folder.iterdir())
+    # a file system's own, and recordings that are not yet whole
+    there = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     found = [path for path in there if is_recording(path)]
     images = [path.name for path in there if path.suffix.lower() in IMAGE_SUFFIXES]
     if found and images:

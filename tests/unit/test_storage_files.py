@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import subprocess
 import sys
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +17,7 @@ from typing import Any
 import pytest
 
 from armscan.errors import FileFormatError, OutputError
+from armscan.storage.documents import fingerprint
 from armscan.storage.files import (
     check_new_folder,
     check_outputs,
@@ -22,8 +26,36 @@ from armscan.storage.files import (
     path_text,
     read_bytes,
     set_aside,
+    sha256_of,
     write_files,
 )
+
+
+def test_a_hash_needs_no_memory_for_the_file(tmp_path: Path) -> None:
+    """The whole file was read."""
+    path = tmp_path / "long.bin"
+    path.write_bytes(bytes(20 * 2**20))
+    tracemalloc.start()
+    found = fingerprint(path).sha256
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 2 * 2**20
+    assert found == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("read", [read_bytes, sha256_of])
+def test_what_cannot_be_read_is_told_alike(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    (tmp_path / "empty").touch()
+    os.mkfifo(tmp_path / "pipe")
+    for name, said in {
+        "empty": "is empty",
+        "none": "no such file",
+        ".": "a folder",
+        "pipe": "a pipe",
+        "\0": "null",
+    }.items():
+        with pytest.raises(FileFormatError, match=said):
+            read(tmp_path / name)
 
 
 def test_files_are_written_together(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ from armscan.storage.codec import (
     parse_json,
     read_matrix,
 )
-from armscan.storage.files import path_text, read_bytes
+from armscan.storage.files import path_text, read_bytes, sha256_of
 from armscan.storage.foreign import parse_foreign_camera
 from armscan.storage.tables import LARGEST_MM
 
@@ -596,7 +596,7 @@ def _explained(path: Path, schema: str) -> Iterator[None]:
 
 def fingerprint(path: Path) -> InputFile:
     """Path as given, with ``/``, and SHA-256 of the content."""
-    return InputFile(path_text(path), sha256(read_bytes(path)).hexdigest())
+    return InputFile(path_text(path), sha256_of(path))
 
 
 def new_provenance(

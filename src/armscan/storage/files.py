@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 from uuid import uuid4
@@ -137,10 +138,38 @@ def is_folder(path: Path) -> bool:
 
 def read_bytes(path: Path) -> bytes:
     """Content of a file that must exist and hold something."""
-    where = path_text(path)
     packed = packed_place(path)
     if packed is not None and packed[1]:
         return _packed_folder(packed[0]).read(packed[1])
+    with _reading(path) as file:
+        data = file.read()
+    if not data:
+        raise _empty(path)
+    return data
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of what `read_bytes` would read, which need not fit into memory."""
+    packed = packed_place(path)
+    if packed is not None and packed[1]:
+        return hashlib.sha256(read_bytes(path)).hexdigest()
+    with _reading(path) as file:
+        digest, size = hashlib.file_digest(file, "sha256"), file.tell()
+    if not size:
+        raise _empty(path)
+    return digest.hexdigest()
+
+
+def _empty(path: Path) -> FileFormatError:
+    return FileFormatError(
+        "the file is empty (0 bytes)", where=path_text(path), remedy="copy the file again"
+    )
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[FileIO]:
+    """Open a file that must exist, and say why it cannot be read."""
+    where = path_text(path)
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
@@ -149,7 +178,8 @@ def read_bytes(path: Path) -> bytes:
             raise FileFormatError(
                 "this is a pipe or a device, not a file", where=where, remedy="name a file"
             )
-        data = path.read_bytes()
+        with path.open("rb", buffering=0) as file:
+            yield file
     except FileNotFoundError as error:
         raise FileFormatError(
             "there is no such file", where=where, remedy="check the path"
@@ -159,11 +189,6 @@ def read_bytes(path: Path) -> bytes:
         raise FileFormatError(
             f"the file cannot be read ({fact})", where=where, remedy="check the path and its rights"
         ) from error
-    if not data:
-        raise FileFormatError(
-            "the file is empty (0 bytes)", where=where, remedy="copy the file again"
-        )
-    return data
 
 
 @contextmanager

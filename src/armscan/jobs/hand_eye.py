@@ -547,7 +547,7 @@ def _refuse_repeated(folders: Sequence[Path]) -> None:
 def _from_profiles(source: StripeSource, artefact: Artefact) -> HandEyeInputs:
     if source.poses is None:
         raise OptionError("profiles need a table of poses", remedy="give --poses")
-    files = [path for name in source.profiles for path in profile_files(Path(name))]
+    files = [path for name in source.profiles for path in profile_files(Path(name), source.poses)]
     profiles = read_profiles(files)
     poses = read_robot_poses(source.poses, source.euler or USUAL_EULER, files)
     stripes = posed_stripes_from_profiles(profiles, poses)

@@ -469,9 +469,9 @@ def _delivered(
     """Place profiles that a sensor delivered."""
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
     scanner = read_scanner_calibration(calibration)
-    profiles = read_profiles(names)
+    files = [path for name in names for path in profile_files(Path(name), table.path)]
+    profiles = read_profiles(files)
     points = scan_spool(scanner)
-    files = [path for name in names for path in profile_files(Path(name))]
     poses = read_robot_poses(table.path, table.euler, files)
     scan = place_profiles(profiles, poses, scanner, volume, points=points)
     warnings = scan.warnings

@@ -10,12 +10,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, get_args
 
 import numpy as np
 
 from armscan.errors import FileFormatError, OptionError
 from armscan.geometry.arrays import FloatArray
+from armscan.records.cloud import CloudFrame
 from armscan.records.points import CommonErrors, MarkerSet, ProbedPoints
 from armscan.records.profile import PointProfile, Profile, StripeFlag
 from armscan.storage.files import is_folder, path_text, read_bytes, told_of
@@ -137,7 +138,7 @@ def _tip(table: CsvTable) -> tuple[float, bool]:
     """Diameter that a comment gives, 0 for none; whether the points are on the surface."""
     stated: dict[str, str] = {}
     for comment in table.comments:
-        found = re.findall(r"(point|tip_diameter_mm)\s*=\s*([^,;]+)", comment)
+        found = re.findall(r"\b(point|tip_diameter_mm)\s*=\s*([^,;]+)", comment)
         stated |= {key: value.strip() for key, value in found}
     unclear = [comment.strip() for comment in table.comments if MEANS_TIP.search(comment)]
     if unclear and not stated:
@@ -175,7 +176,7 @@ COVARIANCES = ("cov_xx_mm2", "cov_xy_mm2", "cov_xz_mm2", "cov_yy_mm2", "cov_yz_m
 ASSUMED_SIGMA_MM = 0.02
 """Standard deviation an axis of a marker about which a list says nothing: a probed point, or a
 ring's centre measured by two cameras."""
-FRAME = "frame ="
+FRAME = re.compile(r"frame\s*[=:]\s*(\S.*)", re.IGNORECASE)
 COMMON_IDS, COMMON_COVARIANCE = "moved together =", "covariance of moves ="
 SIMULATED = "simulated"
 """Comment of a list that was measured on rendered images."""
@@ -219,7 +220,7 @@ def markers_csv(markers: MarkerSet, *, is_simulated: bool = False) -> bytes:
     columns |= number_columns(COORDINATES, markers.points_mm)
     columns |= number_columns(COVARIANCES, upper)
     marks = (SIMULATED,) if is_simulated else ()
-    return csv_bytes(columns, (f"{FRAME} {markers.frame}", *marks, *_common_lines(markers)))
+    return csv_bytes(columns, (f"frame = {markers.frame}", *marks, *_common_lines(markers)))
 
 
 def _common_lines(markers: MarkerSet) -> tuple[str, ...]:
@@ -287,7 +288,8 @@ def stripes_csv(profiles: Sequence[Profile], *, is_simulated: bool = False) -> b
 def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_MM) -> MarkerList:
     """Read a table ``x_mm,y_mm,z_mm`` with, if you like, ``id`` and the six covariances.
 
-    A comment ``# frame = Base`` names the frame, ``# simulated`` marks rendered images. Tables of
+    A comment ``# frame = Base``, however it is written, names the frame, ``# simulated`` marks
+    rendered images. Tables of
     probed points are such lists; points are taken as they stand, centres of a tip included.
 
     ``frame`` is that of the markers where the list names none, ``sigma_mm`` the standard deviation
@@ -311,18 +313,19 @@ def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_
     ids = table.ints("id") if "id" in table else np.arange(1, len(table) + 1)
     table.refuse_repeats("id", ids.tolist())
     has_covariance = any(name in table for name in COVARIANCES)
-    frames = [text[len(FRAME) :].strip() for text in table.comments if text.startswith(FRAME)]
+    named = [found[1] for text in table.comments if (found := FRAME.fullmatch(text))]
+    known = {name.lower(): name for name in get_args(CloudFrame)}
     with told_of(table.where, remedy="correct the table, or measure again"):
         markers = MarkerSet(
             ids=ids,
             points_mm=points,
             covariance_mm2=_covariance(table, sigma_mm, has_covariance=has_covariance),
-            frame=(*frames, frame)[0],
+            frame=known.get(named[0].lower(), named[0]) if named else frame,
             source=path_text(path),
             common=_common_errors(table),
         )
     is_simulated = SIMULATED in (text.strip() for text in table.comments)
-    return MarkerList(markers, path, "id" in table, not has_covariance, is_simulated, not frames)
+    return MarkerList(markers, path, "id" in table, not has_covariance, is_simulated, not named)
 
 
 def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> FloatArray:
@@ -345,6 +348,8 @@ def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> Fl
 
 PROFILE_SUFFIXES = frozenset({".yml", ".yaml", ".csv", ".txt"})
 SCAN_LINE = re.compile(r"^[ \t]*scan_line[ \t]*:\s*\[([^\]]*)(\]?)", re.MULTILINE)
+ROTATION = re.compile(r"\s*(?:(?:[abc]|r[xyz])[ _]?\W?(?:deg|rad)\W?|[abc]|[rq][xyz]|qw)\s*")
+"""A column of a table of poses."""
 YAML_WORDS = {".nan": math.nan, ".inf": math.inf, "-.inf": -math.inf}
 
 
@@ -363,14 +368,19 @@ def read_profiles(paths: Sequence[Path | str]) -> tuple[PointProfile, ...]:
     return tuple(_read(file, name) for file, name in zip(files, names, strict=True))
 
 
-def profile_files(path: Path) -> list[Path]:
-    """Profiles of a file, a pattern or a folder, in natural order."""
+def profile_files(path: Path, poses: Path | None = None) -> list[Path]:
+    """Profiles of a file, a pattern or a folder, in natural order.
+
+    A table of poses in the folder is none, whether it is ``poses`` or is told by its header.
+    """
     if not is_folder(path):
         return list(expand_paths([path]))
     found = [
         item
         for item in path.iterdir()
-        if item.suffix.lower() in PROFILE_SUFFIXES and _looks_like_profile(item)
+        if item.suffix.lower() in PROFILE_SUFFIXES
+        and (poses is None or item.resolve() != poses.resolve())
+        and _looks_like_profile(item)
     ]
     if not found:
         raise FileFormatError(
@@ -381,7 +391,10 @@ def profile_files(path: Path) -> list[Path]:
 
 def _looks_like_profile(path: Path) -> bool:
     start = path.read_bytes()[:2000].decode("utf-8-sig", errors="replace")
-    return SCAN_LINE.search(start) is not None or "x_mm" in start
+    if SCAN_LINE.search(start):
+        return True
+    heading = next((line for line in start.splitlines() if "x_mm" in line), "")
+    return bool(heading) and not any(ROTATION.fullmatch(w) for w in heading.lower().split(","))
 
 
 def _read(path: Path, name: str) -> PointProfile:

@@ -66,6 +66,17 @@ def test_three_columns_are_enough(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.markers.covariance_mm2[1], 0.0025 * np.eye(3))
 
 
+@pytest.mark.parametrize(
+    "comment", ["#frame=Base", "# Frame = Base", "# frame: Base", "# frame = base", "# FRAME =BASE"]
+)
+def test_a_frame_is_read_however_it_is_written(tmp_path: Path, comment: str) -> None:
+    """All but `# frame = Base` were passed over, and the markers taken to be in Sensor."""
+    path = written(tmp_path, f"{comment}\n{HEAD}\n{ROWS}")
+    assert read_marker_list(path, frame="Sensor").markers.frame == "Base"
+    path = written(tmp_path, f"# frame = Fixture 2\n# framed by us\n{HEAD}\n{ROWS}")
+    assert read_marker_list(path, frame="Sensor").markers.frame == "Fixture 2"
+
+
 def test_probed_points_are_a_list_too(tmp_path: Path) -> None:
     text = (
         f"# point = tip-centre, tip_diameter_mm = 6\n{HEAD},feature\n1,2,3,a\n100,2,3,b\n1,90,3,c\n"

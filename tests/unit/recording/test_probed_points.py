@@ -42,6 +42,7 @@ def test_points_are_on_the_surface_unless_a_comment_says_that_they_are_the_tips_
     tmp_path: Path,
 ) -> None:
     assert not read_probed_points(written(tmp_path, TABLE)).are_tip_centres
+    assert not read_probed_points(written(tmp_path, "# checkpoint = 3\n" + TABLE)).are_tip_centres
     text = "# tip centres of a ruby ball\n# point = tip-centre, tip_diameter_mm = 6\n" + TABLE
     assert read_probed_points(written(tmp_path, text)).tip_diameter_mm == 6.0
     text = "# point = surface\n" + TABLE

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from armscan.errors import FileFormatError
 from armscan.geometry.rotations import EulerConvention
 from armscan.records.recording import PoseForm
-from armscan.storage.points import read_profiles
+from armscan.storage.points import profile_files, read_profiles
 from armscan.storage.recordings.robot_poses import read_robot_poses, rotations_of_form
 from rigs.photographs import DATA, needs
 
@@ -49,6 +49,24 @@ def test_a_folder_or_a_pattern_stands_for_its_profiles_in_natural_order(tmp_path
     written(tmp_path, "poses.txt", "1 2 3 4 5 6\n")
     for given in (tmp_path, f"{tmp_path}/p*.yml"):
         assert [item.source for item in read_profiles([given])] == ["p1.yml", "p2.yml", "p10.yml"]
+
+
+def test_a_table_of_poses_beside_the_profiles_is_none_of_them(tmp_path: Path) -> None:
+    written(tmp_path, "p1.csv", "x_mm,z_mm,qwality\n1,2,3\n")
+    mine = written(tmp_path, "a.csv", "# by us\nx_mm,y_mm,z_mm\n1,2,3\n")
+    for k, names in enumerate(
+        (
+            "a_deg,b_deg,c_deg",
+            "A_rad, B_rad, C_rad",
+            "qw,qx,qy,qz",
+            "a [deg],b [deg],c [deg]",
+            "rx,ry,rz",
+            "a,b,c",
+        )
+    ):
+        written(tmp_path, f"poses{k}.csv", f"# poses\nx_mm,y_mm,z_mm,{names}\n")
+    assert [path.name for path in profile_files(tmp_path)] == ["a.csv", "p1.csv"]
+    assert [path.name for path in profile_files(tmp_path, mine)] == ["p1.csv"]
 
 
 @pytest.mark.parametrize(

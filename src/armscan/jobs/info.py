@@ -28,6 +28,7 @@ from armscan.models.calibration import (
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.reconstruction.sync import exposure_poses, largest_gap_ns
 from armscan.records.cloud import PointCloud, largest_eigenvalue
+from armscan.records.points import ProbedPoints
 from armscan.records.recording import LASER_UNKNOWN, NO_TRIGGER, ArmTrack, CameraSetup
 from armscan.report.quantity import Summary, fact, plural, with_sigma
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
@@ -49,7 +50,7 @@ from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import image_format, read_exposure
 from armscan.storage.observations import read_observations
 from armscan.storage.parts.meshes import read_part
-from armscan.storage.points import read_marker_list, read_probed_points
+from armscan.storage.points import is_plane, read_marker_list, read_points_or_plane
 from armscan.storage.recording import FolderRecording, is_recording, read_arm_track, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 
@@ -222,8 +223,10 @@ def describe_probe(path: Path) -> dict[str, Any]:
 
 
 def describe_points(path: Path) -> dict[str, Any]:
-    """Count and extent of probed points."""
-    points = read_probed_points(path)
+    """Count and extent of probed points, or a plane's four numbers."""
+    points = read_points_or_plane(path)
+    if not isinstance(points, ProbedPoints):
+        return {"what": "plane A x + B y + C z + D = 0, in mm", "abcd": points.tolist()}
     kind = "centres of the tip" if points.are_tip_centres else "on the surface"
     return {
         "what": f"{len(points)} probed points, {kind}",
@@ -463,12 +466,12 @@ def _text(path: Path, data: bytes) -> dict[str, Any]:
     stripped = data.lstrip(b"\xef\xbb\xbf \t\r\n")
     content = parse_json(data, str(path)) if stripped.startswith(b"{") else {}
     if "schema" in content:
-        return DESCRIBE_SCHEMA.get(content["schema"], _calibration)(path)
+        return DESCRIBE_SCHEMA.get(str(content["schema"]), _calibration)(path)
     if what := _by_product(path, data, content):
         return {"what": what}
     if path.name in DESCRIBE_NAMED:
         return DESCRIBE_NAMED[path.name](path)
-    if path.suffix.lower() == ".csv":
+    if path.suffix.lower() == ".csv" or is_plane(data):
         return describe_markers(path) if _are_markers(path) else describe_points(path)
     if path.suffix.lower() in (".json", ".yaml", ".yml", ".xml"):
         return _camera(read_camera_calibration(path), "camera calibration of another program")
@@ -483,13 +486,19 @@ def _text(path: Path, data: bytes) -> dict[str, Any]:
 
 
 def _by_product(path: Path, data: bytes, content: dict[str, Any]) -> str:
-    """What a file is that armscan writes beside its results and does not read; empty for others."""
+    """What a file is in which armscan looks for no facts; empty for others."""
     if {"kind", "simulated"} <= content.keys():
         return f"what `armscan` says with --json ({content['kind']})"
     if {"head", "preset", "seed", "simulated"} <= content.keys():
         return f"truth of a simulation ({content['head']})"
-    if OWN_PAGE in data[:2000]:
-        return "page of armscan; open it in a browser"
+    for is_it, what in (
+        (OWN_PAGE in data[:2000], "page of armscan; open it in a browser"),
+        (content.keys() == {"results"}, "list of what was made of a folder of recordings"),
+        (data.startswith(b"ISO-10303-21"), "STEP model of a part, for `armscan inspect cad`"),
+        (path.name == "rig.toml", "devices of a rig, for `armscan record` and `console`"),
+    ):
+        if is_it:
+            return what
     first = data[:1000].decode("utf-8", "replace").splitlines()[:5]
     if path.name == "files.txt" and all(is_file(path.parent / name) for name in first):
         return "list of the files that stand beside it"

@@ -38,6 +38,8 @@ STRIPE_NUMBERS: Final = (
     *("x_px", "y_px", "sigma_px", "normal_x", "normal_y", "width_px", "intensity"),
 )
 PLANE_NAMES = ("a", "b", "c", "d")
+MOST_OF_A_PLANE = 2000
+"""Bytes of a file with four numbers, a header and comments."""
 
 
 def read_probed_points(path: Path) -> ProbedPoints:
@@ -103,6 +105,11 @@ def read_points_or_plane(path: Path) -> ProbedPoints | FloatArray:
         return parse_plane(words, str(path))
     except OptionError as error:
         raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
+
+
+def is_plane(data: bytes) -> bool:
+    """Whether a file holds a plane's four numbers and nothing else."""
+    return len(data) < MOST_OF_A_PLANE and _plane_words(data) is not None
 
 
 def _plane_words(data: bytes) -> str | None:

@@ -185,6 +185,30 @@ def test_what_is_not_known_is_no_zero(tmp_path: Path) -> None:
     assert "x range: 1.0, 4.0 mm" in told
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("part.step", "ISO-10303-21;\nHEADER;\n", "STEP model of a part"),
+        ("rig.toml", 'arm = "tcp://h:1"\n', "devices of a rig"),
+        ("batch.json", '{"results": {"a": {"mark": "x"}}}', "list of what was made of a folder"),
+        ("plane.csv", "A,B,C,D\n0,0,2,-5\n", "plane A x"),
+        ("plane.txt", "# of the table\n0 0 1 -5\n", "plane A x"),
+    ],
+)
+def test_what_holds_no_facts_is_named(tmp_path: Path, name: str, text: str, what: str) -> None:
+    """Some were told to be no table, some to be of no known kind."""
+    path = tmp_path / name
+    path.write_text(text)
+    assert str(described(path)["what"]).startswith(what)
+
+
+def test_json_of_another_program_that_has_a_schema_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.json"
+    path.write_text('{"schema": {"type": "object"}}')
+    with pytest.raises(FileFormatError, match=r"other\.json"):
+        describe_files([str(path)])
+
+
 def test_other_tables_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.csv"
     path.write_text("name,age\nx,3\n")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from armscan.errors import FileFormatError
 from armscan.jobs.info import describe_files
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
+from armscan.storage.codec import RecordCodec
 from armscan.storage.documents import (
     camera_document,
     read_calibration,
@@ -334,3 +335,14 @@ def test_a_fisheye_has_no_variance_of_tangential_distortion(tmp_path: Path) -> N
     path.write_bytes(camera_document(wrong))
     with pytest.raises(FileFormatError, match="tangential"):
         read_camera_calibration(path)
+
+
+def test_a_figure_of_numpy_that_is_not_known_is_written_as_null() -> None:
+    """Only Python's NaN was; numpy's ended in a ValueError of JSON."""
+
+    @dataclass
+    class Record:
+        rms_mm: float
+
+    assert RecordCodec().write(Record(np.float64("nan"))) == {"rms_mm": None}
+    assert RecordCodec().write(Record(np.float64(1.5))) == {"rms_mm": 1.5}

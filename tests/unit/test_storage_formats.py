@@ -352,6 +352,38 @@ def test_pcd_files_of_other_programs(tmp_path: Path, form: str) -> None:
     assert found.normals.tolist() == [[0.0, 0.0, 1.0]] * 40
 
 
+@pytest.mark.parametrize("name", ["x", "normal_x", "intensity"])
+def test_pcd_fields_of_several_values_are_no_coordinates(tmp_path: Path, name: str) -> None:
+    """They ended in a ValueError."""
+    others = [one for one in ("x", "y", "z", "normal_x", "normal_y", "normal_z") if one != name]
+    header = f"FIELDS {' '.join(others)} {name} more\nSIZE{' 4' * (len(others) + 2)}\n"
+    header += f"TYPE{' F' * (len(others) + 2)}\nCOUNT{' 1' * len(others)} 3 2\n"
+    header += "WIDTH 1\nHEIGHT 2\nPOINTS 2\nDATA ascii\n"
+    path = tmp_path / "cloud.pcd"
+    path.write_text(header + 2 * (" ".join(["1"] * (len(others) + 5)) + "\n"))
+    wanted = {"normal_x": "nx"}.get(name, name)
+    with pytest.raises(FileFormatError, match=f"field {wanted} of the PCD file has 3 values"):
+        read_cloud(path)
+
+
+def test_packed_colours_of_an_ascii_pcd_file_are_passed_over(tmp_path: Path) -> None:
+    """Numpy warned of numbers that a field of four bytes does not hold."""
+    path = tmp_path / "cloud.pcd"
+    header = "FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F I\nCOUNT 1 1 1 1\nWIDTH 1\nHEIGHT 1\n"
+    path.write_text(header + "POINTS 1\nDATA ascii\n1.5 -2 3.25 4294967295\n")
+    assert read_cloud(path).points_mm.tolist() == [[1.5, -2.0, 3.25]]
+
+
+@pytest.mark.parametrize("name", ["c.csv", "c.xyz"])
+def test_a_table_in_utf_16_is_told_as_such(tmp_path: Path, name: str) -> None:
+    """It was told as cut."""
+    path = tmp_path / name
+    for encoding in ("utf-16", "utf-16-le", "utf-16-be"):
+        path.write_bytes("x,y,z\n1.5,-2,3.25\n".encode(encoding))
+        with pytest.raises(FileFormatError, match="this is not UTF-8 text"):
+            read_cloud(path)
+
+
 def test_empty_places_of_a_grid_are_no_points_but_nan_in_a_list_is_wrong(tmp_path: Path) -> None:
     points = POINTS.copy()
     points[1] = np.nan

@@ -184,7 +184,8 @@ def reconstruct(
 @job_command(CloudFile, Path("fused.ply"))
 def fuse(
     clouds: Annotated[
-        list[Path], typer.Argument(help="Clouds in one frame, .ply or text.", show_default=False)
+        list[Path],
+        typer.Argument(help="Clouds in one frame, as `convert` reads them.", show_default=False),
     ],
     *,
     voxel: Annotated[

@@ -305,8 +305,10 @@ class RecordCodec:
             return rows | {_translation_key(hint): value.translation_mm.tolist()}
         if is_dataclass(value):
             return self.write(value)
-        if isinstance(value, np.ndarray | np.generic):
+        if isinstance(value, np.ndarray):
             return value.tolist()
+        if isinstance(value, np.generic):
+            value = value.item()
         if isinstance(value, tuple):
             return [self._tree(item, None, may_lack) for item in value]
         return None if may_lack and isinstance(value, float) and not math.isfinite(value) else value

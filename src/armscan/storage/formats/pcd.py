@@ -24,6 +24,7 @@ from armscan.storage.formats.columns import (
     CloudPiece,
     cloud_columns,
     columns_of,
+    dropped_columns,
     header_bytes,
     structured,
 )
@@ -98,6 +99,13 @@ def pcd_columns(data: bytes, path: Path) -> CloudColumns:
             remedy="copy the file again",
         )
     columns = {RENAMED.get(name, name): values for name, values in columns_of(table).items()}
+    read = set(columns) - set(dropped_columns(CloudColumns(columns)))
+    if wide := sorted(name for name in read if columns[name].ndim > 1):
+        raise FileFormatError(
+            f"field {wide[0]} of the PCD file has {columns[wide[0]].shape[1]} values a point",
+            where=where,
+            remedy="write fields x, y and z of one value each",
+        )
     remarks: tuple[str, ...] = ()
     if header.height > 1 and set(POINT) <= set(columns):
         is_seen = np.isfinite(np.stack([columns[name] for name in POINT])).all(axis=0)
@@ -166,7 +174,10 @@ def _ascii_table(body: bytes, header: _Header, where: str) -> NDArray[Any]:
         table = np.zeros(0 if words is None else len(words), header.kind)
         for k, name in enumerate(header.kind.names or ()):
             if words is not None:
-                table[name] = words[:, first[k] : first[k + 1]].reshape(len(words), *counts[k])
+                own = words[:, first[k] : first[k + 1]].reshape(len(words), *counts[k])
+                # colours as one whole number may need more bits than their field says
+                with np.errstate(invalid="ignore"):
+                    table[name] = own
     except (ValueError, IndexError) as error:
         raise FileFormatError(
             "the points of the PCD file are not understood", where=where, remedy=DAMAGED

@@ -124,6 +124,10 @@ def csv_bytes(piece: CloudPiece) -> bytes:
 
 def text_columns(data: bytes, path: Path) -> CloudColumns:
     """Columns of a table of numbers: those that its heading names, else the first three as xyz."""
+    if b"\0" in data[:LONGEST_SHOWN]:
+        raise FileFormatError(
+            "this is not UTF-8 text", where=path_text(path), remedy="save it as text in UTF-8"
+        )
     text = data.decode("utf-8-sig", errors="replace")
     lines, is_ended = text.splitlines(), text.endswith(("\n", "\r"))
     opening = opening_of(lines, path)

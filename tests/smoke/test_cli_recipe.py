@@ -15,8 +15,10 @@ import trimesh
 
 from armscan.cli import main
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
 from armscan.inspection.cad.part import part_of
-from armscan.inspection.recipe import follow_recipe
+from armscan.inspection.recipe import FollowedRecipe, Recipe, follow_recipe
+from armscan.records.cloud import PointCloud
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.documents import scanner_document
 from rigs.calibration_documents import scanner_calibration
@@ -139,6 +141,26 @@ def test_parts_of_a_folder_become_one_table(
     files = sorted(path.name for path in (output / "part-10").iterdir())
     assert files == ["features.json", "part.csv", "part.html", "part.ply"]
     assert not (output / "part-3").exists()
+
+
+def test_a_fit_without_a_solution_costs_its_own_part_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def follow(recipe: Recipe, cloud: PointCloud) -> FollowedRecipe | FitFailure:
+        if len(cloud) == 300:
+            raise np.linalg.LinAlgError("Singular matrix")
+        return follow_recipe(recipe, cloud)
+
+    monkeypatch.setattr("armscan.jobs.inspection.recipe.follow_recipe", follow)
+    (tmp_path / "recipe.toml").write_text('[[feature]]\nname = "face"\nkind = "plane"\n')
+    points = np.random.default_rng(0).uniform(0.0, [40.0, 30.0, 0.01], (600, 3))
+    scans = [tmp_path / "a.ply", tmp_path / "b.ply"]
+    for path, n in zip(scans, (300, 600), strict=True):
+        path.write_bytes(ply_bytes(cloud_of(points[:n])))
+    told = inspected(tmp_path, tmp_path / "results", capsys, *map(str, scans))
+    broken, whole = told["parts"]["each"]
+    assert "no solution in numbers (Singular matrix)" in broken["reason"]
+    assert (broken["verdict"], whole["reason"]) == ("not inspected", "")
 
 
 def test_what_is_done_is_kept_and_not_done_again(

@@ -53,6 +53,10 @@ LEAST_PART = 0.01
 LEAST_SHARE = 1e-3
 """Least part of what points share that exposures err each for itself, along any direction."""
 
+LEAST_SEEN = 1e-3
+"""Part of a motion that a fit must leave in the residuals: of less they tell nothing, as where few
+stripes cross a flat face and the fit takes up all of their motions, but for what is not linear."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitLinearised:
@@ -364,12 +368,15 @@ class _Scores:
         (G, 6, n, 6) the same by motions of exposures, of one standard deviation each.
     noise_mm2
         (G, 6, G, 6) their covariance by the points' own noise, and by the calibration's errors.
+    least
+        What by_group is along motions that the residuals tell, at least.
     """
 
     residual: FloatArray
     by_group: FloatArray
     by_exposure: FloatArray
     noise_mm2: FloatArray
+    least: float
 
     @staticmethod
     def of(fit: FitLinearised, errors: _ExposureErrors) -> _Scores:
@@ -407,19 +414,20 @@ class _Scores:
             np.add.reduceat(by_exposure, first, axis=2),
             np.einsum("ginj,njk->gink", by_exposure, errors.unit_mm),
             private + np.einsum("gik,hjk->gihj", known, known),
+            LEAST_SEEN * float(np.einsum("gii->gi", np.add.reduceat(own, first)).max()),
         )
 
     def whitened(self, chosen: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Sums by some of the six motions as (D,) numbers of about equal noise; that (D, D); by
         the same motions of exposures (D, n C), in units of their standard deviations.
 
-        Sums that the fit takes up are left out.
+        Sums that the fit takes up are left out; of all, D is 0 and the data tell nothing.
         """
         rows = self.residual[:, chosen].size
         square = (slice(None), chosen, slice(None))
         by_group = self.by_group[square][..., chosen].reshape(rows, rows)
         values, vectors = np.linalg.eigh(by_group)
-        is_seen = values > 1e-6 * values[-1]
+        is_seen = values > self.least
         size, vectors = np.sqrt(values[is_seen]), vectors[:, is_seen]
         noise = self.noise_mm2[square][..., chosen].reshape(rows, rows)
         by = self.by_exposure[square][..., chosen].reshape(rows, -1)
@@ -469,7 +477,7 @@ def _spread(by_motions: FloatArray, correlation: FloatArray) -> FloatArray:
     """(D, D) covariance by motions (D, 3 n) of exposures whose errors are correlated by (n, n)."""
     d, n = len(by_motions), len(correlation)
     along = by_motions.reshape(d, n, 3).transpose(0, 2, 1).reshape(3 * d, n)
-    return np.asarray((along @ correlation).reshape(d, -1) @ along.reshape(d, -1).T)
+    return np.asarray((along @ correlation).reshape(d, 3 * n) @ along.reshape(d, 3 * n).T)
 
 
 def _sizes(n_ways: int) -> FloatArray:

@@ -13,9 +13,10 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.features import fit_shape
 from armscan.geometry.shapes import Plane, fit_sphere
-from armscan.inspection.features import Fitted, together
+from armscan.inspection.features import Fitted, inspect_points, together
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import MeasuredLength
+from armscan.inspection.search import WantedFeature
 from armscan.inspection.sphere import DIAMETER_OF_SPHERE, inspect_sphere, linearised_sphere
 from armscan.inspection.step import inspect_step
 from armscan.inspection.uncertainty import _unstated_mm2, measured_length
@@ -205,6 +206,39 @@ def test_too_few_exposures_say_nothing_of_their_scatter() -> None:
     assert not isinstance(found, FitFailure)
     assert math.isnan(found.diameter.sigma_scatter_mm)
     assert math.isfinite(found.diameter.sigma_mm)
+
+
+def few_stripes(n: int, seed: int, sigma_mm: float) -> PointCloud:
+    """Stripes across a flat face in sheets that lean by 30 degrees, all in one orientation."""
+    rng = np.random.default_rng(seed)
+    along = np.array([0.0, 0.5, math.sqrt(0.75)])
+    clean = [[x, 4.0 * k, 0.0] for k in range(n) for x in np.linspace(-15.0, 15.0, 150)]
+    exposure = np.repeat(np.arange(n), 150)
+    points = np.array(clean) + rng.normal(0.0, sigma_mm, (n, 3))[exposure]
+    points += rng.normal(0.0, 2.0 * sigma_mm, (len(points), 1)) * along
+    ways = np.tile(along, (len(points), 1))
+    return cloud_of(points, exposure, sigma_mm=0.005, noise_mm=0.01, noise_along=ways)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_few_stripes_of_one_orientation_tell_how_well_a_flat_face_is_known(n: int) -> None:
+    """The fit takes up all that they err: what is left is not linear, and tells of no motion."""
+    wanted = WantedFeature("plane")
+    found = [inspect_points(few_stripes(n, seed, 0.005), wanted, "given") for seed in range(12)]
+    tilts, sigmas = [], []
+    for one in found:
+        assert not isinstance(one, FitFailure)
+        tilts.append(math.hypot(*one.shape.direction[:2]))
+        sigmas.append(one.direction_sigma_rad)
+    ratio = np.sqrt(np.mean(np.square(tilts)) / np.mean(np.square(sigmas)))
+    assert 1.0 / (1.0 + 3.3 / math.sqrt(2 * 12)) < ratio < 1.0 + 3.3 / math.sqrt(2 * 12)
+
+
+def test_exact_stripes_of_one_orientation_have_the_sigma_that_is_stated() -> None:
+    found = inspect_points(few_stripes(2, 0, 0.0), WantedFeature("plane"), "given")
+    assert not isinstance(found, FitFailure)
+    # both shift by 5 um against each other, 4 mm apart
+    assert found.direction_sigma_rad == pytest.approx(0.005 * math.sqrt(2.0) / 4.0, rel=0.5)
 
 
 def seen_by_a_sensor(seed: int, *, is_told: bool) -> MeasuredLength:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
 from armscan.errors import ArmscanError, OptionError, OutputError
 from armscan.inspection.recipe import FollowedRecipe, PartRow, follow_recipe
 from armscan.jobs.job import Job, solved
@@ -68,13 +70,15 @@ class _Run:
             return self._inspected(name, path, cloud_hash)
         except OutputError:
             raise
-        except (ArmscanError, MemoryError) as error:
+        except (ArmscanError, MemoryError, np.linalg.LinAlgError) as error:
             # what an older scan of this name left would be taken for this one's
             for file in (*PART_FILES, PART_PDF):
                 (folder / file).unlink(missing_ok=True)
             with suppress(OSError):
                 folder.rmdir()
             reason = str(error) or "there is not enough memory"
+            if isinstance(error, np.linalg.LinAlgError):
+                reason = f"a fit to its points has no solution in numbers ({reason})"
             return PartRow(name, path_text(path), reason=reason)
 
     def _done(self, folder: Path, cloud_hash: str) -> PartRow | None:

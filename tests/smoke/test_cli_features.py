@@ -6,11 +6,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from armscan.cli import main
 from armscan.storage.clouds import write_cloud
 from rigs.feature_clouds import workpiece
+from rigs.inspection_clouds import cloud_of
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,25 @@ def test_a_relation(part: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert found["angle"]["value_deg"] == pytest.approx(90.0, abs=0.2)
     assert found["first"]["feature"] == "cylinder"
     assert "distance" not in found
+
+
+def test_normals_of_another_cloud_hide_no_feature(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    faces = np.random.default_rng(0).uniform(0.0, [20.0, 20.0, 0.01], (2, 300, 3))
+    points = np.concatenate([faces[0], faces[1][:, [2, 1, 0]] + [-0.01, 0.0, 2.0]])
+    stale = cloud_of(points, normals=np.tile([0.6, 0.0, 0.8], (len(points), 1)))
+    write_cloud(tmp_path / "a.ply", stale)
+    words = ["plane:seed=10,10,0", "plane:seed=0,10,12"]
+    assert main(["inspect", "relation", str(tmp_path / "a.ply"), *words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["angle"]["value_deg"] == pytest.approx(90.0, abs=0.1)
+    assert "normals do not stand on the faces" in " ".join(told["warnings"])
+    (tmp_path / "recipe.toml").write_text('[[feature]]\nname = "table"\nkind = "plane"\n')
+    words = [str(tmp_path / "recipe.toml"), str(tmp_path / "a.ply")]
+    assert main(["inspect", "recipe", *words, "-o", str(tmp_path / "results"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert "normals do not stand on the faces" in told["warnings"][0]
 
 
 @pytest.mark.parametrize(

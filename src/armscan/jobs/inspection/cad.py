@@ -16,8 +16,7 @@ from armscan.inspection.cad.comparison import CadOptions, compare_with_part
 from armscan.inspection.cad.datums import Datums, align
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import PartModel
-from armscan.inspection.search import normals_are_of_points
-from armscan.jobs.inspection.shapes import region_of
+from armscan.jobs.inspection.shapes import read_inspected, region_of
 from armscan.jobs.job import Job, solved
 from armscan.pipeline.progress import ProgressEvent
 from armscan.records.cloud import PointCloud
@@ -30,7 +29,6 @@ from armscan.report.inspection.cad import (
     verdict_table,
 )
 from armscan.report.quantity import Summary, sentences
-from armscan.storage.clouds import read_cloud_file
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.parts.meshes import UNITS_MM, read_part
 from armscan.storage.parts.step import ChordError
@@ -105,8 +103,8 @@ def inspect_cad(
     limit, by_face = read_tolerances(tolerance, part)
     options = replace(options, tolerance_mm=limit, face_tolerances_mm=by_face)
     _tell(job, 1, cloud_path.name)
-    source = read_cloud_file(cloud_path)
-    cloud, notes = _with_own_normals(source.cloud)
+    source = read_inspected(cloud_path)
+    cloud = source.cloud
     if box is not None:
         cloud = cloud.select(box.holds(cloud.points_mm))
     if len(cloud) == 0:
@@ -123,7 +121,7 @@ def inspect_cad(
     found = solved(compare_with_part(surface, cloud, alignment, options, errors_known), cloud_path)
     _tell(job, 4)
     is_simulated = cloud.is_simulated or are_simulated((cloud_path, part_path))
-    warnings = (*source.remarks, *part.notes, *notes, *cad_warnings(found, errors_known))
+    warnings = (*source.remarks, *part.notes, *cad_warnings(found, errors_known))
     told = cad_quantities(found, part)
     delivery = job.delivery(cloud, cloud_path)
     written: tuple[Path, ...] = ()
@@ -153,16 +151,6 @@ def inspect_cad(
         extra={"kind": "cad inspection", "simulated": is_simulated},
     )
     return delivery.in_summary(summary)
-
-
-def _with_own_normals(cloud: PointCloud) -> tuple[PointCloud, tuple[str, ...]]:
-    """The cloud without normals that are not of its points, and what to say of that."""
-    if cloud.normals is None or normals_are_of_points(cloud.points_mm, cloud.normals):
-        return cloud, ()
-    return replace(cloud, normals=None), (
-        "the cloud's normals do not stand on the faces that its points make, and were not used; "
-        "export it again with normals of its points, or without any",
-    )
 
 
 def _check_options(how: PartOptions) -> None:

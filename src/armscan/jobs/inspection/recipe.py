@@ -13,6 +13,7 @@ import numpy as np
 
 from armscan.errors import ArmscanError, OptionError, OutputError
 from armscan.inspection.recipe import FollowedRecipe, PartRow, follow_recipe
+from armscan.jobs.inspection.shapes import read_inspected
 from armscan.jobs.job import Job, solved
 from armscan.pipeline.progress import ProgressEvent
 from armscan.report.inspection.cad import cad_page, cad_warnings
@@ -25,7 +26,7 @@ from armscan.report.inspection.recipe import (
 )
 from armscan.report.page import Page, page_of
 from armscan.report.quantity import Summary, sentences
-from armscan.storage.clouds import CLOUD_SUFFIXES, read_cloud_file
+from armscan.storage.clouds import CLOUD_SUFFIXES
 from armscan.storage.documents import fingerprint
 from armscan.storage.files import Content, is_folder, make_folder, path_text, write_files
 from armscan.storage.image_paths import are_simulated, natural_key
@@ -98,7 +99,7 @@ class _Run:
         return (*names, PART_PDF) if self.file.has_pdf else names
 
     def _inspected(self, name: str, path: Path, cloud_hash: str) -> PartRow:
-        source = read_cloud_file(path)
+        source = read_inspected(path)
         cloud = source.cloud
         recipe = solved(self.file.for_part(path, cloud.frame), path)
         found = solved(follow_recipe(recipe, cloud), path)

@@ -26,7 +26,7 @@ from armscan.geometry.shapes import plane_from_coefficients
 from armscan.inspection.features import inspect_feature as feature_of
 from armscan.inspection.features import relate
 from armscan.inspection.plane import inspect_plane as plane_of
-from armscan.inspection.search import WantedFeature
+from armscan.inspection.search import WantedFeature, normals_are_of_points
 from armscan.inspection.selection import InspectionOptions, StepOptions
 from armscan.inspection.sphere import inspect_sphere as sphere_of
 from armscan.inspection.step import inspect_step as step_of
@@ -67,7 +67,7 @@ def inspect_plane(
     """
     options = options or InspectionOptions()
     job.places(".html")
-    box, source = region_of(region), read_cloud_file(path)
+    box, source = region_of(region), read_inspected(path)
     cloud = source.cloud
     reference, text, weak = _reference(cloud, plane, plate, side)
     found = plane_of(
@@ -96,7 +96,7 @@ def inspect_sphere(
     """Inspect a ball of known diameter; the rest as `inspect_plane`."""
     options = options or InspectionOptions()
     job.places(".html")
-    box, source = region_of(region), read_cloud_file(path)
+    box, source = region_of(region), read_inspected(path)
     cloud = source.cloud
     found = sphere_of(cloud, diameter_mm, region=box, options=options)
     report = _as_read(sphere_report(solved(found, path), cloud), source)
@@ -120,7 +120,7 @@ def inspect_step(
     """
     options, step_options = options or InspectionOptions(), step_options or StepOptions()
     job.places(".html")
-    box, source = region_of(region), read_cloud_file(path)
+    box, source = region_of(region), read_inspected(path)
     cloud = source.cloud
     given = _normal(normal) if normal else None
     found = step_of(
@@ -133,6 +133,20 @@ def inspect_step(
 def _as_read(report: InspectionReport, source: CloudFile) -> InspectionReport:
     """The report with what is to be known of the reading of its cloud."""
     return replace(report, warnings=(*source.remarks, *report.warnings))
+
+
+def read_inspected(path: Path) -> CloudFile:
+    """Read a cloud, without normals that are not of its points, which is a remark then."""
+    source = read_cloud_file(path)
+    cloud = source.cloud
+    if cloud.normals is None or normals_are_of_points(cloud.points_mm, cloud.normals):
+        return source
+    remark = (
+        "the cloud's normals do not stand on the faces that its points make, and were not used; "
+        "export it again with normals of its points, or without any"
+    )
+    own = replace(cloud, normals=None)
+    return replace(source, cloud=own, remarks=(*source.remarks, remark))
 
 
 def region_of(numbers: Sequence[float]) -> Box | None:
@@ -264,7 +278,7 @@ def inspect_feature(
     """Inspect one feature of a cloud."""
     options = options or InspectionOptions()
     job.places(".html")
-    source = read_cloud_file(path)
+    source = read_inspected(path)
     cloud = source.cloud
     found = solved(feature_of(cloud, wanted, options), path)
     report = _as_read(feature_report(found, cloud), source)
@@ -282,7 +296,7 @@ def inspect_relation(
     """Inspect how two features of a cloud stand to each other; the rest as `inspect_feature`."""
     options = options or InspectionOptions()
     job.places(".html")
-    source = read_cloud_file(path)
+    source = read_inspected(path)
     cloud = source.cloud
     both = [solved(feature_of(cloud, wanted, options), path) for wanted in (first, second)]
     report = _as_read(relation_report(relate(cloud, both[0], both[1]), cloud), source)

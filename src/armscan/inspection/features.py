@@ -237,6 +237,9 @@ def _unlike(
     selection: Selection, chosen: BoolArray, shape: Shape, wanted: WantedFeature
 ) -> FitFailure | None:
     """Why the shape is none of that kind; None if it is one."""
+    lone = selection.in_one_sheet(chosen) if shape.kind == "plane" else None
+    if lone is not None:
+        return FitFailure(f"there is no {wanted}: {lone.reason}", lone.remedy)
     remedy = "check the nominal values, or show where it is with --region or --seed"
     if not wanted.may_be(shape):
         if shape.kind == "cone":

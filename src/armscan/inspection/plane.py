@@ -44,7 +44,7 @@ def inspect_plane(
     region: Box | None = None,
     options: InspectionOptions | None = None,
 ) -> PlaneInspection | FitFailure:
-    """Inspect a flat face; fails where all points but a few lie in one light sheet.
+    """Inspect a flat face; fails where all of its points but a few lie in one light sheet.
 
     Parameters
     ----------
@@ -69,15 +69,12 @@ def inspect_plane(
         If there are too few points.
     """
     selection = select(cloud, region, options)
-    points, stripe = selection.points_mm, selection.stripe
-    if stripe is not None and len(points) - int(np.bincount(stripe).max()) < MIN_POINTS:
-        return FitFailure(
-            f"of {len(points)} points all but a few lie in one light sheet: one stripe does not "
-            "tell how a face lies across it",
-            "measure the face from more places: exposures at rest show it in one line",
-        )
+    lone = selection.in_one_sheet()
+    if lone is not None:
+        return lone
+    points = selection.points_mm
     middle = points.mean(axis=0)
-    start = reference if reference is not None else _search(points, middle, stripe)
+    start = reference if reference is not None else _search(points, middle, selection.stripe)
     if isinstance(start, FitFailure):
         return start
     if reference is None:
@@ -139,6 +136,9 @@ def _inspected(
     reference: Plane | None,
     reference_text: str,
 ) -> PlaneInspection | FitFailure:
+    lone = selection.in_one_sheet(is_feature)
+    if lone is not None:
+        return lone
     cloud, band = selection.cloud, f"within {selection.feature_mm:g} mm"
     feature = selection.rows[is_feature]
     points = cloud.points_mm[feature]

@@ -132,6 +132,23 @@ class Selection:
             number = number + standings(cloud)[cloud.exposure[self.rows]] * len(cloud.sheet_names)
         return np.asarray(np.unique(number, return_inverse=True)[1])
 
+    def in_one_sheet(self, chosen: BoolArray | None = None) -> FitFailure | None:
+        """Why some (N,) of the points show no face: all but a few lie in one light sheet.
+
+        None for a choice stands for all of them.
+        """
+        stripe = self.stripe
+        if stripe is None:
+            return None
+        counts = np.bincount(stripe if chosen is None else stripe[chosen])
+        if int(counts.sum() - counts.max()) >= MIN_POINTS:
+            return None
+        return FitFailure(
+            f"of {counts.sum()} points all but a few lie in one light sheet: one stripe does not "
+            "tell how a face lies across it",
+            "measure the face from more places: exposures at rest show it in one line",
+        )
+
     @property
     def search_band_mm(self) -> FloatArray:
         """(N,) half width of the band in which each point supports a ball.

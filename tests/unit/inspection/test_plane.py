@@ -14,8 +14,10 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Plane, fit_plane, plane_from_coefficients
+from armscan.inspection.features import FeatureInspection, inspect_feature, inspect_points
 from armscan.inspection.plane import inspect_plane, with_reference_errors
 from armscan.inspection.results import PlaneInspection
+from armscan.inspection.search import WantedFeature
 from armscan.inspection.selection import InspectionOptions, standings
 from armscan.records.cloud import FUSED
 from armscan.report.inspection.shapes import plane_report
@@ -194,6 +196,30 @@ def test_one_stripe_shows_its_light_sheet_and_no_face() -> None:
                 refused = inspect_plane(cloud, reference)
                 assert isinstance(refused, FitFailure)
                 assert "all but a few lie in one light sheet" in refused.reason
+
+
+def test_one_stripe_on_the_face_is_no_face_though_others_lie_on_a_block_above() -> None:
+    """The sheet of the one stripe was taken for the face: 88 degrees off it."""
+    rng = np.random.default_rng(1)
+    exposure = np.repeat(np.arange(20), 200)
+    x = np.tile(np.linspace(0.0, 60.0, 200), 20)
+    points = np.column_stack([x, 5.0 + exposure, np.where(exposure > 0, 20.0, 0.0)])
+    points += rng.normal(0.0, [0.0, 0.002, 0.01], points.shape)
+    cloud, plate = cloud_of(points, exposure), given_plane(0.0, 0.0, 1.0, 0.0)
+    refused = inspect_plane(cloud, plate)
+    assert isinstance(refused, FitFailure)
+    assert "of 200 points all but a few lie in one light sheet" in refused.reason
+    seed = WantedFeature("plane", seed_mm=(30.0, 5.0, 0.0))
+    for found in (
+        inspect_feature(cloud, seed),
+        inspect_points(cloud.select(np.flatnonzero(exposure == 0)), WantedFeature("plane"), ""),
+    ):
+        assert isinstance(found, FitFailure)
+        assert "lie in one light sheet" in found.reason
+    # a cloud that tells no sheets counts all points
+    assert isinstance(inspect_plane(cloud_of(points), plate), PlaneInspection)
+    above = WantedFeature("plane", seed_mm=(30.0, 15.0, 20.0))
+    assert isinstance(inspect_feature(cloud, above), FeatureInspection)
 
 
 def test_exposures_from_one_place_share_their_light_sheet() -> None:

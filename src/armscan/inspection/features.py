@@ -125,8 +125,8 @@ class FeatureInspection(ArrayRecord):
     centre_sigma_mm: float
     seen_deg: float
     length_mm: float
-    scatter_mm: float = math.nan
-    post: Shape | None = None
+    scatter_mm: float
+    post: Shape | None
 
     @property
     def form_mm(self) -> float:
@@ -186,12 +186,7 @@ def inspect_feature(
     failure = _unlike(selection, chosen, shape, wanted)
     if failure is not None:
         return failure
-    told = _described(selection, wanted, shape, chosen, is_fitted)
-    if isinstance(told, FitFailure):
-        return told
-    is_ball = shape.kind == "sphere"
-    post = post_of(cloud, told.rows[is_fitted], shape) if is_ball else None
-    return replace(told, scatter_mm=sample.scatter_mm, post=post)
+    return _described(selection, wanted, shape, chosen, is_fitted, scatter_mm=sample.scatter_mm)
 
 
 def inspect_points(
@@ -215,7 +210,8 @@ def inspect_points(
     failure = _unlike(selection, chosen, shape, wanted)
     if failure is not None:
         return failure
-    return _described(selection, wanted, shape, chosen, is_fitted, rule=rule)
+    scatter_mm = sample_of(selection).scatter_mm
+    return _described(selection, wanted, shape, chosen, is_fitted, scatter_mm=scatter_mm, rule=rule)
 
 
 def _belonging(
@@ -273,6 +269,7 @@ def _described(
     chosen: BoolArray,
     is_fitted: BoolArray,
     *,
+    scatter_mm: float,
     rule: str = "",
 ) -> FeatureInspection | FitFailure:
     cloud, rows = selection.cloud, selection.rows[chosen]
@@ -316,6 +313,8 @@ def _described(
         length_mm=float(np.ptp(shape.local_mm(points)[:, 2]))
         if shape.kind in ("line", "cylinder", "cone")
         else 0.0,
+        scatter_mm=scatter_mm,
+        post=post_of(cloud, rows[is_fitted], shape) if shape.kind == "sphere" else None,
     )
 
 

@@ -21,6 +21,7 @@ from armscan.inspection.features import (
     _angle,
     _skew,
     inspect_feature,
+    inspect_points,
     relate,
     together,
 )
@@ -87,6 +88,21 @@ def test_a_cylinder_in_another_shape_is_doubted(shape: str) -> None:
     if not isinstance(one, FitFailure):
         doubts = feature_report(one, cloud).warnings
     assert any("may be of no cylinder" in text or text == "refused" for text in doubts)
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "sphere"])
+def test_another_shape_is_doubted_where_a_face_of_the_model_tells_its_points(
+    kind: ShapeKind,
+) -> None:
+    """An oval bore, and the rim of a disc: such features passed recipes without a word."""
+    rng = np.random.default_rng(0)
+    turn, z = rng.uniform(-math.pi, math.pi, 3000), rng.uniform(-1.0, 1.0, 3000)
+    radius = 10.0 + (0.15 * np.cos(2.0 * turn) if kind == "cylinder" else 0.0)
+    points = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])
+    cloud = cloud_of(points + rng.normal(0.0, 0.004, points.shape), sigma_mm=0.005)
+    one = inspect_points(cloud, WantedFeature(kind, diameter_mm=20.0), "of a face")
+    assert not isinstance(one, FitFailure), one
+    assert f"may be of no {kind}" in " ".join(feature_report(one, cloud).warnings)
 
 
 def test_a_cone_and_a_plane(part: PointCloud) -> None:

@@ -413,7 +413,11 @@ def _second_ball(cloud: PointCloud, found: SphereInspection, rest: BoolArray) ->
     rows = np.flatnonzero(rest)
     if len(rows) < 10 * MIN_EXPOSURE_POINTS:
         return set()
-    other = inspect_sphere(cloud.select(rows), found.nominal_diameter_mm)
+    try:
+        other = inspect_sphere(cloud.select(rows), found.nominal_diameter_mm)
+    except InputError:
+        # a speck, which would be taken for a cloud in metres
+        return set()
     if isinstance(other, FitFailure):
         return set()
     used = np.zeros(len(rows), dtype=np.bool_)

@@ -74,5 +74,19 @@ def test_a_second_ball_is_the_same_ball_elsewhere(size_mm: float) -> None:
     assert check.verdict == "not valid"
 
 
+def test_a_speck_is_no_second_ball() -> None:
+    """Points within 1 mm would be taken for a cloud in metres, and the check was refused."""
+    rng = np.random.default_rng(0)
+    balls = [ball_stripe(float(at), rng)[:120] for at in np.linspace(-12.0, 12.0, 8)]
+    speck = rng.uniform([59.7, -0.3, -0.3], [60.3, 0.3, 0.3], (300, 3))
+    exposure = np.concatenate([np.repeat(np.arange(8), 120), np.repeat([8, 9], 150)])
+    cloud = cloud_of(np.concatenate([*balls, speck]), exposure)
+    found = inspect_sphere(cloud, 2.0 * RADIUS_MM)
+    assert isinstance(found, SphereInspection)
+    check = check_exposures_off(cloud, found, np.ones(len(cloud), dtype=np.bool_))
+    assert check is not None
+    assert check.verdict == "still valid"
+
+
 def test_one_exposure_behind_a_cable_is_allowed() -> None:
     assert judged("ball", np.array([0.0, 0.0, 2.0]), 1).verdict == "still valid"

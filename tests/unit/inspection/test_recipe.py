@@ -37,7 +37,7 @@ from armscan.inspection.recipe import (
 from armscan.inspection.search import WantedFeature
 from armscan.records.cloud import FUSED, PointCloud
 from armscan.report.inspection.features import feature_report
-from armscan.report.inspection.recipe import _nearness
+from armscan.report.inspection.recipe import _nearness, wrong_text
 from armscan.storage.parts.recipes import (
     PartResult,
     found_features,
@@ -160,6 +160,29 @@ def test_a_table_has_a_row_a_part_though_one_has_no_quantities() -> None:
         "a,a.ply,not inspected,no file,,,",
         "b,b.ply,pass,,,0.01,pass",
     ]
+
+
+def test_a_table_holds_quantities_whose_names_are_alike_apart() -> None:
+    names = ("bore 12,5", "bore 125", "bore 125_u", "face 1, mean")
+    told = [replace(quantity("pass"), name=one, value=float(k)) for k, one in enumerate(names)]
+    told.append(replace(quantity("fail", "mean"), name="face 1", value=4.0))
+    *_, heads, cells = part_table_bytes([PartRow("a", "a.ply", tuple(told))]).decode().splitlines()
+    found = dict(zip(heads.split(","), cells.split(","), strict=True))
+    # part, cloud, verdict and reason, and three of each quantity
+    assert len(found) == 4 + 3 * 5
+    assert [found[f"{name}_mm"] for name in ("bore 125", "bore 125 (2)", "bore 125_u (2)")] == [
+        "0.0", "1.0", "2.0",
+    ]  # fmt: skip
+    assert [found[f"face 1 mean{k}_decision"] for k in ("", " (2)")] == ["pass", "fail"]
+
+
+def test_a_feature_with_the_name_of_its_face_stands_beside_it() -> None:
+    """Of a face the worse of mean and spot is named; a feature is another thing."""
+    one = replace(quantity("fail"), name="cylinder 19", value=20.2)
+    mean = replace(quantity("fail", "mean"), name="cylinder 19", value=0.9, nominal=0.0)
+    spot = replace(quantity("fail", "spot"), name="cylinder 19", value=1.0, nominal=0.0)
+    told = wrong_text(PartRow("a", "a.ply", (one, mean, spot)))
+    assert told == "cylinder 19, spot fail (+1.0000 mm); cylinder 19 fail (+0.2000 mm)"
 
 
 def test_the_recipe_of_the_page_is_one(tmp_path: Path) -> None:

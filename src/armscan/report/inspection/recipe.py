@@ -82,8 +82,8 @@ def wrong_text(row: PartRow, most: int = NAMED_WRONG) -> str:
     if row.reason:
         return row.reason
     # of a face the worse of mean and spot
-    worst = {one.name: one for one in reversed(row.wrong)}
-    wrong = [one for one in row.wrong if worst[one.name] is one]
+    worst = {(one.name, one.kind == "feature"): one for one in reversed(row.wrong)}
+    wrong = [one for one in row.wrong if worst[one.name, one.kind == "feature"] is one]
     named = [
         f"{one.label} {one.decision}"
         + ("" if math.isnan(one.value) else f" ({one.deviation:+.4f} {one.unit})")

@@ -645,7 +645,10 @@ def is_part_table(path: Path) -> bool:
 
 
 def part_table_bytes(rows: Sequence[PartRow]) -> bytes:
-    """CSV with a row a part and, a quantity, its value, U (k = 2) and decision."""
+    """CSV with a row a part and, a quantity, its value, U (k = 2) and decision.
+
+    Names that would be one without their commas are numbered.
+    """
     columns: dict[str, tuple[str, ...]] = {
         "part": tuple(row.name for row in rows),
         "cloud": tuple(row.cloud for row in rows),
@@ -653,18 +656,29 @@ def part_table_bytes(rows: Sequence[PartRow]) -> bytes:
         "reason": tuple(row.reason for row in rows),
     }
     comments = [TABLE_NOTE]
-    held = [{one.label: one for one in row.quantities} for row in rows]
-    known = {label: one for by_label in held for label, one in by_label.items()}
-    for label, one in known.items():
-        unit = "mm" if one.unit == "mm" else "deg"
-        name = label.replace(",", "")
-        each = [by_label.get(label) for by_label in held]
-        columns[f"{name}_{unit}"] = tuple(_cell(one, "value") for one in each)
-        columns[f"{name}_u_{unit}"] = tuple(_cell(one, "u_value") for one in each)
-        columns[f"{name}_decision"] = tuple("" if one is None else one.decision for one in each)
+    held = [{(one.name, one.kind): one for one in row.quantities} for row in rows]
+    known = {key: one for by_key in held for key, one in by_key.items()}
+    for key, one in known.items():
+        value, u, decision = _headings(one, columns)
+        each = [by_key.get(key) for by_key in held]
+        columns[value] = tuple(_cell(one, "value") for one in each)
+        columns[u] = tuple(_cell(one, "u_value") for one in each)
+        columns[decision] = tuple("" if one is None else one.decision for one in each)
         if math.isfinite(one.tolerance) and one.kind != "spot":
             comments.append(f"{one.name}: {one.nominal:g} +- {one.tolerance:g} {one.unit}")
     return csv_bytes(columns, comments)
+
+
+def _headings(one: PartQuantity, taken: Mapping[str, object]) -> tuple[str, str, str]:
+    """Of the columns of a quantity's value, U and decision; none is taken."""
+    name, unit = one.label.replace(",", ""), "mm" if one.unit == "mm" else "deg"
+    stem, k = name, 1
+    while True:
+        found = f"{stem}_{unit}", f"{stem}_u_{unit}", f"{stem}_decision"
+        if taken.keys().isdisjoint(found):
+            return found
+        k += 1
+        stem = f"{name} ({k})"
 
 
 def _cell(one: PartQuantity | None, name: str) -> str:

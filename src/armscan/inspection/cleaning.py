@@ -142,8 +142,10 @@ def clean_cloud(cloud: PointCloud, options: CleaningOptions) -> Cleaning:
     Raises
     ------
     InputError
-        If a filter needs what the cloud does not carry, or no point is left.
+        If a filter needs what the cloud does not carry, or no point is there or left.
     """
+    if len(cloud) == 0:
+        raise InputError("the cloud holds no point", remedy="give a cloud that was measured")
     taken_by = np.full(len(cloud), -1, dtype=np.int64)
     steps: list[CleaningStep] = []
     for name, (label, rule, is_taken) in FILTERS.items():
@@ -154,7 +156,7 @@ def clean_cloud(cloud: PointCloud, options: CleaningOptions) -> Cleaning:
         out = is_taken(cloud.select(left), value, options)
         taken_by[left[out]] = len(steps)
         steps.append(CleaningStep(label, int(out.sum()), rule.format(value)))
-        if len(left) and out.all():
+        if out.all():
             raise InputError(
                 f"after the filter '{label}' no point is left of {len(left)}",
                 remedy="give it a number that lets more pass",

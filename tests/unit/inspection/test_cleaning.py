@@ -142,6 +142,12 @@ def test_options_that_make_no_sense(given: dict[str, float]) -> None:
         CleaningOptions(**given)
 
 
+def test_a_cloud_without_points_is_refused_in_words() -> None:
+    for options in (CleaningOptions(density_mm=1.0), CleaningOptions(isolated_mm=1.0)):
+        with pytest.raises(InputError, match="the cloud holds no point"):
+            clean_cloud(plate().select(np.zeros(0, dtype=np.int64)), options)
+
+
 def test_what_a_cloud_does_not_carry_is_said() -> None:
     bare = cloud_of(plate().points_mm, sigma_mm=0.0)
     for options in (CleaningOptions(edge_mm=1.0), CleaningOptions(overlap_mm=1.0)):

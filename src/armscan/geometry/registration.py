@@ -32,9 +32,9 @@ MAX_ROUNDS = 30
 SETTLED = 1e-12
 NOTED_MOVE = 1e-4
 """Square of a last step, in sigmas, from which on a fit counts as not settled."""
-LEAST_SPREAD_SIGMAS = 10.0
+LEAST_SPREAD_SIGMAS, LEAST_SIGMA_MM = 10.0, 1e-10
 """Points whose second extent is within this many standard deviations lie on a line: the turn about
-it would be uncertain by more than a tenth of a radian."""
+it would be uncertain by more than a tenth of a radian. And the smallest of these that counts."""
 
 
 class PointPairs(RowRecord):
@@ -175,12 +175,17 @@ def carried_covariance_mm2(
     return np.asarray(own + jacobian @ covariance @ np.swapaxes(jacobian, 1, 2))
 
 
-def spread_mm(points_mm: FloatArray) -> FloatArray:
-    """(3,) root mean square extents of (N, 3) points about their middle, largest first."""
+def spread_mm(points_mm: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    """(3,) root mean square extents of (N, 3) points about their middle, largest first.
+
+    ``weights`` (N,) of the points; None for equal ones.
+    """
     if len(points_mm) == 0:
         return np.zeros(3)
-    centred = points_mm - points_mm.mean(axis=0)
-    values = np.linalg.eigvalsh(centred.T @ centred / len(points_mm))[::-1]
+    w = np.ones(len(points_mm)) if weights is None else weights
+    w = w / w.sum()
+    centred = points_mm - w @ points_mm
+    values = np.linalg.eigvalsh(centred.T @ (centred * w[:, None]))[::-1]
     return np.asarray(np.sqrt(np.maximum(values, 0.0)))
 
 
@@ -190,11 +195,11 @@ def _degenerate(pairs: PointPairs) -> FitFailure | None:
             f"a rigid motion needs three points in both lists, got {len(pairs)}",
             "measure more common points",
         )
-    noise = float(
-        np.sqrt(np.max(np.linalg.eigvalsh(pairs.covariance_a_mm2 + pairs.covariance_b_mm2)))
-    )
-    across = min(spread_mm(pairs.points_a_mm)[1], spread_mm(pairs.points_b_mm)[1])
-    if across <= max(LEAST_SPREAD_SIGMAS * noise, 1e-9):
+    variance = np.linalg.eigvalsh(pairs.covariance_a_mm2 + pairs.covariance_b_mm2)[:, 2]
+    # by weights: one rough point among good ones takes nothing from what these hold
+    weights = 1.0 / np.maximum(variance, LEAST_SIGMA_MM**2)
+    across = min(spread_mm(one, weights)[1] for one in (pairs.points_a_mm, pairs.points_b_mm))
+    if across <= LEAST_SPREAD_SIGMAS / float(np.sqrt(weights.mean())):
         return FitFailure(
             f"the {len(pairs)} common points lie on a line, within {across:.3g} mm: the turn about "
             "it is not determined",

@@ -258,6 +258,20 @@ def test_what_does_not_determine_a_motion_is_refused_with_the_reason() -> None:
         )
 
 
+def test_a_rough_point_among_good_ones_makes_no_line_of_them() -> None:
+    """Five that span a triangle hold the turn; where they lie on a line, it holds none."""
+    good = np.array([[0, 0, 0], [100, 0, 0], [0, 80, 0], [100, 80, 10], [50, 40, 20]], np.float64)
+    line = good[0] + np.outer(np.linspace(0.0, 1.0, 5), good[1])
+    own = np.array([1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 25.0])[:, None, None] * np.eye(3)
+    for points, is_found in ((good, True), (line, False)):
+        both = np.concatenate([points, [[20.0, 70.0, 5.0]]])
+        pairs = PointPairs(
+            points_a_mm=both, points_b_mm=both,
+            covariance_a_mm2=own, covariance_b_mm2=np.zeros_like(own),
+        )  # fmt: skip
+        assert isinstance(register_points(pairs), Estimate) == is_found
+
+
 def test_the_covariance_of_a_carried_point_is_that_of_many_registrations() -> None:
     generator = np.random.default_rng(8)
     points, pose = generator.normal(size=(5, 3)) * SIZE, some_pose(generator)

@@ -172,17 +172,22 @@ def _degenerate(points: ReferencePoints) -> FitFailure | None:
     n = len(nominal)
     if n == 0:
         return FitFailure("there is no reference point", "measure three that span a triangle")
-    sigma = math.sqrt(float(np.trace(points.covariance_mm2, axis1=1, axis2=2).max()) / 3.0)
-    spread = spread_mm(nominal)
-    least = max(10.0 * sigma, 1e-3 * float(spread[0]), 1e-6)
-    if spread[1] > least and n > 2:
+    variance = np.trace(points.covariance_mm2, axis1=1, axis2=2) / 3.0
+    weights, sigma = np.ones(n), math.sqrt(float(variance.max()))
+    if (variance > 0.0).all():
+        # one rough point among good ones takes nothing from what these hold
+        weights, sigma = 1.0 / variance, 1.0 / math.sqrt(float(np.mean(1.0 / variance)))
+    spread, own = spread_mm(nominal), spread_mm(nominal, weights)
+    if spread[1] > max(1e-3 * float(spread[0]), 1e-6) and own[1] > 10.0 * sigma and n > 2:
         return None
+    least = max(10.0 * sigma, 1e-3 * float(own[0]), 1e-6)
     centre, radius = middle_and_radius(nominal)
     radius = max(radius, 1.0)
     offset = nominal - centre
     rows = np.concatenate([np.concatenate([np.cross(offset, way) / radius, np.tile(way, (n, 1))],
                                           axis=1) for way in np.eye(3)])  # fmt: skip
-    values, vectors = np.linalg.eigh(rows.T @ rows / n)
+    share = np.tile(weights / weights.sum(), 3)
+    values, vectors = np.linalg.eigh(rows.T @ (rows * share[:, None]))
     unit = np.repeat([1.0 / radius, 1.0], 3)
     free = vectors[:, values < max((least / radius) ** 2, 1e-12)] * unit[:, None]
     text = free_text(named_motions(free, centre, radius), ", ") or "a turn"

@@ -421,6 +421,21 @@ def test_points_on_a_line_leave_the_turn_about_it() -> None:
     assert "a turn about Y through (3.0" in found.reason
 
 
+def test_a_rough_point_counts_by_its_weight() -> None:
+    """It makes no line of eight good points, and holds no turn about a line of them."""
+    points = given(0.01, 4, sigma=0.01)
+    own = points.covariance_mm2.copy()
+    own[8] *= 500.0**2
+    assert isinstance(align_points(CLOUD, replace(points, covariance_mm2=own)), Alignment)
+    on_line = points.nominal_mm * [0.0, 1.0, 0.0] + [3.0, 0.0, 7.0]
+    on_line[8] += [20.0, 0.0, 0.0]
+    line = replace(points, nominal_mm=on_line, measured_mm=TRUE.inverse().apply(on_line))
+    assert isinstance(align_points(CLOUD, line), Alignment)
+    found = align_points(CLOUD, replace(line, covariance_mm2=own))
+    assert isinstance(found, FitFailure)
+    assert "a turn about Y through (3.0" in found.reason
+
+
 @pytest.mark.parametrize(
     ("change", "word"), [(np.diag([1.0, 1.0, -1.0]), "mirror"), (1e-3 * np.eye(3), "spread")]
 )

@@ -88,13 +88,13 @@ def seed_warnings(found: FeatureInspection, cloud: PointCloud, whose: str = "") 
     )
 
 
-def arc_warnings(found: FeatureInspection) -> tuple[str, ...]:
+def arc_warnings(found: FeatureInspection, whose: str = "") -> tuple[str, ...]:
     """Of a round feature of which only a narrow arc was seen."""
     is_turned = found.shape.kind in ("circle", "cylinder", "cone")
     if not is_turned or not found.seen_deg < NARROW_ARC_DEG:
         return ()
     return (
-        f"the points cover only {found.seen_deg:.0f} degrees of the turn, where radius and "
+        f"{whose}the points cover only {found.seen_deg:.0f} degrees of the turn, where radius and "
         "place are poorly told apart; scan more of it",
     )
 

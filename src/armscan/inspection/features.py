@@ -558,7 +558,7 @@ def _reach(cloud: PointCloud, first: FeatureInspection, second: Shape) -> float:
 
 
 def _leaning(shapes: tuple[Shape, ...], square: float, reach: float) -> float:
-    return reach * math.tan(abs(_angle(shapes) - square))
+    return reach * math.sin(abs(_angle(shapes) - square))
 
 
 def _is_flat(shape: Shape) -> bool:

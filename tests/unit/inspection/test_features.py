@@ -19,6 +19,7 @@ from armscan.inspection.features import (
     FeatureInspection,
     Fitted,
     _angle,
+    _leaning,
     _skew,
     inspect_feature,
     inspect_points,
@@ -130,6 +131,35 @@ def test_a_relation_tells_which_feature_has_outliers(part: PointCloud) -> None:
     ]
     assert any("of the second feature's points" in text for text in told[0])
     assert any("of the first feature's points" in text for text in told[1])
+
+
+def test_a_relation_tells_of_which_feature_a_narrow_arc_was_seen() -> None:
+    rng = np.random.default_rng(0)
+    turn, z, x, y = rng.uniform(0.0, [math.radians(60.0), 20.0, 30.0, 30.0], (500, 4)).T
+    arc = np.column_stack([10.0 * np.cos(turn), 10.0 * np.sin(turn), z])
+    both = np.concatenate([np.column_stack([x, y, 0.0 * x]), arc])
+    cloud = cloud_of(both + rng.normal(0.0, 0.004, both.shape))
+    features = []
+    for kind, rows in (("plane", np.arange(500)), ("cylinder", np.arange(500, 1000))):
+        one = inspect_points(cloud.select(rows), WantedFeature(kind), "of a face")
+        assert not isinstance(one, FitFailure), one
+        features.append(replace(one, rows=rows[one.rows]))
+    told = relation_report(relate(cloud, *features), cloud).warnings
+    arcs = [text for text in told if "points cover only" in text]
+    assert [text.startswith("second feature: the points cover only") for text in arcs] == [True]
+
+
+def test_the_zone_of_an_axis_is_as_wide_as_its_ends_are_apart() -> None:
+    """An axis of 100 mm at 9 degrees: its points reach along itself, not along the other."""
+    lean = math.radians(9.0)
+    turned = Shape(
+        kind="cylinder",
+        point_mm=np.zeros(3),
+        axes=rotation_from_vector(np.array([lean, 0.0, 0.0])),
+        radius_mm=5.0,
+    )
+    upright = replace(turned, axes=np.eye(3))
+    assert _leaning((turned, upright), 0.0, 100.0) == pytest.approx(100.0 * math.sin(lean))
 
 
 def test_two_axes(part: PointCloud) -> None:

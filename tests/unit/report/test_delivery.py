@@ -7,7 +7,7 @@ import json
 import math
 import socket
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,12 @@ from armscan.errors import OptionError
 from armscan.inspection.title_block import TitleBlock, calibration_state
 from armscan.records.cloud import CalibrationMark
 from armscan.report.drawing import _turned
-from armscan.report.inspection.delivery import calibration_warnings, pdf_bytes, require_pdf
+from armscan.report.inspection.delivery import (
+    age_text,
+    calibration_warnings,
+    pdf_bytes,
+    require_pdf,
+)
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.documents import scanner_document
 from rigs.calibration_documents import scanner_calibration
@@ -61,6 +66,16 @@ def test_a_calibration_holds_as_long_as_laid_down_and_the_oldest_counts(
     assert state.is_valid is is_valid
     is_odd = is_valid is False or age < 0.0 or (math.isnan(age) and not math.isnan(valid_days))
     assert bool(calibration_warnings(block, state)) is is_odd
+
+
+@pytest.mark.parametrize("valid_days", [149.0, 150.0])
+def test_an_age_that_is_over_never_reads_as_the_limit(valid_days: float) -> None:
+    block = TitleBlock(calibration_valid_days=valid_days)
+    state = calibration_state(block, (JUNE,), NOW + timedelta(hours=3))
+    limit = f"laid down to hold for {valid_days:.0f} days"
+    (told,) = calibration_warnings(block, state)
+    assert f"151 days old and was {limit}" in told
+    assert age_text(state) == f"151 days old, {limit}: no longer valid"
 
 
 def test_a_cloud_of_another_head_is_told() -> None:

@@ -111,7 +111,7 @@ def age_text(state: CalibrationState) -> str:
     """Age and validity, in words; empty where neither is known."""
     words = []
     if math.isfinite(state.age_days):
-        words.append(f"{_days(state.age_days)} old")
+        words.append(f"{_days(state.age_days, is_over=state.is_valid is False)} old")
     if math.isfinite(state.valid_days):
         held = f"laid down to hold for {_days(state.valid_days)}"
         answer = {True: "valid", False: "no longer valid", None: "not known whether it is valid"}
@@ -126,8 +126,8 @@ def calibration_warnings(block: TitleBlock, state: CalibrationState) -> tuple[st
     found = []
     if state.is_valid is False:
         found.append(
-            f"the calibration is {_days(state.age_days)} old and was laid down to hold for "
-            f"{_days(state.valid_days)}: verify the scanner or calibrate it anew"
+            f"the calibration is {_days(state.age_days, is_over=True)} old and was laid down to "
+            f"hold for {_days(state.valid_days)}: verify the scanner or calibrate it anew"
         )
     if state.age_days < 0.0:
         found.append(
@@ -146,10 +146,12 @@ def calibration_warnings(block: TitleBlock, state: CalibrationState) -> tuple[st
     return tuple(found)
 
 
-def _days(days: float) -> str:
+def _days(days: float, *, is_over: bool = False) -> str:
+    """In words; what is over a limit is rounded up, or it would read as the limit does."""
     if abs(days) >= LONG_YEARS:
-        return f"{days / 365.25:.1f} years"
-    return plural(math.floor(days), "day")
+        tenths = days / 36.525
+        return f"{(math.ceil(tenths) if is_over else tenths) / 10.0:.1f} years"
+    return plural(math.ceil(days) if is_over else math.floor(days), "day")
 
 
 def require_pdf() -> None:

@@ -47,11 +47,7 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
     kind = found.shape.kind
     main = found.nominal or found.fitted
     told = feature_quantities(found)
-    warnings = (
-        *point_warnings(found.counts, cloud),
-        *_doubts(found, cloud),
-        *arc_warnings(found),
-    )
+    warnings = (*point_warnings(found.counts, cloud), *_doubts(found, cloud))
     references = [(f"against the fitted {kind}", found.fitted)]
     if found.nominal is not None:
         references.insert(0, ("against the nominal size", found.nominal))
@@ -78,9 +74,13 @@ def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionRep
 
 
 def _doubts(found: FeatureInspection, cloud: PointCloud, whose: str = "") -> tuple[str, ...]:
-    """Warn of a seed that is on no feature, and of points that may be of another shape."""
+    """Warn of a seed that is on no feature, points that may be of another shape, a narrow arc."""
     kind = found.shape.kind
-    return (*seed_warnings(found, cloud, whose), *shape_warnings(found, cloud, kind, whose))
+    return (
+        *seed_warnings(found, cloud, whose),
+        *shape_warnings(found, cloud, kind, whose),
+        *arc_warnings(found, whose),
+    )
 
 
 def feature_quantities(found: FeatureInspection) -> tuple[Quantity, ...]:

@@ -546,9 +546,9 @@ def _join_place(
     n_used, rms = int(place.is_used.sum()), _rms(place.residual_mm[place.is_used])
     at_markers = added_sigma_mm(new.markers.points_mm[place.pairs[:, 1]], place)
     rows = [("markers", str(n_used), significant(at_markers))]
-    for item in clouds:
-        added = added_sigma_mm(item.cloud.points_mm, place)
-        rows.append((item.name, f"{len(item.cloud):,}", significant(added)))
+    for one in clouds:
+        added = added_sigma_mm(one.cloud.points_mm, place)
+        rows.append((one.name, f"{len(one.cloud):,}", significant(added)))
     told = _place_quantities(old, new, place, rms, at_markers)
     moved = fact("Moved markers", str(len(place.moved)), "named below" if place.moved else "")
     report = RegisterReport(

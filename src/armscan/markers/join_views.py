@@ -143,8 +143,10 @@ class _Misfit:
 
     def by_view(self, n_views: int) -> tuple[FloatArray, FloatArray]:
         """(V,) sums of the squares of a view's residuals; (V,) what they should be."""
-        squares = np.bincount(self.view, self.squares, minlength=n_views)
-        return squares, np.bincount(self.view, self.expected, minlength=n_views)
+        squares, expected = np.zeros(n_views), np.zeros(n_views)
+        np.add.at(squares, self.view, self.squares)
+        np.add.at(expected, self.view, self.expected)
+        return squares, expected
 
 
 def _fix_a_pose(seen: MarkerObservations) -> bool:

@@ -320,8 +320,8 @@ def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_
     ids = table.ints("id") if "id" in table else np.arange(1, len(table) + 1)
     table.refuse_repeats("id", ids.tolist())
     has_covariance = any(name in table for name in COVARIANCES)
-    named = [found[1] for text in table.comments if (found := FRAME.fullmatch(text))]
-    known = {name.lower(): name for name in get_args(CloudFrame)}
+    named = [str(found[1]) for text in table.comments if (found := FRAME.fullmatch(text))]
+    known: dict[str, str] = {name.lower(): name for name in get_args(CloudFrame)}
     with told_of(table.where, remedy="correct the table, or measure again"):
         markers = MarkerSet(
             ids=ids,

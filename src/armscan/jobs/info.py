@@ -46,13 +46,24 @@ from armscan.storage.documents import (
 )
 from armscan.storage.files import damaged_images, files_in, holds_files, is_file, read_bytes
 from armscan.storage.formats.columns import COVARIANCE
+from armscan.storage.formats.text import words_of
 from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import image_format, read_exposure
 from armscan.storage.observations import read_observations
 from armscan.storage.parts.meshes import read_part
-from armscan.storage.points import is_plane, read_marker_list, read_points_or_plane
+from armscan.storage.points import (
+    COORDINATES,
+    ROTATION,
+    SCAN_LINE,
+    is_plane,
+    read_marker_list,
+    read_points_or_plane,
+    read_profiles,
+)
 from armscan.storage.recording import FolderRecording, is_recording, read_arm_track, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
+from armscan.storage.recordings.robot_poses import read_robot_poses
+from armscan.storage.tables import reads_as_float
 
 
 def describe_registration(path: Path) -> dict[str, Any]:
@@ -103,8 +114,6 @@ def describe_stereo(path: Path) -> dict[str, Any]:
     return content | _origin(calibration.provenance)
 
 
-NS_PER_S = 1e9
-NS_PER_MS = 1e6
 LISTED = 5
 """Damaged images told by name."""
 
@@ -125,7 +134,7 @@ def describe_recording(folder: Path) -> dict[str, Any]:
         "exposures": len(scan.rows),
         # a row without a view is an arrangement of its own
         "views": len({row if row.view is None else row.view for row in scan.rows}),
-        "seconds": round((max(times) - min(times)) / NS_PER_S, 3),
+        "seconds": round((max(times) - min(times)) / 1e9, 3),
         **_steps("exposure", np.unique(np.array(times, dtype=np.int64))),
         **({"lasers": lasers} if lasers else {}),
         **({"exposures_with_lasers_unknown": n_unknown} if n_unknown else {}),
@@ -285,7 +294,7 @@ def _steps(what: str, t_ns: IntArray) -> dict[str, float]:
     """Median and longest step between times; nothing for a single one."""
     if len(t_ns) < 2:
         return {}
-    steps_ms = np.diff(t_ns) / NS_PER_MS
+    steps_ms = np.diff(t_ns) / 1e6
     return {
         f"{what}_median_period_ms": round(float(np.median(steps_ms)), 6),
         f"{what}_longest_step_ms": round(float(steps_ms.max()), 6),
@@ -296,7 +305,7 @@ def _poses(scan: FolderRecording, track: ArmTrack) -> dict[str, Any]:
     """How many exposures have a pose, how it is found, and why the others have none."""
     limit_ns = largest_gap_ns(track)
     gaps = {
-        "arm_gap_limit_ms": limit_ns / NS_PER_MS,
+        "arm_gap_limit_ms": limit_ns / 1e6,
         "arm_steps_above_gap_limit": int((np.diff(track.t_ns) > limit_ns).sum()),
     }
     try:
@@ -407,11 +416,8 @@ def _line(key: str, value: Any) -> str:
         return f"{key.replace('_', ' ')}: " + ", ".join(str(item) for item in value) + unit
     if value is None:
         return f"{key.replace('_', ' ')}: not known"
-    return f"{key.replace('_', ' ')}: {_number(value)}"
-
-
-def _number(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    told = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{key.replace('_', ' ')}: {told}"
 
 
 CLOUDS = tuple(suffix for suffix in BY_SUFFIX if suffix not in (".ply", ".csv", ".txt"))
@@ -433,22 +439,44 @@ def _file(path: Path) -> dict[str, Any]:
             f"{plural(len(part.vertices_mm), 'corner')}",
             **_ranges(part.vertices_mm.T),
         }
-    if path.suffix.lower() in CLOUDS or _is_table_of_points(data):
+    if path.suffix.lower() in CLOUDS:
         return _cloud(read_cloud_file(path))
     return _text(path, data)
 
 
-POINT_COLUMNS = {*"xyz", "nx", "ny", "nz", "intensity", *"rgb", "red", "green", "blue", "alpha"}
-"""Columns of other programs' clouds; tables of probed points have x_mm, y_mm, z_mm."""
+OWN_TABLES = {
+    "image,x_px": "stripe points of images",
+    "face,n": "faces of a part beside their model",
+    "part,cloud": "parts inspected by a recipe",
+}
+POINT_COLUMNS = {*COORDINATES, *COVARIANCE, "id", "feature"}
 
 
-def _is_table_of_points(data: bytes) -> bool:
-    """Whether this is a cloud that armscan, or another program, wrote as CSV, by its heading."""
-    heading = data.partition(b"\n")[0].decode("utf-8-sig", "replace")
-    plain = heading.lower().replace("[mm]", "").replace("(mm)", "").replace(";", ",")
-    names = {name.strip(' "\r') for name in plain.split(",")}
-    is_foreign = set("xyz") <= names <= POINT_COLUMNS
-    return is_foreign or not COVARIANCE.keys().isdisjoint(heading.split(","))
+def _table(path: Path, data: bytes) -> dict[str, Any]:
+    """A table by its heading: one of armscan's own, poses, a profile, markers, points, a cloud."""
+    lines = data[:10_000].decode("utf-8-sig", "replace").splitlines()
+    heading = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    names = {name.strip().lower() for name in heading.split(",")}
+    if own := OWN_TABLES.get(",".join(heading.split(",")[:2])):
+        return {"what": f"table of {own}"}
+    if any(name[:1] == "x" for name in names) and any(map(ROTATION.fullmatch, names)):
+        n_poses = len(read_robot_poses(path, "extrinsic-xyz"))
+        return {"what": f"{plural(n_poses, 'pose')} of an arm, for --poses"}
+    is_flat = {"x_mm", "z_mm"} <= names and "y_mm" not in names
+    if is_flat or path.suffix.lower() in (".yml", ".yaml"):
+        return _profile(path)
+    if is_plane(data) or set(COORDINATES) <= names <= POINT_COLUMNS:
+        return describe_markers(path) if _are_markers(path) else describe_points(path)
+    content = _cloud(read_cloud_file(path))
+    if len(words := words_of(heading)) == 6 and all(map(reads_as_float, words)):
+        content["what"] += " (or poses of an arm: six numbers a line without names)"
+    return content
+
+
+def _profile(path: Path) -> dict[str, Any]:
+    (profile,) = read_profiles([path])
+    what = f"profile of a sensor, {plural(len(profile.points_mm), 'point')}"
+    return {"what": what, "gaps": profile.n_gaps, **_ranges(profile.points_mm.T)}
 
 
 def _are_markers(path: Path) -> bool:
@@ -471,13 +499,12 @@ def _text(path: Path, data: bytes) -> dict[str, Any]:
         return {"what": what}
     if path.name in DESCRIBE_NAMED:
         return DESCRIBE_NAMED[path.name](path)
-    if path.suffix.lower() == ".csv" or is_plane(data):
-        return describe_markers(path) if _are_markers(path) else describe_points(path)
+    is_table = path.suffix.lower() == ".csv" or SCAN_LINE.search(data.decode("utf-8", "replace"))
+    with suppress(*(() if is_table else (FileFormatError,))):
+        if is_table or path.suffix.lower() == ".txt":
+            return _table(path, data)
     if path.suffix.lower() in (".json", ".yaml", ".yml", ".xml"):
         return _camera(read_camera_calibration(path), "camera calibration of another program")
-    if path.suffix.lower() == ".txt":
-        with suppress(FileFormatError):
-            return _cloud(read_cloud_file(path))
     raise FileFormatError(
         "armscan does not know this kind of file",
         where=str(path),
@@ -666,9 +693,7 @@ def _folder(path: Path) -> dict[str, Any]:
         raise FileFormatError("the folder is empty", where=str(path), remedy="name another folder")
     kinds = Counter(item.suffix.lower() or "other" for item in items if is_file(item))
     n_folders = sum(item.is_dir() for item in items)
-    content: dict[str, Any] = {
-        "what": f"folder with {sum(kinds.values())} files and {n_folders} folders"
+    return {
+        "what": f"folder with {sum(kinds.values())} files and {n_folders} folders",
+        **{f"files_{kind.lstrip('.')}": count for kind, count in sorted(kinds.items())},
     }
-    for kind, count in sorted(kinds.items()):
-        content[f"files_{kind.lstrip('.')}"] = count
-    return content

@@ -202,6 +202,31 @@ def test_what_holds_no_facts_is_named(tmp_path: Path, name: str, text: str, what
     assert str(described(path)["what"]).startswith(what)
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("paraview.csv", "Points:0,Points:1,Points:2\n1,2,3\n2,3,4\n", "point cloud, 2 points"),
+        ("label.csv", "x,y,z,label\n1,2,3,4\n2,2,3,4\n", "point cloud, 2 points"),
+        ("slashes.csv", "//X,Y,Z,Intensity\n1,2,3,4\n1,2,4,4\n", "point cloud, 2 points"),
+        ("bare.csv", "1,2,3\n2,3,4\n", "point cloud, 2 points"),
+        ("deviation.csv", "x_mm,y_mm,z_mm,deviation_mm\n1,2,3,0\n", "point cloud, 1 points"),
+        ("profile.csv", "x_mm,z_mm\n1,2\n2,3\n", "profile of a sensor, 2 points"),
+        ("profile.yml", "%YAML:1.0\nscan_line: [1.0, 0.0, 2.0]\n", "profile of a sensor, 1 point"),
+        ("poses.csv", "x_mm,y_mm,z_mm,a_deg,b_deg,c_deg\n9,2,3,1,2,3\n", "1 pose of an arm"),
+        ("poses.txt", "900,200,300,10,20,30\n", "(or poses of an arm"),
+        ("stripes.csv", "image,x_px,y_px\n1.png,2,3\n", "table of stripe points of images"),
+        (
+            "table.csv",
+            "# x\npart,cloud,verdict,reason\na,a.ply,pass,\n",
+            "table of parts inspected",
+        ),
+    ],
+)
+def test_tables_are_told_by_their_headings(tmp_path: Path, name: str, text: str, what: str) -> None:
+    (tmp_path / name).write_text(text)
+    assert what in str(described(tmp_path / name)["what"])
+
+
 def test_json_of_another_program_that_has_a_schema_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.json"
     path.write_text('{"schema": {"type": "object"}}')
@@ -212,7 +237,7 @@ def test_json_of_another_program_that_has_a_schema_is_refused(tmp_path: Path) ->
 def test_other_tables_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.csv"
     path.write_text("name,age\nx,3\n")
-    with pytest.raises(FileFormatError, match="no column is called x_mm"):
+    with pytest.raises(FileFormatError, match="which of 2 columns are x, y and z"):
         describe_files([str(path)])
 
 

@@ -52,9 +52,8 @@ from armscan.storage.images import image_format, read_exposure
 from armscan.storage.observations import read_observations
 from armscan.storage.parts.meshes import read_part
 from armscan.storage.points import (
-    COORDINATES,
-    ROTATION,
     SCAN_LINE,
+    has_rotations,
     is_plane,
     read_marker_list,
     read_points_or_plane,
@@ -63,7 +62,7 @@ from armscan.storage.points import (
 from armscan.storage.recording import FolderRecording, is_recording, read_arm_track, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.storage.recordings.robot_poses import read_robot_poses
-from armscan.storage.tables import reads_as_float
+from armscan.storage.tables import COORDINATES, reads_as_float
 
 
 def describe_registration(path: Path) -> dict[str, Any]:
@@ -459,7 +458,7 @@ def _table(path: Path, data: bytes) -> dict[str, Any]:
     names = {name.strip().lower() for name in heading.split(",")}
     if own := OWN_TABLES.get(",".join(heading.split(",")[:2])):
         return {"what": f"table of {own}"}
-    if any(name[:1] == "x" for name in names) and any(map(ROTATION.fullmatch, names)):
+    if any(name[:1] == "x" for name in names) and has_rotations(names):
         n_poses = len(read_robot_poses(path, "extrinsic-xyz"))
         return {"what": f"{plural(n_poses, 'pose')} of an arm, for --poses"}
     is_flat = {"x_mm", "z_mm"} <= names and "y_mm" not in names
@@ -520,7 +519,7 @@ def _by_product(path: Path, data: bytes, content: dict[str, Any]) -> str:
         return f"truth of a simulation ({content['head']})"
     for is_it, what in (
         (OWN_PAGE in data[:2000], "page of armscan; open it in a browser"),
-        (content.keys() == {"results"}, "list of what was made of a folder of recordings"),
+        (path.name == "batch.json", "list of what was made of a folder of recordings"),
         (data.startswith(b"ISO-10303-21"), "STEP model of a part, for `armscan inspect cad`"),
         (path.name == "rig.toml", "devices of a rig, for `armscan record` and `console`"),
     ):

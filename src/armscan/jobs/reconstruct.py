@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -477,7 +478,7 @@ def _delivered(
     warnings = scan.warnings
     if voxel_mm is not None:
         told = (text for piece in points.pieces() for text in noise_remarks(piece.cloud))
-        warnings = (*warnings, *dict.fromkeys(told))
+        warnings = (*warnings, *islice(told, 1))
     provenance = job.provenance(
         (*files, table.path, calibration),
         (table,),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, get_args
@@ -108,8 +108,9 @@ def read_points_or_plane(path: Path) -> ProbedPoints | FloatArray:
 
 
 def is_plane(data: bytes) -> bool:
-    """Whether a file holds a plane's four numbers and nothing else."""
-    return len(data) < MOST_OF_A_PLANE and _plane_words(data) is not None
+    """Whether a file holds a plane's four numbers and nothing else, no names of coordinates."""
+    is_short = len(data) < MOST_OF_A_PLANE
+    return is_short and _plane_words(data) is not None and not re.search(rb"#.*\bx\b", data, re.I)
 
 
 def _plane_words(data: bytes) -> str | None:
@@ -355,8 +356,10 @@ def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> Fl
 
 PROFILE_SUFFIXES = frozenset({".yml", ".yaml", ".csv", ".txt"})
 SCAN_LINE = re.compile(r"^[ \t]*scan_line[ \t]*:\s*\[([^\]]*)(\]?)", re.MULTILINE)
-ROTATION = re.compile(r"\s*(?:(?:[abc]|r[xyz])[ _]?\W?(?:deg|rad)\W?|[abc]|[rq][xyz]|qw)\s*")
-"""A column of a table of poses."""
+ROTATION = re.compile(
+    r"\s*(?:(?:[abc]|r[xyz])[ _]?\W?(?:deg|rad)\W?|[abc]|r[xyz]|q_?[wxyz]|r\d\d|rotvec\w*)\s*"
+)
+"""A column of a table of poses, which has three of them or more."""
 YAML_WORDS = {".nan": math.nan, ".inf": math.inf, "-.inf": -math.inf}
 
 
@@ -401,7 +404,12 @@ def _looks_like_profile(path: Path) -> bool:
     if SCAN_LINE.search(start):
         return True
     heading = next((line for line in start.splitlines() if "x_mm" in line), "")
-    return bool(heading) and not any(ROTATION.fullmatch(w) for w in heading.lower().split(","))
+    return bool(heading) and not has_rotations(heading.lower().split(","))
+
+
+def has_rotations(names: Iterable[str]) -> bool:
+    """Whether these are columns of a table of poses."""
+    return sum(ROTATION.fullmatch(name) is not None for name in names) >= 3
 
 
 def _read(path: Path, name: str) -> PointProfile:

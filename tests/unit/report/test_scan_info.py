@@ -213,6 +213,8 @@ def test_what_holds_no_facts_is_named(tmp_path: Path, name: str, text: str, what
         ("profile.csv", "x_mm,z_mm\n1,2\n2,3\n", "profile of a sensor, 2 points"),
         ("profile.yml", "%YAML:1.0\nscan_line: [1.0, 0.0, 2.0]\n", "profile of a sensor, 1 point"),
         ("poses.csv", "x_mm,y_mm,z_mm,a_deg,b_deg,c_deg\n9,2,3,1,2,3\n", "1 pose of an arm"),
+        ("one.txt", "# x y z intensity\n1.5 2.5 3.5 128\n", "point cloud, 1 points"),
+        ("quat.csv", "x,y,z,qw,qx,qy,qz\n9,2,3,1,0,0,0\n", "1 pose of an arm"),
         ("poses.txt", "900,200,300,10,20,30\n", "(or poses of an arm"),
         ("stripes.csv", "image,x_px,y_px\n1.png,2,3\n", "table of stripe points of images"),
         (

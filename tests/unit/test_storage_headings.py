@@ -336,3 +336,96 @@ def test_an_empty_last_value_is_none(tmp_path: Path) -> None:
     found = read_cloud_file(path).cloud
     assert found.points_mm.tolist() == POINTS
     assert found.intensity.tolist() == [0.0, 7.0, 0.0]
+
+
+PADDED = [
+    ("\tid\tx\ty\tz", "\t{0}\t{1}\t{2}\t{3}"),
+    ("\tid\tx\ty\tz", "{0}\t{1}\t{2}\t{3}"),
+    ("Punktnummer\tSatz\tx\ty\tz", "{0}\t\t7\t{1}\t{2}\t{3}"),
+    ("Name\tx\ty\tz", "P{0}\t\t{1}\t{2}\t{3}"),
+    ("Name\tx\ty\tz", "Punkt {0}\t\t{1}\t{2}\t{3}"),
+    ("x\ty\tz", "{1}\t\t{2}\t\t{3}"),
+    ("x\ty\tz", "{1}\t\t{2}\t \t{3}\t\t8\t\t9"),
+    ("x\ty\tz\tname", "{1}\t\t{2}\t{3}\tPunkt {0}"),
+    ("x\t\ty\t\tz", "{1}\t{2}\t{3}"),
+    ("x\ty\tz\t", "{1}\t\t{2}\t{3}"),
+    ("\tx\ty\tz", "\t{1}\t{2}\t{3}"),
+    ("x\ty\tz", "\t{1}\t{2}\t{3}"),
+]
+
+
+@pytest.mark.parametrize(("heading", "row"), PADDED)
+def test_tabs_that_pad_move_no_column(tmp_path: Path, heading: str, row: str) -> None:
+    """Each was taken for a separator: x was 1 or 7, without a word, or the table was refused."""
+    path = tmp_path / "c.txt"
+    path.write_text("\n".join([heading, *(row.format(*point) for point in NUMBERED), ""]))
+    assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS
+
+
+def test_tabs_that_pad_late_rows_are_seen_and_empty_ones_among_them_refused(tmp_path: Path) -> None:
+    path = tmp_path / "c.txt"
+    rows = "Punktnummer\tSatz\tx\ty\tz\n" + "P 100000\t7\t1.5\t-2\t3.25\n" * 1200
+    path.write_text(rows + "P 1\t\t7\t4\t5\t-6.5\n")
+    assert read_cloud_file(path).cloud.points_mm[-2:].tolist() == POINTS[:2]
+    path.write_text(rows + "P 1\t\t\t4\t5\t-6.5\n")
+    with pytest.raises(FileFormatError, match="more tabs than stand between 5 columns"):
+        read_cloud_file(path)
+    path.write_text("x\ty\tz\n1.5\t-2\t3.25\t\t8\n4\t5\t-6.5\t7\t8\n7\t8.5\t9\t\t\n")
+    assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize(
+    ("heading", "row"),
+    [
+        ("x|y|z|remark", '{0}|{1}|{2}|"'),
+        ("remark|x|y|z", '"|{0}|{1}|{2}'),
+        ("size|x|y|z", '"3|{0}|{1}|{2}'),
+        ("size|x|y|z", '3"|{0}|{1}|{2}'),
+        ("a|b|x|y|z|c", '"|"|{0}|{1}|{2}|"'),
+        ("a|x|y|z|c", '"A|b ""c""|d"|{0}|{1}|{2}|"'),
+        ("x|y|z|remark", '{0}|{1}|{2}|"see # 3"'),
+    ],
+)
+def test_quotation_marks_without_a_second_one_take_no_points(
+    tmp_path: Path, heading: str, row: str, separator: str
+) -> None:
+    """From one ditto mark to the next all lines were one field, and half of the points gone."""
+    lines = [heading, *(row.format(*point) for point in POINTS), ""]
+    path = tmp_path / "c.csv"
+    path.write_text("\n".join(lines).replace("|", separator))
+    assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS
+
+
+@pytest.mark.parametrize(
+    ("heading", "row"),
+    [
+        ("x y z", "{0} {1} {2} 255,128,0"),
+        ("x y z", "{0} {1} {2} 255;128;0"),
+        ("x y z", "{0} {1} {2}\t255\t128"),
+        ("# x y z", "{0} {1} {2} 255,128,0"),
+        ("X (mm);Y (mm);Z (mm);Farbe (r,g,b)", "{0};{1};{2};1,2,3"),
+        ('X;Y;Z;"Remark, free"', '{0};{1};{2};"a, b, c, d"'),
+        ("x;y;z;r,g,b", "{0};{1};{2};1,2,3"),
+        ("x,y,z;r;g;b", "{0},{1},{2};1;2;3"),
+        ("name\tx y z", "P1\t{0} {1} {2}"),
+        ("x y z\tr g b", "{0} {1} {2}\t1 2 3"),
+    ],
+)
+def test_tables_with_two_kinds_of_separators_are_read(
+    tmp_path: Path, heading: str, row: str
+) -> None:
+    """They were split at the wrong one, and refused."""
+    path = tmp_path / "c.txt"
+    path.write_text("\n".join([heading, *(row.format(*point) for point in POINTS), ""]))
+    assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS
+
+
+def test_words_of_a_field_are_not_taken_for_numbers_of_the_next(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text("Name;X;Y;Z\nP 1 2 3;abc;2;3\nP 1 2 4;1;2;3\n")
+    with pytest.raises(FileFormatError, match="line 2 is 'P 1 2 3;abc;2;3'"):
+        read_cloud_file(path)
+    path.write_text('x y z\n"1,5","2,5","3,5"\n')
+    with pytest.raises(FileFormatError, match="the points are not understood: line 2"):
+        read_cloud_file(path)

@@ -390,3 +390,20 @@ def refuse_beyond_reach(points_mm: FloatArray, where: str) -> None:
             where=where,
             remedy="correct it, or leave the entry out",
         )
+
+
+def refuse_decimal_commas(line: str, where: str) -> None:
+    """Raise for a line whose commas can only be decimal signs, or may be.
+
+    ``1,5;2,5;3,5`` and ``1,5 2,5 3,5`` hold commas and another separator between numbers; so do
+    six whole numbers ``1,5,2,5,3,5`` from a table of three columns, which is not told from one of
+    six: only what is certain is refused.
+    """
+    fields = [word for word in re.split(r"[;\s]+", line.strip().strip(",;")) if word]
+    with_comma = [word for word in fields if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", word)]
+    if len(fields) >= 2 and with_comma:
+        raise FileFormatError(
+            f"the numbers have commas as decimal signs: '{line.strip()[:60]}'",
+            where=where,
+            remedy="write them with points: 1.5 2.5 3.5",
+        )

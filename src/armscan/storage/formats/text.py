@@ -14,7 +14,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +36,12 @@ from armscan.storage.formats.columns import (
     cloud_columns,
     structured,
 )
-from armscan.storage.tables import OTHER_UNITS, reads_as_float, refuse_other_units
+from armscan.storage.tables import (
+    OTHER_UNITS,
+    reads_as_float,
+    refuse_decimal_commas,
+    refuse_other_units,
+)
 
 SIGMA_LOSS = "sigma_mm and covariance"
 XYZ_LOSES = (
@@ -64,6 +69,10 @@ KNOWN = {
 FIRST_THREE: Mapping[str, int] = {name: k for k, name in enumerate(POINT)}
 COMMENT_MARKS = ("#", "//")
 SEPARATORS = (",", ";", "\t")
+PADDED = "\t\t"
+"""Separator of rows in which one tab or several stand between two fields."""
+QUOTED = re.compile(r'(^|[,;\t]) *"(?! *[,;\t])((?:[^"]|"")*)"(?= *(?:[,;\t]|$))')
+"""A field between quotation marks, of which ditto marks are none: ``P1;";";1.5``."""
 COLUMNS_ARE = re.compile(r"^(columns?|fields?|format|header)\s*[:=\s]\s*", re.IGNORECASE)
 """Before the names of columns in a comment: ``# columns: id x y z``."""
 NAMES_FOLLOW = re.compile(r"(columns?|fields?)\s*[:=]", re.IGNORECASE)
@@ -125,34 +134,29 @@ def csv_bytes(piece: CloudPiece) -> bytes:
 def text_columns(data: bytes, path: Path) -> CloudColumns:
     """Columns of a table of numbers: those that its heading names, else the first three as xyz."""
     if b"\0" in data[:LONGEST_SHOWN]:
-        raise FileFormatError(
-            "this is not UTF-8 text", where=path_text(path), remedy="save it as text in UTF-8"
-        )
+        raise _refusal("this is not UTF-8 text", path, "save it as text in UTF-8")
     text = data.decode("utf-8-sig", errors="replace")
     lines, is_ended = text.splitlines(), text.endswith(("\n", "\r"))
     opening = opening_of(lines, path)
-    body = [line.partition("#")[0] for line in lines[opening.n_lines :]]
-    filled = list(islice((line for line in body if line.strip()), LOOKED_AT))
+    body = [_unquoted(line.partition("#")[0]) for line in lines[opening.n_lines :]]
+    filled = [line for line in body if line.strip()]
     if not filled:
-        raise FileFormatError(
-            "the file holds no points", where=path_text(path), remedy="write lines of x y z in mm"
-        )
-    for line in filled:
-        _refuse_decimal_commas(line, path)
+        raise _refusal("the file holds no points", path, "write lines of x y z in mm")
+    for line in filled[:LOOKED_AT]:
+        refuse_decimal_commas(line, path_text(path))
     n_named = len(words_of(opening.heading))
     may_have_commas = "," in filled[0] and "." not in filled[0]
     if may_have_commas and n_named > 2 and len(_fields(filled[0], ",")) == 2 * n_named:
-        raise FileFormatError(
-            f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'",
-            where=path_text(path),
-            remedy="write numbers with points: 1.5,2.5,3.5",
-        )
-    named = named_columns(opening, filled, path)
+        fact = f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'"
+        raise _refusal(fact, path, "write numbers with points: 1.5,2.5,3.5")
+    named = named_columns(opening, filled[:LOOKED_AT], path)
+    separator = _separator(named, filled, path)
     if not is_ended:
-        last, first = (_fields(line, named.separator) for line in (body[-1], filled[0]))
+        last, first = (_fields(line, separator) for line in (body[-1], filled[0]))
         _refuse_cut_line(last, first, f"line {len(lines)}, '{lines[-1].strip()[:60]}'", path)
     filled_body = "\n".join(line if line.strip() else "" for line in body)
-    values = _values(filled_body, named, path, opening.n_lines + 1)
+    read = tuple(named.numbers.values())
+    values = _values(filled_body, separator, read, path, opening.n_lines + 1)
     columns = {name: values[:, k] for k, name in enumerate(named.numbers)}
     notes = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
     _refuse_cut(notes, len(values), len(lines), path, is_ended=is_ended)
@@ -165,14 +169,8 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
 class Opening:
     """Lines of a table before its first row.
 
-    Parameters
-    ----------
-    n_lines
-        How many they are.
-    heading
-        The bare line of names; empty without one.
-    comments
-        Text of the ``#`` and ``//`` lines.
+    ``heading`` is the bare line of names, empty without one, and ``comments`` is the text of the
+    ``#`` and ``//`` lines.
     """
 
     n_lines: int
@@ -184,14 +182,15 @@ class Opening:
 class NamedColumns:
     """Numbers of the columns that are read, by name, and what to say of the others.
 
-    ``separator`` stands between the fields of the rows, which may hold blanks; where it is empty
-    blanks, commas and semicolons separate words.
+    ``mark`` stands between the ``n_names`` names, which may hold blanks; it is empty where these
+    are words. Without names there are 0.
     """
 
     numbers: Mapping[str, int]
     passed_over: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
-    separator: str = ""
+    mark: str = ""
+    n_names: int = 0
 
 
 def opening_of(lines: Sequence[str], path: Path) -> Opening:
@@ -208,7 +207,7 @@ def opening_of(lines: Sequence[str], path: Path) -> Opening:
         if not has_count and len(words) == 1 and words[0].isdecimal():
             has_count = True
         elif not heading and _names_columns(line, k, path):
-            heading = line
+            heading = _unquoted(line)
         else:
             return Opening(k, heading, tuple(comments))
     return Opening(len(lines), heading, tuple(comments))
@@ -221,11 +220,8 @@ def _names_columns(line: str, k: int, path: Path) -> bool:
         return False
     if not all(re.match(r"[\W_]*[A-Za-z]", word) for word in words):
         number = f"line {k + 1}" if k else "the first line"
-        raise FileFormatError(
-            f"{number} is neither a point nor a heading: '{line[:LONGEST_SHOWN]}'",
-            where=path_text(path),
-            remedy="correct the line, or put # before it",
-        )
+        fact = f"{number} is neither a point nor a heading: '{line[:LONGEST_SHOWN]}'"
+        raise _refusal(fact, path, "correct the line, or put # before it")
     return True
 
 
@@ -237,15 +233,14 @@ def named_columns(opening: Opening, rows: Sequence[str], path: Path) -> NamedCol
     FileFormatError
         If it leaves open which columns are x, y and z, or they are in another unit than mm.
     """
-    headings = [opening.heading] if opening.heading else []
-    for text in headings:
-        if (found := _named(text, rows)) and not _is_prose(text, found.numbers, rows):
-            return found
+    found = _named(opening.heading, rows)
+    if found and not _is_prose(opening.heading, found.numbers, rows):
+        return found
     for text in reversed(opening.comments):
         found = _named(COLUMNS_ARE.sub("", text), rows)
         if found and _are_names(text, found.numbers, rows):
             return _remarked(found, text)
-    for text in (*headings, *opening.comments):
+    for text in (opening.heading, *opening.comments):
         _refuse_units(words_of(text), path)
     if opening.heading:
         return _by_heading(opening.heading, rows, path)
@@ -255,19 +250,18 @@ def named_columns(opening: Opening, rows: Sequence[str], path: Path) -> NamedCol
 def _named(text: str, rows: Sequence[str]) -> NamedColumns | None:
     """Columns by a line with as many names as these, x, y and z among them; else None."""
     counts = _counts(rows[0])
-    names = _names(text, counts)
+    names, mark = _names(text, counts)
     numbers = _numbers(names)
     if not set(POINT) <= set(numbers) or len(names) not in counts:
         return None
     read = set(numbers.values())
     passed_over = (word for k, word in enumerate(names) if k not in read and word)
-    separator = _separator(text, rows[0], len(names), numbers)
-    return NamedColumns(numbers, tuple(passed_over), separator=separator)
+    return NamedColumns(numbers, tuple(passed_over), mark=mark, n_names=len(names))
 
 
 def _is_prose(heading: str, numbers: Mapping[str, int], rows: Sequence[str]) -> bool:
     """Whether a bare line between blanks says ``Data X Y Z``, which is one word more."""
-    if _separated(heading, _counts(rows[0])):
+    if _names(heading, _counts(rows[0]))[1]:
         return False
     before = words_of(heading)[: min(numbers[name] for name in POINT)]
     return any(_introduces(word, rows) for word in before)
@@ -278,13 +272,11 @@ def _are_names(comment: str, numbers: Mapping[str, int], rows: Sequence[str]) ->
 
     Prose may have as many by chance, as ``# points: x y z`` over four columns has.
     """
-    text, counts = COLUMNS_ARE.sub("", comment), _counts(rows[0])
-    separated = _separated(text, counts)
-    names = separated or words_of(text)
+    names, mark = _names(COLUMNS_ARE.sub("", comment), _counts(rows[0]))
     before = names[: max(numbers[name] for name in POINT)]
-    if all(_is_name(name, k, rows, is_sure=bool(separated)) for k, name in enumerate(before)):
+    if all(_is_name(name, k, rows, is_sure=bool(mark)) for k, name in enumerate(before)):
         return True
-    if separated:
+    if mark:
         return all(len(name.split()) <= 1 for name in names)
     return bool(NAMES_FOLLOW.match(comment)) and not any(_introduces(w, rows) for w in before)
 
@@ -311,27 +303,24 @@ def _remarked(found: NamedColumns, text: str) -> NamedColumns:
 
 def _by_heading(heading: str, rows: Sequence[str], path: Path) -> NamedColumns:
     """Columns of a bare heading that does not give x, y, z and all others one name each."""
-    counts = _counts(rows[0])
     n_columns, words = len(words_of(rows[0])), words_of(heading)
     for mark in SEPARATORS:
-        names = UNIT_IN_BRACKETS.sub(r"\1_\2", heading).split(mark)
+        names = _fields(UNIT_IN_BRACKETS.sub(r"\1_\2", heading), mark)
         numbers = _numbers(names)
         if set(POINT) <= set(numbers):
             if numbers["x"] == 0:
                 _refuse_numbers_first(heading, words, rows, path)
-            separator = _separator(heading, rows[0], len(names), numbers)
-            return NamedColumns(numbers, separator=separator)
+            return NamedColumns(numbers, mark=mark, n_names=len(names))
     numbers = _numbers(words)
     if set(POINT) <= set(numbers):
         if any(numbers[name] != k for name, k in FIRST_THREE.items()):
             raise _unclear(heading, words, n_columns, path)
         _refuse_numbers_first(heading, words, rows, path)
         return NamedColumns(numbers)
-    is_title = len(words) == 1
-    if not is_title:
-        _refuse_unknown(heading, _names(heading, counts), rows, path)
-    if n_columns > len(POINT) and not is_title:
-        raise _no_names(heading, n_columns, path)
+    if len(words) > 1:
+        _refuse_unknown(heading, _names(heading, _counts(rows[0]))[0], rows, path)
+        if n_columns > len(POINT):
+            raise _no_names(heading, n_columns, path)
     return NamedColumns(FIRST_THREE, remarks=_taken(heading))
 
 
@@ -399,14 +388,13 @@ def _may_be_names(last: str, rows: Sequence[str], path: Path) -> bool:
         If these may be others than x, y and z in the first three.
     """
     counts = _counts(rows[0])
-    names = _names(last, counts)
+    names, mark = _names(last, counts)
     if len(names) not in counts or len(names) < len(POINT):
         return False
     # prose has colons and numbers, names of columns have none
     if not all(re.fullmatch(r"[\W_]*[A-Za-z][^:]*", word) for word in words_of(last)):
         return False
-    is_prose = not _separated(last, counts) and not _numbers(names)
-    _refuse_unknown(last, names, rows, path, is_prose=is_prose)
+    _refuse_unknown(last, names, rows, path, is_prose=not mark and not _numbers(names))
     return True
 
 
@@ -488,10 +476,12 @@ def _refuse_units(words: Iterable[str], path: Path) -> None:
 def _taken(text: str, n_columns: int = 0) -> tuple[str, ...]:
     """Of a line without the names of x, y and z, or without those of all of some columns."""
     lacks = f"give one name to each of {n_columns} columns" if n_columns else "name x, y and z"
-    return (
-        f"{_quoted(text)} does not {lacks}: the first three columns were taken for x, y and z, in "
-        "mm",
-    )
+    taken = "the first three columns were taken for x, y and z, in mm"
+    return (f"{_quoted(text)} does not {lacks}: {taken}",)
+
+
+def _refusal(fact: str, path: Path, remedy: str) -> FileFormatError:
+    return FileFormatError(fact, where=path_text(path), remedy=remedy)
 
 
 def _quoted(text: str) -> str:
@@ -502,28 +492,23 @@ def _unclear(text: str, words: Sequence[str], n_columns: int, path: Path) -> Fil
     """Of a comment that has as many words as there are columns, or another count."""
     if len(words) != n_columns:
         return _not_one_each(text, n_columns, path)
-    return FileFormatError(
+    return _refusal(
         f"{_quoted(text)} may be prose or the names of {n_columns} columns",
-        where=path_text(path),
-        remedy="write commas between the names, as 'id,x,y,z', or delete the line if the first "
+        path,
+        "write commas between the names, as 'id,x,y,z', or delete the line if the first "
         "three columns are x, y and z",
     )
 
 
 def _no_names(text: str, n_columns: int, path: Path) -> FileFormatError:
-    return FileFormatError(
-        f"{_quoted(text)} does not say which of {n_columns} columns are x, y and z",
-        where=path_text(path),
-        remedy=NAME_THEM,
+    return _refusal(
+        f"{_quoted(text)} does not say which of {n_columns} columns are x, y and z", path, NAME_THEM
     )
 
 
 def _not_one_each(text: str, n_columns: int, path: Path) -> FileFormatError:
-    return FileFormatError(
-        f"{_quoted(text)} does not give one name to each of {n_columns} columns",
-        where=path_text(path),
-        remedy="name every column in that line, x, y and z among them",
-    )
+    fact = f"{_quoted(text)} does not give one name to each of {n_columns} columns"
+    return _refusal(fact, path, "name every column in that line, x, y and z among them")
 
 
 def _numbers(names: Iterable[str]) -> dict[str, int]:
@@ -539,42 +524,75 @@ def _plain(name: str) -> str:
     return name.strip(" \t#/%;\"'").lower()
 
 
-def _names(text: str, counts: set[int]) -> list[str]:
-    """Names in a heading, which may hold blanks where a separator gives each column its own."""
-    return _separated(text, counts) or words_of(text)
+def _names(text: str, counts: set[int]) -> tuple[list[str], str]:
+    """Names in a heading, and the mark between them, which gives each of some columns one.
 
-
-def _separated(text: str, counts: set[int]) -> list[str]:
-    """Fields of a line between separators that give each column one; empty without."""
-    text = UNIT_IN_BRACKETS.sub(r"\1_\2", text).strip(" \r\n")
-    for separator in SEPARATORS:
-        fields = [field.strip() for field in text.split(separator)]
-        while len(fields) > 1 and len(fields) not in counts and not fields[-1]:
-            fields.pop()
-        if len(fields) > 1 and len(fields) in counts:
-            return fields
-    return []
-
-
-def _separator(heading: str, row: str, n_names: int, numbers: Mapping[str, int]) -> str:
-    """What stands between the fields of a row, by the names of its columns; empty for blanks.
-
-    That of the heading comes first, for fields of text may hold the others.
+    They are words where there is none, or where only the words are x, y and z: ``name\\tx y z``.
     """
-    for mark in sorted(SEPARATORS, key=lambda mark: mark not in heading):
-        fields = row.split(mark)
-        if mark in heading and len(fields) > max(numbers.values()):
-            return mark
-        if len(fields) >= n_names and not "".join(fields[n_names:]).strip():
-            return mark
-    return ""
+    text = UNIT_IN_BRACKETS.sub(r"\1_\2", text).strip(" \r\n")
+    words, point = words_of(text), set(POINT)
+    for mark in SEPARATORS:
+        for names in (_fields(text, mark), text.split(mark)):
+            is_meant = point <= set(_numbers(names)) or not point <= set(_numbers(words))
+            if 1 < len(names) in counts and is_meant:
+                return [name.strip() for name in names], mark
+    return words, ""
+
+
+def _separator(named: NamedColumns, rows: Sequence[str], path: Path) -> str:
+    """What stands between the fields of rows, by the names of their columns; empty for blanks.
+
+    The mark between the names comes first, for fields of text may hold the others. It gives the
+    columns that are read numbers, or nothing.
+    """
+    read, last = named.numbers.values(), max(named.numbers.values())
+    marks = sorted(SEPARATORS, key=lambda mark: mark != named.mark) if named.n_names else []
+    fallback = ""
+    for mark in (mark for mark in marks if rows[0].count(mark) >= last):
+        found = _tabs(named, rows, path) if mark == "\t" else mark
+        if mark == named.mark:
+            fallback = found  # refused by its line: words of text might be numbers
+        fields = _fields(rows[0], found)
+        is_wide = mark != named.mark and len(fields) > named.n_names
+        if not is_wide and all(reads_as_float("".join(fields[k : k + 1]) or "nan") for k in read):
+            return found
+    return fallback
+
+
+def _tabs(named: NamedColumns, rows: Sequence[str], path: Path) -> str:
+    """A tab, `PADDED` where some tabs only pad, or nothing where the words are as many as names.
+
+    Where rows have more fields than names, and empty ones before those that are read, tabs pad.
+    """
+    n_names, last = named.n_names, max(named.numbers.values())
+    wide = [row for row in rows if row.rstrip().count("\t") >= n_names]
+    wide = [row for row in wide if not all(map(str.strip, row.split("\t")[: last + 1]))]
+    if not wide:
+        return "\t"
+    n_fields = {len(_fields(row, PADDED)) for row in rows}
+    if n_fields == {n_names} or (len(n_fields) == 1 and last == 2 < max(n_fields)):
+        return PADDED
+    is_as_ever = last == 2 and named.mark != "\t"
+    if is_as_ever or all(len(words_of(row)) == n_names for row in rows):
+        return ""
+    fact = f"a line has more tabs than stand between {n_names} columns: {_quoted(wide[0])}"
+    raise _refusal(fact, path, "write one tab between two columns")
+
+
+def _unquoted(line: str) -> str:
+    """A line without the quotation marks around fields, in which no mark separates any more."""
+    if '"' not in line:
+        return line
+    return QUOTED.sub(lambda found: found[1] + re.sub(r"[,;\t]", "\u201a", found[2]), line)
 
 
 def _fields(row: str, separator: str) -> list[str]:
     """Fields of a row up to the last that is not empty; words where there is no separator."""
     if not separator:
         return words_of(row)
-    fields = [field.strip() for field in row.split(separator)]
+    if separator == PADDED:
+        row = re.sub(r"\t[ \t]*", "\t", row.strip())
+    fields = [field.strip() for field in row.split(separator[0])]
     while fields and not fields[-1]:
         fields.pop()
     return fields
@@ -587,9 +605,10 @@ def _words(row: str) -> list[str]:
 
 def _counts(row: str) -> set[int]:
     """How many columns a row may be said to have: empty ones at its end count or not."""
-    filled = EMPTY_FIELD.sub(r"\1nan", row.strip())
-    separated = {filled.count(mark) + 1 for mark in SEPARATORS if mark in filled}
-    return {len(words_of(filled)), *separated}
+    row = row.strip(" \r\n")
+    full = {row.count(mark) + 1 for mark in SEPARATORS if mark in row}
+    filled = {len(_fields(row, mark)) for mark in (*SEPARATORS, PADDED) if mark[0] in row}
+    return {len(_words(row)), *full, *filled}
 
 
 def words_of(line: str) -> list[str]:
@@ -598,35 +617,34 @@ def words_of(line: str) -> list[str]:
     return [word for word in re.split(r"[,;\s]+", line.strip()) if word]
 
 
-def _values(body: str, named: NamedColumns, path: Path, first: int) -> FloatArray:
-    """(N, C) numbers of the named columns of lines that are numbered from ``first``."""
-    columns, separator = tuple(named.numbers.values()), named.separator
-    # an empty field is a value that is missing, which must not move the next ones
-    if separator != "\t":
+def _values(
+    body: str, separator: str, columns: tuple[int, ...], path: Path, first: int
+) -> FloatArray:
+    """(N, C) numbers of some columns of lines that are numbered from ``first``."""
+    if separator == PADDED:
+        body = "\n".join("\t".join(_fields(line, PADDED)) for line in body.split("\n"))
+        separator = "\t"
+    elif separator != "\t":
         body = body.replace("\t", " ")
+    # an empty field is a value that is missing, which must not move the next ones
     mark = f"[{separator or ',;'}]"
     body = re.sub(rf"^ *(?={mark})|(?<={mark}) *(?={mark}|$)", "nan", body, flags=re.MULTILINE)
     if not separator:
         body = body.replace(",", " ").replace(";", " ")
     try:
-        lines, quotes = io.StringIO(body), '"' if separator else None
-        return np.loadtxt(
-            lines, delimiter=separator or None, usecols=columns, ndmin=2, quotechar=quotes
-        )
+        return np.loadtxt(io.StringIO(body), delimiter=separator or None, usecols=columns, ndmin=2)
     except (ValueError, IndexError) as error:
-        raise FileFormatError(
-            f"the points are not understood{_first_wrong(body, named, first)}",
-            where=path_text(path),
-            remedy="give one point a line: x y z in mm, with a point as decimal sign",
-        ) from error
+        fact = f"the points are not understood{_first_wrong(body, separator, columns, first)}"
+        remedy = "give one point a line: x y z in mm, with a point as decimal sign"
+        raise _refusal(fact, path, remedy) from error
 
 
-def _first_wrong(body: str, named: NamedColumns, first: int) -> str:
-    """Which line it is that holds no numbers in the named columns."""
+def _first_wrong(body: str, separator: str, columns: tuple[int, ...], first: int) -> str:
+    """Which line it is that holds no numbers in some columns."""
     for k, line in enumerate(body.split("\n")):
-        fields = line.split(named.separator or None) if line.strip() else []
+        fields = line.split(separator or None) if line.strip() else []
         try:
-            for column in named.numbers.values() if fields else ():
+            for column in columns if fields else ():
                 float(fields[column])
         except (ValueError, IndexError):
             return f": line {first + k} is '{line.strip()[:60]}'"
@@ -638,10 +656,10 @@ def _refuse_cut_line(fields: Sequence[str], wanted: Sequence[str], place: str, p
     pairs = zip(fields, wanted, strict=False)
     is_half = any(reads_as_float(other) and not reads_as_float(one) for one, other in pairs)
     if fields and (len(fields) < len(wanted) or is_half):
-        raise FileFormatError(
+        raise _refusal(
             f"the file seems cut: it ends within {place}",
-            where=path_text(path),
-            remedy="copy or export it again; without that line the points before it can be read",
+            path,
+            "copy or export it again; without that line the points before it can be read",
         )
 
 
@@ -663,10 +681,8 @@ def _refuse_cut(
     elif n_points == wanted:
         fact = f"the file seems cut within its last point: line {n_lines} has no end"
         on_purpose = "if that line is whole"
-    raise FileFormatError(
-        fact,
-        where=path_text(path),
-        remedy=f"copy it again, or delete the line '# points {wanted}' {on_purpose}",
+    raise _refusal(
+        fact, path, f"copy it again, or delete the line '# points {wanted}' {on_purpose}"
     )
 
 
@@ -678,20 +694,3 @@ def _notes(notes: list[str]) -> tuple[str, ...]:
     found = [f"frame {words[0]}", *([SIMULATED] if words[1:2] == [SIMULATED] else [])]
     reasons = [note.removeprefix(f"{FORCED}: ") for note in notes if note.startswith(f"{FORCED}: ")]
     return (*found, *(f"{FORCED} {k} {json.dumps(text)}" for k, text in enumerate(reasons)))
-
-
-def _refuse_decimal_commas(line: str, path: Path) -> None:
-    """Raise for a line whose commas can only be decimal signs, or may be.
-
-    ``1,5;2,5;3,5`` and ``1,5 2,5 3,5`` hold commas and another separator between numbers; so do
-    six whole numbers ``1,5,2,5,3,5`` from a table of three columns, which is not told from one of
-    six: only what is certain is refused.
-    """
-    fields = [word for word in re.split(r"[;\s]+", line.strip().strip(",;")) if word]
-    with_comma = [word for word in fields if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", word)]
-    if len(fields) >= 2 and with_comma:
-        raise FileFormatError(
-            f"the numbers have commas as decimal signs: '{line.strip()[:60]}'",
-            where=path_text(path),
-            remedy="write them with points: 1.5 2.5 3.5",
-        )

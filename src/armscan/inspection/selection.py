@@ -29,6 +29,9 @@ SEARCH_SIGMAS = 2.0
 """The same in the points' stated sigmas, where these are larger: 19 of 20 points lie within."""
 MIN_POINTS = 30
 """Fewest points that make a feature."""
+LEAST_BESIDE = 0.2
+"""Part of a face's points in other stripes than the largest that tells how it lies across that;
+`MIN_POINTS` do in any case."""
 LEAST_OF_SIZE = 0.7
 """Of a feature's nominal size, over which its points spread; written in metres they have 0.001."""
 AT_REST_MM, SAMPLED = 0.3, 10_000
@@ -141,7 +144,7 @@ class Selection:
         if stripe is None:
             return None
         counts = np.bincount(stripe if chosen is None else stripe[chosen])
-        if int(counts.sum() - counts.max()) >= MIN_POINTS:
+        if _are_of_several(counts):
             return None
         return FitFailure(
             f"of {counts.sum()} points all but a few lie in one light sheet: one stripe does not "
@@ -158,6 +161,13 @@ class Selection:
         """
         widest = max(SEARCH_BAND_MM, 0.5 * self.feature_mm)
         return np.clip(SEARCH_SIGMAS * self.sigma_mm, SEARCH_BAND_MM, widest)
+
+
+def _are_of_several(counts: IntArray) -> bool:
+    """Whether points lie in more than one stripe, all but strays, from the count of each stripe."""
+    n = int(counts.sum())
+    least = min(MIN_POINTS, LEAST_BESIDE * max(n, MIN_POINTS))
+    return n - int(counts.max(initial=0)) >= least
 
 
 def standings(cloud: PointCloud) -> IntArray:
@@ -297,7 +307,7 @@ def dominant_flat(
 
     ``stripe``: (N,) number of each point's stripe. All points of one lie in its light sheet, which
     is no face: of several stripes the one that has most points on a plane does not count there, and
-    `MIN_POINTS` of others are asked for. None, and a single stripe: all points count.
+    more than strays of others are asked for. None, and a single stripe: all points count.
     ``band_mm``: how near they lie.
     """
     if stripe is not None and int(np.ptp(stripe)) == 0:
@@ -325,8 +335,7 @@ def dominant_flat(
     best = int(np.concatenate(votes).argmax())
     if stripe is not None:
         on_it = np.abs(points @ normals[best] - offsets[best]) <= band_mm
-        counts = np.bincount(stripe[on_it])
-        if int(counts.sum() - counts.max(initial=0)) < MIN_POINTS:
+        if not _are_of_several(np.bincount(stripe[on_it])):
             return FitFailure(
                 "no face has points of several stripes, and one by itself lies in its light sheet, "
                 "whatever it crosses",

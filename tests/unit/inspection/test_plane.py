@@ -222,6 +222,25 @@ def test_one_stripe_on_the_face_is_no_face_though_others_lie_on_a_block_above() 
     assert isinstance(inspect_feature(cloud, above), FeatureInspection)
 
 
+@pytest.mark.parametrize(("n_stripes", "n_points"), [(2, 28), (3, 14), (4, 9)])
+def test_a_small_face_that_several_stripes_cross_is_measured(n_stripes: int, n_points: int) -> None:
+    """Fewer than 30 points lie beside the largest stripe; what strays are depends on the count."""
+    exposure = np.repeat(np.arange(n_stripes), n_points)
+    x = np.tile(0.1 * np.arange(n_points), n_stripes)
+    z = np.random.default_rng(0).normal(0.0, 0.005, len(x))
+    points = np.column_stack([x, exposure.astype(np.float64), z])
+    seen = inspected(inspect_plane(cloud_of(points, exposure)))
+    assert abs(seen.plane.normal[2]) > np.cos(np.radians(2.0))
+    found = inspect_feature(cloud_of(points, exposure), WantedFeature("plane"))
+    assert isinstance(found, FeatureInspection)
+    # as many points, all but five in one stripe
+    strays = (np.arange(len(x)) < 5).astype(np.int64)
+    points[:, :2] = np.column_stack([0.1 * np.arange(len(x)), strays])
+    refused = inspect_plane(cloud_of(points, strays))
+    assert isinstance(refused, FitFailure)
+    assert "lie in one light sheet" in refused.reason
+
+
 def test_exposures_from_one_place_share_their_light_sheet() -> None:
     x = np.tile(np.linspace(-30.0, 30.0, 300), 3)
     z = np.random.default_rng(0).normal(0.0, 0.005, 900)

@@ -166,7 +166,8 @@ def test_a_table_holds_quantities_whose_names_are_alike_apart() -> None:
     names = ("bore 12,5", "bore 125", "bore 125_u", "face 1, mean")
     told = [replace(quantity("pass"), name=one, value=float(k)) for k, one in enumerate(names)]
     told.append(replace(quantity("fail", "mean"), name="face 1", value=4.0))
-    *_, heads, cells = part_table_bytes([PartRow("a", "a.ply", tuple(told))]).decode().splitlines()
+    table = part_table_bytes([PartRow("a", "a.ply", tuple(told))]).decode()
+    *_, heads, cells = table.splitlines()
     found = dict(zip(heads.split(","), cells.split(","), strict=True))
     # part, cloud, verdict and reason, and three of each quantity
     assert len(found) == 4 + 3 * 5
@@ -174,6 +175,14 @@ def test_a_table_holds_quantities_whose_names_are_alike_apart() -> None:
         "0.0", "1.0", "2.0",
     ]  # fmt: skip
     assert [found[f"face 1 mean{k}_decision"] for k in ("", " (2)")] == ["pass", "fail"]
+    # the comments of tolerances call them by their own names
+    assert re.findall("# column (.*)", table) == [
+        "bore 125: bore 12,5, feature",
+        "bore 125 (2): bore 125, feature",
+        "bore 125_u (2): bore 125_u, feature",
+        "face 1 mean: face 1, mean, feature",
+        "face 1 mean (2): face 1, mean",
+    ]
 
 
 def test_a_feature_with_the_name_of_its_face_stands_beside_it() -> None:

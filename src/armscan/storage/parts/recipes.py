@@ -647,7 +647,7 @@ def is_part_table(path: Path) -> bool:
 def part_table_bytes(rows: Sequence[PartRow]) -> bytes:
     """CSV with a row a part and, a quantity, its value, U (k = 2) and decision.
 
-    Names that would be one without their commas are numbered.
+    Names that would be one without their commas are numbered; comments say which are which.
     """
     columns: dict[str, tuple[str, ...]] = {
         "part": tuple(row.name for row in rows),
@@ -664,14 +664,22 @@ def part_table_bytes(rows: Sequence[PartRow]) -> bytes:
         columns[value] = tuple(_cell(one, "value") for one in each)
         columns[u] = tuple(_cell(one, "u_value") for one in each)
         columns[decision] = tuple("" if one is None else one.decision for one in each)
+        stem = decision.removesuffix("_decision")
+        if "," in one.name or stem != _plain(one):
+            comments.append(f"column {stem}: {one.name}, {one.kind}")
         if math.isfinite(one.tolerance) and one.kind != "spot":
             comments.append(f"{one.name}: {one.nominal:g} +- {one.tolerance:g} {one.unit}")
     return csv_bytes(columns, comments)
 
 
+def _plain(one: PartQuantity) -> str:
+    """A quantity's label as headings hold it, without commas."""
+    return one.label.replace(",", "")
+
+
 def _headings(one: PartQuantity, taken: Mapping[str, object]) -> tuple[str, str, str]:
     """Of the columns of a quantity's value, U and decision; none is taken."""
-    name, unit = one.label.replace(",", ""), "mm" if one.unit == "mm" else "deg"
+    name, unit = _plain(one), "mm" if one.unit == "mm" else "deg"
     stem, k = name, 1
     while True:
         found = f"{stem}_{unit}", f"{stem}_u_{unit}", f"{stem}_decision"

@@ -85,6 +85,23 @@ def block_stripes(
     return np.concatenate(found), np.concatenate(numbers)
 
 
+def paused_scan(
+    n_paused: int, n_moving: int, noise_mm: float = 0.01, *, step_mm: float = 0.05
+) -> tuple[FloatArray, IntArray]:
+    """Stripes along x over the face z = 0: some where the head trembles by 1 um, then one a 0.5 mm.
+
+    Points are ``step_mm`` apart on them, and there nearest ones are flat in the light sheet.
+    """
+    rng = np.random.default_rng(0)
+    x = np.arange(0.0, 200.0 * step_mm, step_mm)
+    exposure = np.repeat(np.arange(n_paused + n_moving), len(x))
+    y = 0.5 * np.maximum(np.arange(n_paused + n_moving) - n_paused, 0)
+    y = y + rng.normal(0.0, 0.001, len(y))
+    places = np.tile(x, len(y)) + np.repeat(rng.uniform(0.0, step_mm, len(y)), len(x))
+    heights = rng.normal(0.0, noise_mm, len(places))
+    return np.stack([places, y[exposure], heights], axis=1), exposure
+
+
 def random_motion(seed: int) -> tuple[FloatArray, FloatArray]:
     """Rotation (3, 3) and shift (3,) in mm up to a metre."""
     rng = np.random.default_rng(seed)

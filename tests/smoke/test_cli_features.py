@@ -12,7 +12,7 @@ import pytest
 from armscan.cli import main
 from armscan.storage.clouds import write_cloud
 from rigs.feature_clouds import workpiece
-from rigs.inspection_clouds import cloud_of
+from rigs.inspection_clouds import cloud_of, paused_scan, seen_from
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +76,22 @@ def test_normals_of_another_cloud_hide_no_feature(
     assert main(["inspect", "recipe", *words, "-o", str(tmp_path / "results"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert "normals do not stand on the faces" in told["warnings"][0]
+
+
+def test_the_normals_of_a_scan_that_paused_are_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of the points lie in one light sheet and are flat in it; seen from below."""
+    points, exposure = paused_scan(30, 30, 0.03)
+    cloud = cloud_of(points, exposure, normals=np.tile([0.0, 0.0, -1.0], (len(points), 1)))
+    n = len(cloud.exposure_sources)
+    places = np.array([[0.0, points[exposure == k, 1].mean(), -200.0] for k in range(n)])
+    seen = seen_from(cloud, places, np.tile(np.eye(3), (n, 1, 1)))
+    write_cloud(tmp_path / "a.ply", seen)
+    assert main(["inspect", "plane", str(tmp_path / "a.ply"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert "normals" not in " ".join(told["warnings"])
+    assert told["fitted"]["plane"][2] < -0.99
 
 
 @pytest.mark.parametrize(

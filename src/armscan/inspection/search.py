@@ -243,21 +243,37 @@ def normals_are_of_points(points_mm: FloatArray, normals: FloatArray) -> bool:
 
     Other programs write the same one at every point, or leave those of another cloud. True where
     too few neighbourhoods are flat to tell; zeros are no normals and do not count.
+
+    Where a scanner paused, nearest points are of one light sheet, and flat in it: normals that
+    stand on the faces of evenly thinned points are not off either.
     """
     given = np.flatnonzero(np.isfinite(normals).all(axis=1) & normals.any(axis=1))
     if len(given) < MIN_POINTS:
         return True
     points = points_mm[given]
     asked = np.random.default_rng(0).permutation(len(given))[:N_ASKED]
-    near = cKDTree(points).query(points[asked], min(N_NEIGHBOURS, len(points)))[1]
+    is_flat, is_upright = _on_faces(points, points[asked], normals[given[asked]])
+    told = asked[is_flat]
+    if len(told) < MIN_POINTS:
+        return True
+    is_off = ~is_upright[is_flat]
+    if float(is_off.mean()) > MOST_OFF:
+        even = points[_thinned(points, min(N_ASKED, len(points) // SPARSER))]
+        is_off &= ~np.logical_and(*_on_faces(even, points[told], normals[given[told]]))
+    return float(is_off.mean()) <= MOST_OFF
+
+
+def _on_faces(
+    points: FloatArray, at_mm: FloatArray, normals: FloatArray
+) -> tuple[BoolArray, BoolArray]:
+    """(N,) whether points nearest to places (N, 3) are flat, and whether normals stand on them."""
+    near = cKDTree(points).query(at_mm, min(N_NEIGHBOURS, len(points)))[1]
     about = points[near] - points[near].mean(axis=1, keepdims=True)
     values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", about, about))
     thickness, breadth, length = np.sqrt(np.maximum(values, 0.0)).T
     is_flat = (breadth >= BROAD_FACE * length) & (thickness <= THICKEST_FACE * breadth)
-    told = normals[given[asked[is_flat]]]
-    cosine = np.abs(np.einsum("ni,ni->n", told, axes[is_flat, :, 0]))
-    is_off = cosine < LEAST_UPRIGHT * np.linalg.norm(told, axis=1)
-    return len(told) < MIN_POINTS or float(is_off.mean()) <= MOST_OFF
+    cosine = np.abs(np.einsum("ni,ni->n", normals, axes[:, :, 0]))
+    return is_flat, cosine >= LEAST_UPRIGHT * np.linalg.norm(normals, axis=1)
 
 
 def scatter_about_mm(selection: Selection, rows: IntArray) -> float:
@@ -320,8 +336,8 @@ def _thinned(points: FloatArray, most: int) -> IntArray:
     Dense stripes far apart would else take every place, and steep walls have few points.
     """
     order = np.random.default_rng(0).permutation(len(points))
-    if len(points) <= most:
-        return order
+    if len(points) <= most or not np.ptp(points, axis=0).any():
+        return np.asarray(order[:most])
     low, high = 0.0, float(np.ptp(points, axis=0).max())
     placed = np.ascontiguousarray((points[order] - points.min(axis=0)).T)
     widest = None

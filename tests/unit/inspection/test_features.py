@@ -27,12 +27,12 @@ from armscan.inspection.features import (
     together,
 )
 from armscan.inspection.results import MeasuredLength
-from armscan.inspection.search import WantedFeature
+from armscan.inspection.search import WantedFeature, normals_are_of_points
 from armscan.inspection.selection import InspectionOptions
 from armscan.records.cloud import PointCloud
 from armscan.report.inspection.features import feature_report, relation_report
 from rigs.feature_clouds import BALL_MM, BORE_MM, BOSS_MM, CONE_DEG, workpiece
-from rigs.inspection_clouds import ball_stripes, cloud_of, random_motion, seen_from
+from rigs.inspection_clouds import ball_stripes, cloud_of, paused_scan, random_motion, seen_from
 
 OPTIONS = InspectionOptions(feature_mm=0.5)
 BORE = WantedFeature("cylinder", diameter_mm=BORE_MM)
@@ -398,3 +398,17 @@ def test_the_worst_sigma_holds_what_a_calibration_errs_along_any_way() -> None:
         ball = Shape(kind="sphere", point_mm=place, axes=np.eye(3), radius_mm=10.0)
         found = Fitted(ball, known, np.arange(len(directions))).centre_sigma_mm()
         assert found == pytest.approx(0.02, rel=0.02)
+
+
+@pytest.mark.parametrize(("n_paused", "n_moving"), [(15, 60), (60, 30)])
+def test_normals_of_a_face_are_those_of_points_where_the_scanner_paused(
+    n_paused: int, n_moving: int
+) -> None:
+    """Nearest points of exposures at rest are flat in the light sheet, square to their face."""
+    points, _ = paused_scan(n_paused, n_moving)
+    assert normals_are_of_points(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+    assert not normals_are_of_points(points, np.tile([1.0, 0.0, 0.0], (len(points), 1)))
+    random = np.random.default_rng(0).normal(size=points.shape)
+    assert not normals_are_of_points(points, random)
+    # no face is told by points in one place, which are refused later
+    normals_are_of_points(np.full_like(points, 0.1), random)

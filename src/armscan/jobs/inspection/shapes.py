@@ -136,10 +136,15 @@ def _as_read(report: InspectionReport, source: CloudFile) -> InspectionReport:
 
 
 def read_inspected(path: Path) -> CloudFile:
-    """Read a cloud, without normals that are not of its points, which is a remark then."""
+    """Read a cloud, without normals that are not of its points, which is a remark then.
+
+    Of a cloud that tells where the sensor stood they are armscan's own.
+    """
     source = read_cloud_file(path)
     cloud = source.cloud
-    if cloud.normals is None or normals_are_of_points(cloud.points_mm, cloud.normals):
+    if cloud.normals is None or cloud.seen_from_mm is not None:
+        return source
+    if normals_are_of_points(cloud.points_mm, cloud.normals):
         return source
     remark = (
         "the cloud's normals do not stand on the faces that its points make, and were not used; "

@@ -52,8 +52,8 @@ LEAST_TO_PLACE = 4
 
 
 def most_left_out(n_common: int) -> int:
-    """Of so many common markers, how many may have moved: a quarter, or two if four stay."""
-    return max(min(max(n_common // 4, 2), n_common - LEAST_TO_PLACE), 0)
+    """Of so many common markers, how many may have moved: half, if four others stay."""
+    return max(min(n_common // 2, n_common - LEAST_TO_PLACE), 0)
 
 
 def least_moved(squares: float, freedom: float, n: int) -> float:
@@ -212,7 +212,8 @@ def _weighed(
     n_views, view = len(problem.poses), sightings.view
     is_shared = np.bincount(sightings.marker)[sightings.marker] > 1
     n_shared = np.bincount(view[is_shared], minlength=n_views).tolist()
-    is_used, score = np.ones(len(sightings), dtype=bool), np.zeros(len(sightings))
+    is_used = np.ones(len(sightings), dtype=bool)
+    has_moved, k, one, score = ~is_used, 0, 0, 0.0
     scatters, scale, n_scaled = np.zeros(n_views, dtype=bool), np.ones(n_views), 0
     while True:
         enlarged = scale[view][:, None, None] * sightings.covariance_mm2
@@ -220,6 +221,9 @@ def _weighed(
         problem, is_settled = replace(problem, sightings=seen).solved()
         misfit = problem.misfit()
         squares, expected = misfit.by_view(n_views)
+        if score > 0.0:
+            limit = least_moved(float(squares[one]), float(expected[one]), n_shared[one])
+            has_moved[k], score = score > limit, 0.0
         ratio = np.where(expected > 1.0, squares / np.maximum(expected, 1.0), 1.0)
         next_scale = np.where(scatters, np.maximum(scale * ratio, 1.0), scale)
         is_near = np.abs(next_scale / scale - 1.0) < SCALE_SETTLED
@@ -230,19 +234,17 @@ def _weighed(
         worst = misfit.worst(scatters)
         if worst is not None:
             k = int(np.flatnonzero(is_used)[worst])
-            others = is_used & is_shared & (view == view[k])
+            one = int(view[k])
+            others = is_used & is_shared & (view == one)
             others[k] = False
-            n_left_out = int((~is_used & (view == view[k])).sum())
-            if n_left_out < most_left_out(n_shared[view[k]]) and _fix_a_pose(
-                sightings.select(others)
-            ):
-                is_used[k], score[k] = False, misfit.score[worst]
+            n_left_out = int((~is_used & (view == one)).sum())
+            if n_left_out < most_left_out(n_shared[one]) and _fix_a_pose(sightings.select(others)):
+                is_used[k], score = False, float(misfit.score[worst])
                 continue
-            scatters[view[k]] = True
+            scatters[one] = True
         else:
-            for one in np.unique(view[~is_used]):
-                limit = least_moved(float(squares[one]), float(expected[one]), n_shared[one])
-                scatters[one] = score[~is_used & (view == one)].max() <= limit
+            scatters[view[~is_used]] = True
+            scatters[view[~is_used & has_moved]] = False
             new = (ratio > 1.0) & (chdtrc(expected, squares) < UNLIKELY / n_views) & ~scatters
             # alike ones together: of two views alone nothing tells which scatters
             scatters |= new & (ratio >= 0.5 * np.max(ratio, where=new, initial=0.0))

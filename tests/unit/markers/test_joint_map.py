@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -29,6 +30,12 @@ def joined(scene: Walk) -> JoinedViews:
     result = join_views(scene.views)
     assert isinstance(result, JoinedViews), result
     return result
+
+
+@cache
+def four_views() -> tuple[Walk, JoinedViews]:
+    scene = walk(np.random.default_rng(4), 4, step_mm=20.0)
+    return scene, joined(scene)
 
 
 def truth(scene: Walk, view: int) -> Pose[Frame, Frame]:
@@ -125,8 +132,7 @@ def test_a_walk_around_closes_and_drifts_less() -> None:
 
 
 def test_a_moved_marker_is_left_out_and_the_rest_stays() -> None:
-    scene = walk(np.random.default_rng(4), 4, step_mm=20.0)
-    clean = joined(scene)
+    _, clean = four_views()
     counts = np.bincount(clean.sightings.marker)
     row = int(
         np.flatnonzero((counts[clean.sightings.marker] >= 3) & (clean.sightings.view == 1))[0]
@@ -145,8 +151,7 @@ def test_a_moved_marker_is_left_out_and_the_rest_stays() -> None:
 
 def test_a_view_that_scatters_more_than_stated_counts_whole_and_as_uncertain() -> None:
     """Eight times the noise stated: none of its markers moved, and the other views stay as sure."""
-    scene = walk(np.random.default_rng(4), 4, step_mm=20.0)
-    clean = joined(scene)
+    scene, clean = four_views()
     is_its = clean.sightings.view == 1
     true = truth(scene, clean.placed[1])
     squares = []
@@ -166,9 +171,48 @@ def test_a_view_that_scatters_more_than_stated_counts_whole_and_as_uncertain() -
     assert np.mean(squares) < 6.0 + 3.3 * np.sqrt(12.0 / len(squares))
 
 
+@pytest.mark.parametrize("by_mm", [0.6, 2.0])
+def test_four_of_the_twelve_markers_of_a_view_that_moved_are_left_out(by_mm: float) -> None:
+    """Kept, they would make the whole view ten times less sure."""
+    _, clean = four_views()
+    seen = clean.sightings
+    n_seen = np.bincount(seen.marker)[seen.marker]
+    assert int(((seen.view == 3) & (n_seen > 1)).sum()) == 12
+    shared = np.flatnonzero((seen.view == 3) & (n_seen >= 3))
+    for seed in range(4):
+        generator = np.random.default_rng(seed)
+        rows, point = np.sort(generator.permutation(shared)[:4]), np.array(seen.point_mm)
+        step = generator.normal(size=(4, 3))
+        point[rows] += by_mm * step / np.linalg.norm(step, axis=1)[:, None]
+        again = adjust_jointly(replace(seen, point_mm=point), clean.chain, clean.map.markers_mm)
+        assert np.flatnonzero(~again.is_used).tolist() == rows.tolist()
+        assert again.factor.max() < 1.5
+
+
+def test_a_view_that_shares_eight_and_scatters_much_keeps_them() -> None:
+    """The four that fit best by chance scatter too little to say that the other four moved."""
+    scene, clean = four_views()
+    seen = clean.sightings
+    n_seen = np.bincount(seen.marker)[seen.marker]
+    squares = []
+    for seed in range(100, 112):
+        generator = np.random.default_rng(seed)
+        noise = generator.normal(0.0, 8.0 * NOISE_MM, seen.point_mm.shape)
+        point = seen.point_mm + noise * (seen.view == 1)[:, None]
+        is_kept = np.ones(len(seen), dtype=bool)
+        is_kept[generator.permutation(np.flatnonzero((seen.view == 1) & (n_seen > 1)))[8:]] = False
+        again = adjust_jointly(
+            replace(seen, point_mm=point).select(is_kept), clean.chain, clean.map.markers_mm
+        )
+        assert again.is_used.all()
+        e = error(again.part_from_view[1], truth(scene, clean.placed[1]))
+        squares.append(float(e @ np.linalg.solve(again.pose_covariance[1], e)))
+    assert np.mean(squares) < 6.0 + 3.3 * np.sqrt(12.0 / len(squares))
+
+
 def test_a_view_keeps_the_four_markers_that_fix_it() -> None:
     """Its pose would otherwise be that of two or three markers, off by metres and called joined."""
-    clean = joined(walk(np.random.default_rng(4), 4, step_mm=20.0))
+    _, clean = four_views()
     seen = clean.sightings
     n_seen = np.bincount(seen.marker)[seen.marker]
     shared = np.flatnonzero((seen.view == 3) & (n_seen >= 3))[:4]

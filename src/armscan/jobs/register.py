@@ -280,9 +280,11 @@ def _too_small(chi2_sum: float, degrees_of_freedom: int) -> tuple[str, ...]:
     if float(chdtrc(max(degrees_of_freedom, 1), chi2_sum)) >= UNLIKELY:
         return ()
     ratio = float(np.sqrt(chi2_sum / degrees_of_freedom))
+    larger = float(np.sqrt(chi2_sum / (degrees_of_freedom - 2)))
     return (
         f"the residuals are {ratio:.2g} times what the covariances let expect: the registration's "
-        "uncertainty is stated larger by that factor, that of the markers is too small by it",
+        f"uncertainty is stated {larger:.2g} times as large, that of the markers is too small by "
+        f"{ratio:.2g}",
     )
 
 

@@ -306,7 +306,9 @@ def _enlarged(
             f"the {n} common markers do not fit each other: the residuals are {scale**0.5:.2g} "
             "times what the covariances let expect",
         )
-    return replace(fit, covariance=scale * fit.covariance)
+    # the scatter is estimated too: errors are Student's, and this is their second moment
+    freedom = fit.degrees_of_freedom
+    return replace(fit, covariance=freedom / (freedom - 2.0) * scale * fit.covariance)
 
 
 def _passed_on(

@@ -154,6 +154,22 @@ def test_up_to_half_of_the_markers_that_moved_are_named(n: int, n_moved: int) ->
     assert np.mean(squares) < 6.0 + 3.3 * np.sqrt(12.0 / len(squares))
 
 
+def test_few_markers_that_scatter_know_their_scatter_badly() -> None:
+    """Of six, the scatter is that of twelve residuals: errors are Student's, not normal."""
+    squares = []
+    for seed in range(120):
+        generator = np.random.default_rng(seed)
+        points, pose = scattered(generator, 6, SIZE), random_pose(generator)
+        noise = generator.normal(0.0, 3.0 * NOISE_MM, (2, 6, 3))
+        old, new = numbered(pose.apply(points) + noise[0], points + noise[1])
+        place = register_place(old, new, RegisterOptions(is_by_id=True))
+        if not place.moved:
+            e = pose.step_from(place.fit.value)
+            squares.append(float(e @ np.linalg.solve(place.fit.covariance, e)))
+    assert len(squares) > 110
+    assert 5.0 < np.mean(squares) < 7.0
+
+
 def test_by_id_a_lost_and_a_new_marker_stay_two() -> None:
     """A new marker 3 mm beside the place of a lost one is no moved one if its number differs."""
     generator = np.random.default_rng(7)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from armscan.devices.clocks import (
+    LARGEST_SIGMA_NS,
     ClockFit,
     ClockModel,
     ElementStatus,
@@ -106,6 +107,22 @@ def test_sigma_tells_how_a_delay_without_a_sharp_limit_goes_on_sinking(kind):
         sunk_ns = early.to_other_ns(then) - late.to_other_ns(then)
         ratios.append(sunk_ns / np.hypot(early.sigma_ns(then), late.sigma_ns(then)))
     assert np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_line_that_is_stable_and_sinks_is_known(seed):
+    """Jitter of the stamps by 0.4 ms: what it will still sink by is told, and hides no time."""
+    rng = np.random.default_rng(seed)
+    device, true = stream(80.0, 240.0, 50e-6, host0=10**15)
+    host = true + np.rint(3e6 + 4e5 * rng.standard_normal(len(true))).astype(np.int64)
+    model, n_unknown, n_rough = ClockModel(), 0, 0
+    for k, (one, other) in enumerate(zip(device.tolist(), host.tolist(), strict=True)):
+        model.add(one, other)
+        if k >= 2400:
+            assert isinstance(model.fit, ClockFit)
+            n_unknown += model.missing(one) != ""
+            n_rough += model.fit.sigma_ns(one) > LARGEST_SIGMA_NS
+    assert n_unknown == model.n_jumps == 0 and n_rough > 100
 
 
 def test_least_squares_through_all_would_be_wrong():

@@ -53,9 +53,13 @@ class ClockFit:
     drift
         Part by which the other clock runs faster.
     sigma_offset_ns, sigma_drift
-        Standard deviations of ``other_ns`` and of the drift, which do not correlate.
+        Standard deviations of ``other_ns`` and of the drift, which do not correlate, of delays
+        with a sharp lower limit.
     scatter_ns
         Of the fastest elements of the blocks about the line.
+    sunk_ns
+        By how much the line would sink if blocks were twice as long: delays whose least ones are
+        rare have no sharp limit. It is told, and decides nothing: such a line is stable.
     """
 
     device_ns: int
@@ -64,6 +68,7 @@ class ClockFit:
     sigma_offset_ns: float
     sigma_drift: float
     scatter_ns: float
+    sunk_ns: float = 0.0
 
     def to_other_ns(self, t_device_ns: int) -> int:
         """Time of the other clock, in whole ns."""
@@ -72,6 +77,10 @@ class ClockFit:
 
     def sigma_ns(self, t_device_ns: int) -> float:
         """Standard deviation of `to_other_ns`, the constant least delay apart."""
+        return hypot(self.line_sigma_ns(t_device_ns), self.sunk_ns)
+
+    def line_sigma_ns(self, t_device_ns: int) -> float:
+        """The same without what the line goes on sinking: whether a time is known."""
         return hypot(self.sigma_offset_ns, self.sigma_drift * (t_device_ns - self.device_ns))
 
 
@@ -129,7 +138,7 @@ class ClockModel:
         """Why a time cannot be told by the other clock; empty if it can."""
         if isinstance(self.fit, FitFailure):
             return self.fit.reason
-        sigma = self.fit.sigma_ns(t_device_ns)
+        sigma = self.fit.line_sigma_ns(t_device_ns)
         if sigma > LARGEST_SIGMA_NS:
             return (
                 f"its sigma is {sigma / 1e3:.3g} us, more than {LARGEST_SIGMA_NS / 1e3:g} us; "
@@ -141,7 +150,7 @@ class ClockModel:
         """Whether an element came before it can have been taken."""
         ahead = fit.to_other_ns(t_device_ns) - t_other_ns
         return ahead > SMALLEST_JUMP_NS and ahead > JUMP_SIGMAS * (
-            fit.scatter_ns + fit.sigma_ns(t_device_ns)
+            fit.scatter_ns + fit.line_sigma_ns(t_device_ns)
         )
 
     def _begin_anew(self, blocks: list[tuple[int, int]]) -> None:
@@ -196,7 +205,7 @@ def _ahead_ns(fit: ClockFit, block: tuple[int, int]) -> int:
 
 
 def _limit_ns(fit: ClockFit, block: tuple[int, int]) -> float:
-    return max(SMALLEST_JUMP_NS, JUMP_SIGMAS * (fit.scatter_ns + fit.sigma_ns(block[0])))
+    return max(SMALLEST_JUMP_NS, JUMP_SIGMAS * (fit.scatter_ns + fit.line_sigma_ns(block[0])))
 
 
 def _merged(fastest: list[tuple[int, int]], slope: float) -> list[tuple[int, int]]:
@@ -210,9 +219,6 @@ def _merged(fastest: list[tuple[int, int]], slope: float) -> list[tuple[int, int
 def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
     """Fit the line of two clocks under pairs of times.
 
-    Delays whose least ones are rare lie under no sharp limit: the line sinks as blocks grow. By how
-    much it would if they were twice as long counts in the sigma of the offset.
-
     Pairs of times (device, other) in ns are in time order, each the fastest of a block.
     """
     fit = _fit(fastest, FEWEST_BLOCKS)
@@ -221,8 +227,7 @@ def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
     longer = _fit(_merged(fastest, fit.drift), FEWEST_BLOCKS // 2)
     if isinstance(longer, FitFailure):
         return fit
-    sunk = longer.to_other_ns(fit.device_ns) - fit.other_ns
-    return replace(fit, sigma_offset_ns=hypot(fit.sigma_offset_ns, sunk))
+    return replace(fit, sunk_ns=abs(longer.to_other_ns(fit.device_ns) - fit.other_ns))
 
 
 def _fit(fastest: list[tuple[int, int]], fewest: int) -> ClockFit | FitFailure:

@@ -159,6 +159,25 @@ def test_a_session_tells_of_an_arm_without_ids() -> None:
     assert told_of(frames, [replace(one, trigger_id=one.number) for one in samples]) == set()
 
 
+@pytest.mark.parametrize(("is_common_trigger", "said"), [(True, set()), (False, {TIMES_APART})])
+def test_cameras_that_ids_pair_are_not_free(is_common_trigger: bool, said: set[str]) -> None:
+    """7 ms apart by their own clocks, as their transports are."""
+    pairs = [
+        [Frame(IMAGE, k, t_ns + late_ns, t_ns + late_ns, trigger_id=k) for k, t_ns in times]
+        for times in [list(enumerate(times_ns(60)))]
+        for late_ns in (-7_000_000, 0)
+    ]
+    cameras: Any = [Dated(f"camera {k}", frames) for k, frames in enumerate(pairs)]
+    description = RigDescription(("c", "d"), trigger="free", is_common_trigger=is_common_trigger)
+    session = LiveSession(Rig(cameras, description=description), options=ALL)
+    told: list[LiveEvent] = []
+    session.add_listener(told.append)
+    session.open()
+    waited(lambda: all(counts.n_elements == 60 for counts in session.stream_counts[:2]))
+    session.stop()
+    assert {one.text for one in told if one.kind == "warning"} == said
+
+
 def test_a_session_tells_of_a_laser_controller_that_is_silent() -> None:
     frames = [Frame(IMAGE, k, t_ns, t_ns) for k, t_ns in enumerate(times_ns(100))]
     assert told_of(frames, has_lasers=True) == {(LASERS_UNTOLD, "lasers")}

@@ -296,7 +296,7 @@ class Acquisition:
         self._watch = IdWatch(
             is_triggered=rig.description.is_common_trigger and rig.arm is not None,
             has_controller=rig.lasers is not None,
-            is_free=rig.description.trigger == "free",
+            is_free=rig.description.is_free,
         )
         self.faults: dict[tuple[str, int], str] = {}
         self._recording: _Recording | None = None

@@ -79,8 +79,7 @@ class LiveRecorder:
         self.n_samples = self.n_posed = 0
         self._writer = RecordingWriter(path, options)
         self._rig, self._is_triggered = rig, rig.description.is_common_trigger
-        # what one wire triggers is of one time, however their transports differ
-        self._is_free = rig.description.trigger == "free" and not self._is_triggered
+        self._is_free = rig.description.is_free
         by_joints = rig.arm is not None and rig.arm.pose_form == "joints"
         self._form: PoseForm = "joints" if by_joints else "quaternion"
         self._session = Session(

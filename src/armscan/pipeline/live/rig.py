@@ -108,6 +108,14 @@ class RigDescription:
         return tuple(tuple(filter(None, step.split("+"))) for step in self.schedule)
 
     @property
+    def is_free(self) -> bool:
+        """Whether each camera takes images by its own clock.
+
+        What one wire triggers is of one time, however transports differ.
+        """
+        return self.trigger == "free" and not self.is_common_trigger
+
+    @property
     def lasers_key(self) -> str:
         """The key that says which lasers are on, and needs a controller; empty for none."""
         return "schedule" if self.schedule else "chooses_lasers" if self.chooses_lasers else ""

@@ -24,6 +24,7 @@ from armscan.errors import ArmscanError, DeviceError, DeviceStoppedError, Output
 from armscan.jobs.live.record import RecordRequest, _Recording, record_scan
 from armscan.pipeline.live.acquire import BEHIND, JUMPED, MATCHING, LiveEvent
 from armscan.pipeline.live.recorder import LiveRecorder
+from armscan.reconstruction.sync import PoseStatus
 from armscan.simulation.live import TwinArm, TwinLasers
 from armscan.storage.files import set_aside
 from armscan.storage.recording import read_recording
@@ -303,6 +304,25 @@ def test_a_recording_of_which_nothing_can_be_used_is_no_success(
     told = capsys.readouterr().err
     assert re.search("none of [0-9]+ exposures can be used: " + re.escape(words), told)
     assert "the file keeps them" in told and len(read_recording(output).rows) >= 3
+
+
+def test_a_camera_that_counts_otherwise_than_the_arm_is_no_success(
+    rig: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real, output = LiveRecorder.add_instant, rig.parent / "scan.mcap"
+
+    def later(recorder: LiveRecorder, instant: MatchedInstant) -> None:
+        """Its ids are those of triggers of 10 s before."""
+        frames = tuple(one and replace(one, t_host_ns=one.t_host_ns + 10**10)
+                       for one in instant.frames)  # fmt: skip
+        status = PoseStatus.UNKNOWN_TRIGGER
+        real(recorder, replace(instant, frames=frames, t_ns=None, pose=None, status=status))
+
+    monkeypatch.setattr(LiveRecorder, "add_instant", later)
+    assert main(["record", str(rig), "--exposures", "3", "-o", str(output)]) == 2
+    told = capsys.readouterr().err
+    words = "they bear ids of samples of the arm that came long before or after; let camera and arm"
+    assert re.search("none of [0-9]+ exposures can be used: " + words, told)
 
 
 def test_what_arrives_and_cannot_be_matched_is_no_success(

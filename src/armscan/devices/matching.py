@@ -19,12 +19,7 @@ from armscan.devices.clocks import ElementStatus, StreamMonitor
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.arm import ArmModel, forward
-from armscan.reconstruction.sync import (
-    ARRIVED_TOGETHER_NS,
-    PoseStatus,
-    bridged_ns,
-    poses_at,
-)
+from armscan.reconstruction.sync import PoseStatus, bridged_ns, poses_at
 from armscan.records.recording import ArmTrack
 
 T = TypeVar("T")
@@ -45,6 +40,8 @@ SAME_TRIGGER_NS = 100_000_000
 before a device began to count anew, has the same ids."""
 SAME_COUNT_NS = 500_000_000
 """And within this by clocks that were related by arrivals, on a computer that may be overloaded."""
+ARRIVED_TOGETHER_NS = 2_000_000_000
+"""And arrived within this, while nothing else is known: no count ends so soon after its start."""
 SAME_INSTANT = 0.25
 """Frames of two cameras without ids are of one instant within this part of the usual step."""
 
@@ -106,6 +103,11 @@ class MatchedInstant:
     number: int = 0
     are_lasers_mixed: bool = False
     times_ns: tuple[int | None, ...] = ()
+
+    @property
+    def has_sample(self) -> bool:
+        """Where ids decide: whether a sample of the arm is of its trigger, with a pose or none."""
+        return self.status in (PoseStatus.FOUND, PoseStatus.UNKNOWN_SAMPLE)
 
 
 @dataclass(slots=True)

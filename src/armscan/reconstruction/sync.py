@@ -147,14 +147,6 @@ LISTED_FAULTS = 3
 """Faults of a track that are told one by one."""
 BEND_MM = 0.02
 """Interpolation errors of this size in the tool's place are warned of: an arm's own scatter."""
-ARRIVED_TOGETHER_NS = 2_000_000_000
-"""What bears one trigger id arrived within this: no count ends so soon after its start."""
-TIME_SCATTERS = 10.0
-"""Times that are rough, as whole seconds, may be so many of their usual errors apart."""
-DRIFT = 1e-3
-"""Two clocks run apart by no more: each is within 500 parts in a million."""
-LAG = 16
-"""Steps of time are compared over so many triggers: single ones may arrive in bursts."""
 
 
 def exposure_poses(
@@ -168,9 +160,8 @@ def exposure_poses(
     The arm's track is checked by itself (`armscan.reconstruction.track_faults`): exposures at
     samples that cannot be right get no pose.
 
-    Trigger ids decide if exposures and samples have them, but for those of another count, as times
-    of one clock show. Else the pose is interpolated in time between two neighbouring known samples:
-    the rotation by SLERP, the place along a straight line.
+    Trigger ids decide if exposures and samples have them. Else the pose is interpolated in time
+    between two neighbouring known samples: the rotation by SLERP, the place along a straight line.
     An exposure that was to have an id and has none gets no pose: its time may only order.
 
     Parameters
@@ -308,7 +299,7 @@ def _by_trigger(
             is_known = arm.is_known[found[k]]
             status[k] = PoseStatus.FOUND if is_known else PoseStatus.UNKNOWN_SAMPLE
     rotations, translations = _at_samples(arm, found, status)
-    poses = ExposurePoses(
+    return ExposurePoses(
         rotations=rotations,
         translations_mm=translations,
         status=status,
@@ -316,50 +307,6 @@ def _by_trigger(
         source="trigger",
         warnings=_times_apart(rows, arm, found, latency_ns) if clock == "shared" else (),
     )
-    return _without_other_counts(poses, rows, arm)
-
-
-def _without_other_counts(
-    poses: ExposurePoses, rows: Sequence[ExposureRow], arm: ArmTrack
-) -> ExposurePoses:
-    """Take the pose from exposures whose id is that of another count, as times show.
-
-    A device that was switched off counts from its first trigger again. Where times are of one
-    clock, they then lie seconds apart from those of equal ids before. Of clocks that have nothing
-    in common, and of times that do not move as those of the arm, nothing is concluded.
-    """
-    matched = np.flatnonzero(poses.sample >= 0)
-    times = np.array([row.t_ns for row in rows], dtype=np.int64)[matched]
-    order = np.argsort(times, kind="stable")
-    matched, times = matched[order], times[order]
-    of_arm = arm.t_ns[poses.sample[matched]]
-    apart = times - of_arm
-    if not (np.abs(apart) <= ARRIVED_TOGETHER_NS).any():
-        return poses
-    lag = max(1, min(LAG, len(matched) // 4))
-    error, step = (
-        float(np.median(np.abs(one[lag:] - one[:-lag]))) if len(one) > lag else 0.0
-        for one in (apart, of_arm)
-    )
-    if error > 0.5 * step:
-        return poses
-    most = max(float(ARRIVED_TOGETHER_NS), TIME_SCATTERS * error)
-    is_other = np.zeros(len(rows), dtype=np.bool_)
-    usual, since = 0, int(times[0])
-    for row, now, one in zip(matched.tolist(), times.tolist(), apart.tolist(), strict=True):
-        is_other[row] = min(abs(one), abs(one - usual)) > most + DRIFT * (now - since)
-        if not is_other[row]:
-            usual, since = one, now
-    if not is_other.any():
-        return poses
-    farthest = np.abs(apart[is_other[matched]]).max() / 1e9
-    text = (
-        f"{is_other.sum()} exposures lie up to {farthest:.1f} s from the arm sample of their "
-        "trigger id, others of the scan do not: a count of triggers began anew, and they get no "
-        "pose; where the ids are right, correct the times"
-    )
-    poses = replace(poses, warnings=(*poses.warnings, text))
-    return _taken_from(poses, is_other, PoseStatus.UNKNOWN_TRIGGER)
 
 
 def _times_apart(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -66,8 +67,23 @@ def test_an_arm_without_ids_is_told_of_once_images_bear_some() -> None:
     assert watch.see_samples([sample(21, None)]) == ""
     assert watch.see_samples([sample(25, None)]) == SAMPLES_WITHOUT
     assert watch.see_samples([sample(26, None), sample(26, 7)]) == IDS_APART
-    assert watch.see_samples([sample(40, 1)]) == ""
+    # of one id, and of triggers ten seconds apart
+    other = MatchedInstant((frame(20, 1),), None, (), 1, None, PoseStatus.UNKNOWN_TRIGGER)
+    watch.see_pair(other)
+    assert watch.see_samples([sample(40, 1)]) == IDS_APART
+    watch.see_pair(replace(other, status=PoseStatus.UNKNOWN_SAMPLE))
     assert watch.see_samples([sample(41, 8)]) == ""
+
+
+def test_a_watch_that_runs_for_days_does_not_grow() -> None:
+    watch = IdWatch(is_triggered=True, has_controller=True)
+    tracemalloc.start()
+    for k in range(5_000):
+        watch.see_frame(frame(k, k), 0)
+        watch.see_samples([sample(k, k + 10**6)])
+    n_bytes = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert n_bytes < 20_000
 
 
 def test_lasers_that_are_never_known_are_told_of() -> None:
@@ -120,21 +136,29 @@ class Dated(Device):
 
 
 def told_of(
-    frames: list[Frame], samples: list[ArmSample] | None = None, *, has_lasers: bool = False
+    frames: list[Frame],
+    samples: list[ArmSample] | None = None,
+    *,
+    has_lasers: bool = False,
+    is_arm_first: bool = False,
 ) -> set[tuple[str, str]]:
-    """Warnings of a session that reads frames, then samples of the arm."""
+    """Warnings of a session that reads frames, then samples of the arm, or the other way."""
     arm = None if samples is None else Dated("arm", [])
     lasers = Dated("lasers", []) if has_lasers else None
     description = RigDescription(("c",), is_common_trigger=arm is not None)
-    rig: Any = Rig([Dated("camera 0", list(frames))], arm, lasers, description)  # type: ignore[list-item, arg-type]
+    camera = Dated("camera 0", [] if is_arm_first else list(frames))
+    rig: Any = Rig([camera], arm, lasers, description)  # type: ignore[list-item, arg-type]
     session = LiveSession(rig, options=ALL)
     told: list[LiveEvent] = []
     session.add_listener(told.append)
     session.open()
-    waited(lambda: session.stream_counts[0].n_elements == len(frames))
+    waited(lambda: is_arm_first or session.stream_counts[0].n_elements == len(frames))
     if arm is not None and samples:
         arm.elements = [(one,) for one in samples]
         waited(lambda: session.stream_counts[1].n_elements == len(samples))
+    if is_arm_first:
+        camera.elements = list(frames)
+        waited(lambda: session.stream_counts[0].n_elements == len(frames))
     session.stop()
     return {(one.text, one.device) for one in told if one.kind == "warning"}
 
@@ -156,7 +180,11 @@ def test_a_session_tells_of_an_arm_without_ids() -> None:
     frames = [Frame(IMAGE, k, t_ns, t_ns, trigger_id=k) for k, t_ns in enumerate(when[:1])]
     samples = [ArmSample(k, t_ns, t_ns) for k, t_ns in enumerate(when)]
     assert told_of(frames, samples) == {(SAMPLES_WITHOUT, "arm")}
-    assert told_of(frames, [replace(one, trigger_id=one.number) for one in samples]) == set()
+    with_ids = [replace(one, trigger_id=one.number) for one in samples]
+    assert told_of(frames, with_ids, is_arm_first=True) == set()
+    # counts that were apart from the start
+    begun = [replace(one, trigger_id=one.number + 3) for one in frames]
+    assert told_of(begun, with_ids) == {(IDS_APART, "arm")}
 
 
 @pytest.mark.parametrize(("is_common_trigger", "said"), [(True, set()), (False, {TIMES_APART})])

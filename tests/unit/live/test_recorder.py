@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import time
+import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,7 @@ from armscan.jobs.info import describe_recording
 from armscan.models.arm import forward, thesis_arm
 from armscan.pipeline.instants import group_instants
 from armscan.pipeline.live.acquire import LiveEvent
-from armscan.pipeline.live.recorder import LiveRecorder
+from armscan.pipeline.live.recorder import CommonIds, LiveRecorder
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.live.session import LiveSession
 from armscan.pipeline.scan import ScanOptions, measure_scan
@@ -35,6 +37,7 @@ from armscan.storage.tables import read_csv
 from rigs.scan_fake import scanner
 from unit.live.test_session import ALL, Device, rig_of, triggered_scan, waited
 
+Count = Callable[[int], int | None]
 IMAGES = np.random.default_rng(1).integers(0, 255, (6, 12, 16)).astype(np.uint8)
 
 
@@ -56,6 +59,10 @@ def instant(k: int, t_ns: int | None, **changes: Any) -> MatchedInstant:
         Frame(IMAGES[k], k, 10**15 + k, 5_000_000_000 + 10_000_000 * k, trigger_id=k + 3), **changes
     )
     return MatchedInstant((frame,), t_ns, ("A",), k + 3, None, PoseStatus.NO_TIME)
+
+
+FRAME = Frame(IMAGES[0], 0, 1, 10**10)
+TIMED = MatchedInstant((FRAME,), 10**10, (), 1, None, PoseStatus.UNKNOWN_TRIGGER)
 
 
 def test_a_session_that_was_recorded_gives_the_points_that_were_shown(tmp_path: Path) -> None:
@@ -254,6 +261,130 @@ def test_counts_that_both_begin_anew_give_the_poses_that_were_shown(tmp_path: Pa
     assert shown == [0, 1, 2, 5, 6, 7, 8, 9, 10, 11]
     assert poses.has_pose.all() and poses.translations_mm[:, 0].tolist() == shown
     assert recorded.warnings == poses.warnings == ()
+
+
+def counted(
+    path: Path,
+    n: int,
+    arm_of: Count,
+    *cameras_of: Count,
+    late_ns: Callable[[int], int] = lambda _: 0,
+    step_ns: int = 10**8,
+) -> tuple[LiveRecorder, list[int], list[list[int]]]:
+    """A recording of n triggers, by what id each device gives to each of them.
+
+    Returns of which triggers an image had a pose when it was shown, and then by camera.
+    """
+    cameras: Any = [Device("camera", [], setup=CameraSetup(16, 12)) for _ in cameras_of]
+    arm: Any = Device("arm", [], pose_form="quaternion")
+    names = tuple(map(str, range(len(cameras))))
+    rig = Rig(cameras, arm, None, RigDescription(names, is_common_trigger=True))
+    recorder = LiveRecorder(path, rig)
+    recorder.begin()
+    matcher = InstantMatcher(len(cameras), is_triggered=True, has_controller=False)
+    shown: list[int] = []
+    begun_ns = 10**10
+    elements: list[tuple[Any, int]] = []
+    for k in range(n):
+        t_ns = begun_ns + step_ns * k
+        pose = Pose[Base, Tool](np.eye(3), np.array([float(k), 0.0, 0.0]))
+        host_ns = t_ns + 5_000_000 + late_ns(k)
+        elements.append((ArmSample(k, t_ns, host_ns, pose, trigger_id=arm_of(k)), -1))
+        for camera, id_of in enumerate(cameras_of):
+            if id_of(k) is not None:
+                frame = Frame(IMAGES[camera], k, t_ns, t_ns + 6_000_000, trigger_id=id_of(k))
+                elements.append((frame, camera))
+    elements.sort(key=lambda element: element[0].t_host_ns)
+    for one, camera in elements:
+        if isinstance(one, ArmSample):
+            recorder.add_samples(matcher.add_samples((one,)))
+        else:
+            matcher.add_frame(one, camera)
+        is_last = one is elements[-1][0]
+        for instant in matcher.take(one.t_host_ns + is_last * 10**9):
+            recorder.add_instant(instant)
+            if instant.pose is not None:
+                shown.append(round(instant.pose.translation_mm[0]))
+    recorder.close()
+    if not recorder.n_samples or recorder.unplaced[0]:
+        return recorder, shown, [[] for _ in cameras]
+    recorded = read_recording(path)
+    poses = exposure_poses(recorded.rows, recorded.arm, recorded.session.clock)
+    posed: list[list[int]] = [[] for _ in cameras]
+    for row in np.flatnonzero(poses.has_pose):
+        true = round((recorded.rows[row].t_ns - begun_ns) / step_ns)
+        assert round(poses.translations_mm[row, 0]) == true
+        posed[recorded.rows[row].camera].append(true)
+    return recorder, shown, posed
+
+
+OTHER_COUNTS: list[tuple[str, Count, Count, int]] = [
+    ("sound", lambda k: k, lambda k: k, 160),
+    ("camera away, then counts anew",
+     lambda k: k, lambda k: k if k < 40 else None if k < 70 else k - 70, 40),
+    ("both count anew", lambda k: k % 80, lambda k: None if 40 <= k < 60 else k % 80, 140),
+    ("the arm counts anew", lambda k: k % 80, lambda k: k, 80),
+    ("the camera counts anew", lambda k: k, lambda k: k % 80, 80),
+    ("16 bits", lambda k: (k + 65456) % 65536, lambda k: (k + 65456) % 65536, 160),
+    ("the camera is behind", lambda k: k + 50, lambda k: k, 0),
+    ("the camera is ahead", lambda k: k, lambda k: k + 50, 0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arm_of", "camera_of", "n_posed"),
+    [pytest.param(*given, id=name) for name, *given in OTHER_COUNTS],
+)
+def test_an_id_of_another_count_gives_no_pose(
+    arm_of: Count, camera_of: Count, n_posed: int, tmp_path: Path
+) -> None:
+    recorder, shown, posed = counted(tmp_path / "scan.mcap", 160, arm_of, camera_of)
+    assert posed == [shown] and len(shown) == n_posed
+    words, _ = recorder.unplaced
+    assert words.startswith("no trigger's id is that of an image") != bool(n_posed)
+    n_other = recorder.n_of_other_count + recorder.n_samples_of_other_count
+    assert (n_other > 0) == (n_posed < 100)
+
+
+def test_counts_that_were_apart_by_a_second_are_told_by_clocks_that_are_known(
+    tmp_path: Path,
+) -> None:
+    counts: tuple[Count, Count] = (lambda k: k, lambda k: k + 100)
+    recorder, shown, _ = counted(tmp_path / "scan.mcap", 200, *counts, step_ns=12_500_000)
+    assert shown == [] and recorder.unplaced[0].startswith("no trigger's id is that of an image")
+
+
+def test_a_camera_that_counts_otherwise_takes_no_pose_from_the_other_one(tmp_path: Path) -> None:
+    cameras: tuple[Count, Count] = (lambda k: k, lambda k: k + 50)
+    recorder, shown, posed = counted(tmp_path / "scan.mcap", 160, lambda k: k, *cameras)
+    assert len(shown) == 160 and posed[1] == []
+    # but for the ids that it bore before its clock was known
+    assert len(posed[0]) == 160 - recorder.n_samples_of_other_count >= 160 - 32
+
+
+@pytest.mark.parametrize("since", [0, 60])
+def test_samples_that_come_late_keep_their_ids(since: int, tmp_path: Path) -> None:
+    """Up to 1.9 s, before clocks are known and after: no pose is shown, and all have one."""
+
+    def late(k: int) -> int:
+        return 1_900_000_000 - 10**8 * (k - since) if 0 <= k - since < 19 else 0
+
+    path = tmp_path / "scan.mcap"
+    recorder, shown, posed = counted(path, 160, lambda k: k, lambda k: k, late_ns=late)
+    assert posed == [list(range(160))] and len(shown) < 150
+    assert recorder.n_of_other_count == recorder.n_samples_of_other_count == 0
+
+
+def test_ids_are_kept_in_eight_bytes_a_device() -> None:
+    ids, n = CommonIds(), 20_000
+    sample = ArmSample(0, 1, 10**10)
+    one = TimedSample(sample, 10**10, ElementStatus.USABLE, None)
+    tracemalloc.start()
+    for k in range(n):
+        assert ids.see_sample(10**6 + k, one) and ids.see_frame(10**6 + k, FRAME, TIMED)
+    n_bytes = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert ids.is_found and n_bytes < 20 * n
 
 
 @pytest.mark.parametrize(

@@ -291,6 +291,11 @@ class _Recording:
                 "let the cameras tell the id, or record without is_common_trigger",
             ),
             (
+                recorder.n_of_other_count,
+                "they bear ids of samples of the arm that came long before or after",
+                "let camera and arm count the same triggers from the same one on",
+            ),
+            (
                 recorder.n_laser_unknown,
                 "it is not known what lasers were on",
                 "see that the laser controller answers, and use a schedule of one step or fewer "
@@ -470,6 +475,15 @@ class _Recording:
                 0,
                 f"{self._recorder.n_untriggered} exposures bear no trigger's id, as those before "
                 "the first trigger: they are listed, and get no pose",
+            )
+        n_images = self._recorder.n_of_other_count
+        n_samples = self._recorder.n_samples_of_other_count
+        if n_images or n_samples:
+            warnings.insert(
+                0,
+                f"{n_images} exposures and {n_samples} samples of the arm bear the id of another "
+                "trigger, as of a device that was switched off and counts anew: they are listed "
+                "without it, and such exposures get no pose",
             )
         if self._recorder.n_laser_unknown:
             warnings.insert(

@@ -59,8 +59,8 @@ SAMPLES_WITHOUT = (
     "send a sample with the id at each trigger, or leave is_common_trigger out"
 )
 IDS_APART = (
-    "no trigger's id of its samples is that of an image: no image gets a pose; let camera and arm "
-    "count the same triggers from the same one on, or leave is_common_trigger out"
+    "none of its samples came with the image of its trigger's id: no image gets a pose; let camera "
+    "and arm count the same triggers from the same one on, or leave is_common_trigger out"
 )
 LASERS_MIXED = (
     "what lasers were on is not known: the images bear no trigger's id, and the lasers change "
@@ -166,22 +166,6 @@ class _Stream:
     seen_ns: int = 0
 
 
-class CommonIds:
-    """Whether an id of a trigger came both with an image and with a sample of the arm."""
-
-    def __init__(self) -> None:
-        self._seen: tuple[set[int], set[int]] = (set(), set())
-        self.is_found = False
-
-    def see(self, trigger_id: int | None, *, is_arm: bool) -> None:
-        """Take what came."""
-        if trigger_id is None or self.is_found:
-            return
-        self._seen[is_arm].add(trigger_id)
-        if trigger_id in self._seen[not is_arm]:
-            self.is_found, self._seen = True, (set(), set())
-
-
 class IdWatch:
     """Looks at all that arrives and tells what will not be matched; called from one thread.
 
@@ -203,13 +187,12 @@ class IdWatch:
         self._cameras_with_ids: set[int] = set()
         self._triggered_ns: int | None = None
         self._has_arm_ids = False
-        self._ids = CommonIds()
+        self._has_sample = False
         self._unknown_ns: int | None = None
 
     def see_frame(self, frame: Frame, camera: int) -> str:
         """What a person should know of this camera now; empty for nothing."""
         begun_ns = self._begun_ns.setdefault(camera, frame.t_host_ns)
-        self._ids.see(frame.trigger_id, is_arm=False)
         if frame.trigger_id is not None:
             self._cameras_with_ids.add(camera)
             if self._triggered_ns is None:
@@ -221,9 +204,8 @@ class IdWatch:
         """The same of the arm."""
         for one in samples:
             self._has_arm_ids |= one.trigger_id is not None
-            self._ids.see(one.trigger_id, is_arm=True)
         since_ns = self._triggered_ns
-        if not self._is_triggered or self._ids.is_found or since_ns is None or not samples:
+        if not self._is_triggered or self._has_sample or since_ns is None or not samples:
             return ""
         text = IDS_APART if self._has_arm_ids else SAMPLES_WITHOUT
         return text if samples[-1].t_host_ns > since_ns + WATCHED_NS else ""
@@ -242,7 +224,8 @@ class IdWatch:
         return LASERS_MIXED if instant.are_lasers_mixed else LASERS_UNTOLD
 
     def see_pair(self, instant: MatchedInstant) -> str:
-        """What a person should know of the times of two cameras."""
+        """What a person should know of the times of two cameras; sees whether the arm's ids fit."""
+        self._has_sample |= instant.has_sample
         first, *others = (frame for frame in instant.frames if frame is not None)
         if not others:
             return ""

@@ -6,6 +6,7 @@ events with the devices' own counts and times.
 from __future__ import annotations
 
 import time
+from array import array
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -15,11 +16,17 @@ from typing import Any
 import numpy as np
 
 from armscan.devices.clocks import ElementStatus
-from armscan.devices.matching import MatchedInstant, TimedSample
+from armscan.devices.matching import (
+    ARRIVED_TOGETHER_NS,
+    SAME_COUNT_NS,
+    SAME_TRIGGER_NS,
+    MatchedInstant,
+    TimedSample,
+)
 from armscan.devices.protocols import Frame, LaserEvent
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray
-from armscan.pipeline.live.acquire import CommonIds, LiveEvent
+from armscan.pipeline.live.acquire import LiveEvent
 from armscan.pipeline.live.rig import Rig
 from armscan.records.recording import (
     LASER_UNKNOWN,
@@ -37,6 +44,63 @@ from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions
 BATCH_NS = 100_000_000
 """Samples of the arm are written so many together."""
 _REPEATED = (ElementStatus.DUPLICATE, ElementStatus.LATE)
+_PAGE = 256
+
+
+class CommonIds:
+    """Tells which ids of triggers came with an image and with a sample of the arm of one trigger.
+
+    Counts differ where a device was switched off. What bears one id is of one trigger if the later
+    time is within `SAME_COUNT_NS` of the other, or, where its clock is not known and it is that of
+    arrival, within `ARRIVED_TOGETHER_NS`. Of each id eight bytes are kept for images and as many
+    for samples: the first time, negative if of arrival.
+    """
+
+    def __init__(self) -> None:
+        self._first_ns: tuple[dict[int, array[int]], dict[int, array[int]]] = ({}, {})
+        self._arm_id = self._arm_ns = -1
+        self.is_found = False
+
+    def see_sample(self, trigger_id: int, one: TimedSample) -> bool:
+        """Take a sample; False if an image bears its id from another count."""
+        self._arm_id, self._arm_ns = trigger_id, -1 if one.t_ns is None else one.t_ns
+        return self._see(trigger_id, one.t_ns, one.sample.t_host_ns, is_arm=True)
+
+    def see_frame(self, trigger_id: int, frame: Frame, instant: MatchedInstant) -> bool:
+        """Take an image; False if the arm's count is another."""
+        t_ns = instant.t_ns
+        # of one count no later sample bears a lesser id
+        is_ahead = t_ns is not None and self._arm_ns > t_ns + SAME_TRIGGER_NS
+        if is_ahead and self._arm_id < trigger_id:
+            return False
+        is_known = instant.has_sample
+        return self._see(trigger_id, t_ns, frame.t_host_ns, is_arm=False, is_known=is_known)
+
+    def _see(
+        self,
+        trigger_id: int,
+        t_ns: int | None,
+        t_host_ns: int,
+        *,
+        is_arm: bool,
+        is_known: bool = False,
+    ) -> bool:
+        page, place = divmod(trigger_id, _PAGE)
+        now = -max(t_host_ns, 1) if t_ns is None else max(t_ns, 1)
+        own, others = self._first_ns[is_arm], self._first_ns[not is_arm]
+        first = others[page][place] if page in others else 0
+        if first:
+            late_ns = abs(now) - abs(first)
+            is_arrival = (now if late_ns > 0 else first) < 0
+            most_ns = ARRIVED_TOGETHER_NS if is_arrival else SAME_COUNT_NS
+            if not is_known and abs(late_ns) > most_ns:
+                return False
+            self.is_found = True
+        times = own.get(page)
+        if times is None:
+            times = own[page] = array("q", bytes(8 * _PAGE))
+        times[place] = times[place] or now
+        return True
 
 
 class LiveRecorder:
@@ -68,6 +132,10 @@ class LiveRecorder:
     n_untriggered
         Frames without a trigger's id where ids decide, as before the first trigger: they are
         listed, and get no pose.
+    n_of_other_count, n_samples_of_other_count
+        Frames that bear the id of a sample of another time, and samples that bear that of a frame:
+        a device was switched off, or counts from elsewhere. They are listed without id, and the
+        frames get no pose.
     n_laser_unknown
         Frames of which it is not known what lasers were on: they are listed, and not measured.
     n_samples, n_posed
@@ -77,6 +145,7 @@ class LiveRecorder:
     def __init__(self, path: Path, rig: Rig, *, options: WriterOptions | None = None) -> None:
         self.n_usable = self.n_aside = self.n_untriggered = self.n_laser_unknown = 0
         self.n_samples = self.n_posed = 0
+        self.n_of_other_count = self.n_samples_of_other_count = 0
         self._writer = RecordingWriter(path, options)
         self._rig, self._is_triggered = rig, rig.description.is_common_trigger
         self._is_free = rig.description.is_free
@@ -154,7 +223,7 @@ class LiveRecorder:
             ),
             (
                 self._is_triggered and not self._ids.is_found,
-                "no trigger's id is that of an image and of a sample of the arm",
+                "no trigger's id is that of an image and of a sample of the arm that came with it",
                 "let camera and arm count the same triggers from the same one on, or record "
                 "without is_common_trigger",
             ),
@@ -233,11 +302,12 @@ class LiveRecorder:
         if number < self._arm_id:
             self._ids_from = self._highest_id + 1
         self._arm_id = number
-        self._highest_id = max(self._highest_id, self._ids_from + number)
-        self._ids.see(self._ids_from + number, is_arm=True)
-        if not self._ids_from:
-            return one
-        return replace(one, sample=replace(one.sample, trigger_id=self._ids_from + number))
+        trigger_id = self._ids_from + number
+        self._highest_id = max(self._highest_id, trigger_id)
+        if self._ids.see_sample(trigger_id, one):
+            return replace(one, sample=replace(one.sample, trigger_id=trigger_id))
+        self.n_samples_of_other_count += 1
+        return replace(one, sample=replace(one.sample, trigger_id=None))
 
     def add_events(self, events: tuple[LaserEvent, ...]) -> None:
         """Keep what was on, with the controller's own count and times."""
@@ -252,9 +322,10 @@ class LiveRecorder:
 
     def add_instant(self, instant: MatchedInstant) -> None:
         """Write its images."""
-        for camera, frame in enumerate(instant.frames):
-            if frame is None:
+        for camera, delivered in enumerate(instant.frames):
+            if delivered is None:
                 continue
+            frame = delivered
             # where ids decide, or there is no arm, a time orders the exposures and places nothing
             may_guess = self._is_triggered or self._rig.arm is None
             t_ns = frame.t_host_ns if instant.t_ns is None and may_guess else instant.t_ns
@@ -266,6 +337,10 @@ class LiveRecorder:
             if self._is_triggered and frame.trigger_id is None:
                 flags.append(UNTRIGGERED)
                 self.n_untriggered += 1
+            elif is_usable and self._is_of_other_count(frame, instant):
+                frame = replace(frame, trigger_id=None)
+                flags.append(UNTRIGGERED)
+                self.n_of_other_count += 1
             if instant.lasers is None and self._rig.lasers is not None:
                 flags.append(LASER_UNKNOWN)
                 self.n_laser_unknown += is_usable
@@ -273,6 +348,11 @@ class LiveRecorder:
             lasers = instant.lasers or ()
             is_listed = self._add(camera, frame, t_ns if is_usable else None, lasers, flags)
             self.n_usable += is_listed and spoiled.isdisjoint(flags)
+
+    def _is_of_other_count(self, frame: Frame, instant: MatchedInstant) -> bool:
+        if not self._is_triggered or self._rig.arm is None or frame.trigger_id is None:
+            return False
+        return not self._ids.see_frame(self._ids_from + frame.trigger_id, frame, instant)
 
     def _add(
         self,
@@ -294,7 +374,6 @@ class LiveRecorder:
             self._highest_id = max(self._highest_id, trigger_id)
         if t_ns is not None:
             self._first_ns = min(self._first_ns, t_ns)
-            self._ids.see(trigger_id, is_arm=False)
         row = ExposureRow(
             self._index,
             last_ns if t_ns is None else t_ns,

@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from armscan.devices.clocks import ElementStatus, StreamMonitor
+from armscan.devices.clocks import LARGEST_DRIFT, ElementStatus, StreamMonitor
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.arm import ArmModel, forward
@@ -182,7 +182,7 @@ class InstantMatcher:
         self._steps: deque[int] = deque(maxlen=USUAL_STEPS)
         self._pose_of: dict[int, _Told[Pose[Base, Tool] | None]] = {}
         self._lasers_of: dict[int, _Told[tuple[str, ...]]] = {}
-        self._apart_ns: dict[tuple[int, int], int] = {}
+        self._apart_ns: dict[tuple[int, int], tuple[int, int]] = {}
         self._events: deque[tuple[int, tuple[str, ...]]] = deque(maxlen=USUAL_STEPS)
         self._frame_step_ns = 0.0
         self._n_taken = 0
@@ -344,13 +344,15 @@ class InstantMatcher:
         camera, frame = next((k, f) for k, f in enumerate(one.frames) if f is not None)
         pair, apart_ns = (id(of_trigger), camera), frame.t_device_ns - found.t_device_ns
         if pair in self._apart_ns:
-            is_same = abs(apart_ns - self._apart_ns[pair]) <= SAME_TRIGGER_NS
+            before_ns, then_ns = self._apart_ns[pair]
+            drifted_ns = 2.0 * LARGEST_DRIFT * abs(frame.t_device_ns - then_ns)
+            is_same = abs(apart_ns - before_ns) <= SAME_TRIGGER_NS + drifted_ns
         elif one.t_ns is not None and found.t_ns is not None:
             is_same = abs(one.t_ns - found.t_ns) <= SAME_COUNT_NS
         else:
             is_same = abs(one.newest_host_ns - found.t_host_ns) <= ARRIVED_TOGETHER_NS
         if is_same:
-            self._apart_ns[pair] = apart_ns
+            self._apart_ns[pair] = apart_ns, frame.t_device_ns
         return found if is_same else None
 
     def _is_told(self, of_trigger: dict[int, _Told[T]], one: _Open) -> bool:

@@ -234,6 +234,21 @@ def test_a_frame_whose_middle_is_not_certain_has_no_time_and_tells_nothing_of_th
     assert matcher.cameras[0].counts.words == ""
 
 
+def test_after_a_pause_in_which_two_clocks_ran_apart_poses_are_found_again():
+    """80 parts in a million over an hour are 0.29 s."""
+    matcher = InstantMatcher(is_triggered=True, has_controller=False)
+    instants = []
+    for k in range(120):
+        t_ns = 10**9 + round(1e9 * (k / 80 + (3600.0 if k >= 60 else 0.0)))
+        pose = Pose(np.eye(3), np.array([k, 0.0, 0.0]))
+        stamp_ns = t_ns + round(8e-5 * t_ns)
+        matcher.add_frame(Frame(IMAGE, k, stamp_ns, t_ns + 4_000_000, trigger_id=k))
+        matcher.add_samples((ArmSample(k, t_ns, t_ns + 5_000_000, pose=pose, trigger_id=k),))
+        instants += matcher.take(t_ns + 5_000_000)
+    instants += matcher.take(10**13)
+    assert [one.pose is not None for one in instants] == [True] * 120
+
+
 def test_trigger_ids_alone_decide_where_there_are_any():
     matcher = InstantMatcher(is_triggered=True)
     kinds = ("frame", "triggered", "event")

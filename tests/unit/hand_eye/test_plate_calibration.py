@@ -185,3 +185,12 @@ def test_a_plate_solved_along_needs_no_probing() -> None:
     found = fit.calibration.plate
     assert found is not None
     assert abs(float(found.distance_mm(plate.plane.point_mm[None])[0])) < 1e-8
+
+
+def test_tilts_of_postures_are_those_of_the_rig() -> None:
+    postures = good_postures(6, np.random.default_rng(3))
+    drawn = PlateRig(postures, points_per_stripe=40).draw(1)
+    fit = calibrate_on_plate(*drawn, HandEyeOptions(arm_position_mm=0.006))
+    assert isinstance(fit, HandEyeFit)
+    told = [posture.tilt_deg for posture in fit.postures]
+    assert told == pytest.approx(np.degrees(postures.tilt), abs=0.2)

@@ -423,3 +423,31 @@ def test_points_of_unlike_noise_that_is_stated_rightly_widen_nothing() -> None:
     cloud = replace(cloud_of(points + up * noise, exposure, sigma_mm=1e-4), sheet=sheet)
     assert _unstated_mm2(noise[:, 0], cloud, np.arange(len(points)), told_mm**2) == 0.0
     assert _unstated_mm2(3.0 * noise[:, 0], cloud, np.arange(len(points)), told_mm**2) > 0.0
+
+
+def test_what_the_arm_errs_alike_at_all_postures_is_in_sigma() -> None:
+    """As the fitted ball grows by where all points are moved along one axis of the head each."""
+    arm_mm, outward, exposure = 0.016, ball_stripes(16, 30), np.repeat(np.arange(16), 30)
+    towards = np.array([outward[exposure == k].mean(axis=0) for k in range(16)])
+    towards /= np.linalg.norm(towards, axis=1)[:, None]
+    across = np.cross(towards, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    turns = np.stack([np.cross(across, -towards), across, -towards], axis=2)
+    errors = CalibrationErrors(
+        turns=turns,
+        middle=np.zeros((1, 2)),
+        half_width=np.ones((1, 2)),
+        modes_mm=np.zeros((1, len(FIELD_POWERS), 3, 1)),
+        arm_mm=arm_mm,
+    )
+    points = RADIUS_MM * outward
+    plain = cloud_of(points, exposure, sigma_mm=1e-4, noise_mm=1e-4, noise_along=outward)
+    cloud = replace(plain, seen_from_mm=150.0 * towards, calibration_errors=errors)
+    grown = []
+    for k in range(3):
+        moved = fit_sphere(points + arm_mm * turns[exposure][:, :, k])
+        assert not isinstance(moved, FitFailure)
+        grown.append(2.0 * (moved.value.radius_mm - RADIUS_MM))
+    found = inspect_sphere(cloud, 2 * RADIUS_MM)
+    assert not isinstance(found, FitFailure)
+    assert found.diameter.sigma_mm == pytest.approx(np.linalg.norm(grown), rel=0.05)

@@ -263,3 +263,17 @@ def test_scores_that_correlate_scatter_more():
     assert score_sigma(np.convolve(white, np.ones(8), "valid"), 60) == pytest.approx(
         8 * np.sqrt(4000), rel=0.15
     )
+
+
+def test_the_drift_of_shared_clocks_is_told_with_sign_and_size():
+    fit, _ = fitted(LatencyCase(drift=150e-6, seconds=6.0, camera_hz=40.0), 6)
+    assert abs(fit.drift - 150e-6) < 4.0 * fit.sigma_drift < 100e-6
+
+
+def test_sigma_of_a_drift_is_the_latencys_over_the_spread_of_times():
+    """Of a line through points of equal weight; what the arm errs alike makes it somewhat wider."""
+    case = LatencyCase(
+        drift=120e-6, separate_ns=4 * 10**14, arm_hz=333.0, seconds=6.0, camera_hz=40.0
+    )
+    fit, _ = fitted(case, 5, is_shared=False)
+    assert 0.7 < fit.sigma_drift / (fit.sigma_ns / np.std(fit.t_ns)) < 1.5

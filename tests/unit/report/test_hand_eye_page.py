@@ -137,3 +137,10 @@ def test_repeats_are_tabled_with_mean_and_scatter() -> None:
     assert float(rows["standard deviation"][3]) == pytest.approx(0.02, abs=1e-4)
     assert float(rows["predicted"][3]) == pytest.approx(0.015, abs=1e-4)
     assert "theta_deg" in text.text
+
+
+def test_sizes_of_a_hand_eyes_sigmas_are_root_mean_squares() -> None:
+    covariance = np.diag([1e-8, 4e-8, 4e-8, 1e-4, 4e-4, 4e-4])
+    numbers = hand_eye_numbers(fake_fit()[0].calibration, covariance)
+    assert numbers.rotation_sigma_deg == pytest.approx(np.degrees(np.sqrt(3e-8)))
+    assert numbers.size_sigma_mm == pytest.approx(np.sqrt(3e-4))

@@ -422,3 +422,23 @@ def test_faces_without_points_and_with_too_few_are_told_apart() -> None:
     assert len(texts) == 2
     assert few not in texts[0]
     assert f"{few} (5 in all)" in texts[1]
+
+
+def test_noise_that_neighbours_share_counts_so_many_times() -> None:
+    """Nine points that err alike are one: U of their mean is three times as wide."""
+    points, up = top_points(2500), np.tile([0.0, 0.0, 1.0], (2500, 1))
+    alone = cloud_of(points, np.arange(2500) % 5, sigma_mm=1e-9, noise_mm=0.05, noise_along=up)
+    cloud = replace(alone, noise_length=np.full(2500, 9.0))
+    found = compare_with_part(BOX, cloud, align_none(cloud), CadOptions(), errors_known=True)
+    assert isinstance(found, CadComparison)
+    (face,) = (one for one in found.faces if one.statistics.n)
+    assert face.u_mean_mm == pytest.approx(2.0 * 0.05 * 3.0 / 50.0, rel=0.05)
+
+
+def test_u_of_a_point_holds_the_alignment() -> None:
+    cloud = cloud_of(top_points(200), sigma_mm=0.01)
+    moved = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 0.03**2])
+    place = replace(align_none(cloud), step_covariance=moved)
+    found = compare_with_part(BOX, cloud, place, CadOptions(), errors_known=True)
+    assert isinstance(found, CadComparison)
+    assert found.u_mm == pytest.approx(np.full(200, 2.0 * math.hypot(0.01, 0.03)))

@@ -507,3 +507,28 @@ def test_markers_at_equal_distances_are_not_guessed() -> None:
     )
     assert isinstance(found, FitFailure)
     assert "matched" in found.reason
+
+
+def test_both_lists_of_markers_err() -> None:
+    """Each has 0.01 mm an axis."""
+    ids = list(range(1, len(NOMINAL) + 1))
+    measured = markers(TRUE.inverse().apply(NOMINAL), ids, "Base")
+    found = paired_markers(markers(NOMINAL, ids, "Cad"), measured, by_number=True)
+    assert isinstance(found, ReferencePoints)
+    assert found.covariance_mm2 == pytest.approx(np.tile(2e-4 * np.eye(3), (len(ids), 1, 1)))
+
+
+def test_sigma_of_a_plane_datum_by_hand() -> None:
+    """A plane has three motions, each of which the points' mean tells to noise / sqrt(n)."""
+    points, normals, _ = scan(0)
+    cloud = cloud_of(
+        BACK.apply(points),
+        np.arange(len(points)) % 7,
+        sigma_mm=1e-9,
+        noise_mm=0.02,
+        noise_along=BACK.rotate(normals),
+    )
+    found = align_features(SURFACE, cloud, DATUMS, started())
+    assert not isinstance(found, FitFailure)
+    first = found.datums[0]
+    assert first.sigma_mm == pytest.approx(0.02 * np.sqrt(3.0 / first.n_points), rel=0.1)

@@ -269,16 +269,16 @@ class TwinRig:
         settings = self.settings[camera]
         nominal_us = 1e6 * self.twin.instrument.mechanics.exposure_s
         longer = (settings.exposure_us or nominal_us) / nominal_us
-        brighter = longer * 10.0 ** ((settings.gain_db or 0.0) / 20.0)
+        gain = 10.0 ** ((settings.gain_db or 0.0) / 20.0)
         window = None
         if settings.size_px is not None:
             corner = settings.window or SensorWindow()
             window = Window(corner.x_px, corner.y_px, *settings.size_px)
-        if brighter == 1.0 and window is None:
+        if longer == gain == 1.0 and window is None:
             return stage.scan
-        key = (stage.scene, brighter, window)
+        key = (stage.scene, longer, gain, window)
         if key not in self._lit:
-            self._lit[key] = stage.scan.as_set(brighter, window)
+            self._lit[key] = stage.scan.as_set(longer, gain, window)
         return self._lit[key]
 
     def setup(self, camera: int) -> CameraSetup:

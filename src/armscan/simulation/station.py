@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from armscan.errors import InputError
 from armscan.geometry.arrays import ArrayRecord, FloatArray, ImageArray, floats
 from armscan.geometry.poses import Base, Board, Points, Pose, Sensor
+from armscan.geometry.rotations import slerp
 from armscan.records.exposure import Exposure, SensorWindow, window_of_sensor
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session, SessionKind
 from armscan.simulation.head import Head, MountedCamera, Window
@@ -37,6 +38,8 @@ from armscan.simulation.optics.stray_light import stray_lights
 from armscan.simulation.optics.stripe_light import PosedView, band_light, lit_pixels, look
 
 _RAY_TOLERANCE = 1e-10
+_MOST_POSES = 16
+"""Of one exposure, however long."""
 _CENTRE_SIGMAS = 2.0
 """A sheet's centre is looked for among pixels so near to it; at edges among all."""
 ROOM = RoomLight(even=0.6, direct=0.4, position_mm=(350.0, -400.0, 900.0), up=(0.0, 0.0, 1.0))
@@ -450,11 +453,20 @@ class TwinScan:
             view=shot.row.view,
         )
 
-    def as_set(self, brighter: float, window: Window | None) -> TwinScan:
-        """The scan by cameras that gather more light, and read another part of the sensor."""
-        head = self.head
+    def as_set(self, longer: float, gain: float, window: Window | None) -> TwinScan:
+        """The scan with so many times the exposure time and gain, and another part read.
+
+        The amplifier comes after all noise but that of rounding.
+        """
+        head, brighter = self.head, longer * gain
         lasers = tuple(replace(one, irradiance=brighter * one.irradiance) for one in head.lasers)
-        imaging = replace(head.imaging, ambient=brighter * head.imaging.ambient)
+        detector = replace(
+            head.imaging.detector,
+            electrons_per_level=head.imaging.detector.electrons_per_level / gain,
+            read_noise=head.imaging.detector.read_noise * gain,
+        )
+        ambient = brighter * head.imaging.ambient
+        imaging = replace(head.imaging, ambient=ambient, detector=detector)
         shots = []
         for shot in self.shots:
             light = shot.settings.room_light
@@ -463,9 +475,9 @@ class TwinScan:
                 window=window or shot.settings.window,
                 room_light=None if light is None else brighter * light,
             )
-            shots.append(replace(shot, settings=settings))
-        brighter_head = replace(head, lasers=lasers, imaging=imaging)
-        return replace(self, head=brighter_head, shots=tuple(shots))
+            poses = _over_time(shot.sub_poses, longer)
+            shots.append(replace(shot, settings=settings, sub_poses=poses))
+        return replace(self, head=replace(head, lasers=lasers, imaging=imaging), shots=tuple(shots))
 
     def true_pose(self, row: int) -> Pose[Base, Sensor]:
         """Where the head truly is in the middle of an exposure."""
@@ -499,6 +511,27 @@ class TwinScan:
             bits_used=self.head.imaging.detector.bits,
             colour="mono" if self.head.imaging.laser_colour is None else "rgb",
         )
+
+
+def _over_time(
+    poses: tuple[Pose[Base, Sensor], ...], longer: float
+) -> tuple[Pose[Base, Sensor], ...]:
+    """Poses over an exposure that is so many times as long, the motion being steady.
+
+    Of two poses, whose mean square is that of all; more of them where these lie far apart.
+    """
+    if not poses or longer == 1.0:
+        return poses
+    first, last = poses[0], poses[-1]
+    n = int(np.clip(np.ceil(longer), 2, _MOST_POSES))
+    reach = longer * np.sqrt(3.0 * (n - 1) / (n + 1))
+    shares = 0.5 + 0.5 * reach * np.linspace(-1.0, 1.0, n)
+    turned = slerp(np.tile(first.rotation, (n, 1, 1)), np.tile(last.rotation, (n, 1, 1)), shares)
+    way_mm = last.translation_mm - first.translation_mm
+    return tuple(
+        Pose(rotation, first.translation_mm + share * way_mm)
+        for rotation, share in zip(turned, shares, strict=True)
+    )
 
 
 CAMERA_FOLDERS = ("left", "right")

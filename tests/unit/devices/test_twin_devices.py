@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from armscan.devices.protocols import ArmFlag, ArmSample, CameraSettings, Frame,
 from armscan.devices.registry import open_device
 from armscan.errors import DeviceError, DeviceTakenError, OptionError
 from armscan.records.exposure import SensorWindow
-from armscan.simulation.live import TwinRig
+from armscan.simulation.live import TwinRig, _plan
+from armscan.simulation.station import exposure_light
+from armscan.simulation.twin import SceneStage
 
 PLACE = "twin:thesis-cross?scene=plate&preset=clean&pause=0.2&rate=20"
 SMALL = CameraSettings(window=SensorWindow(1400, 1000), size_px=(300, 100))
@@ -223,6 +226,57 @@ def test_a_longer_exposure_is_brighter(bench: Bench) -> None:
     assert bench.frames[0].exposure_ns > bench.frames[-1].exposure_ns == 250_000
     lit = first < 250
     assert 0.2 < last.astype(float).sum() / first.astype(float)[lit].sum() < 0.4
+
+
+@pytest.fixture
+def rig() -> Iterator[TwinRig]:
+    found = TwinRig(_plan("thesis-single?scene=plate")[0])
+    yield found
+    found.end()
+
+
+def variance_per_level(rig: TwinRig, gain_db: float) -> float:
+    """Slope of the photon transfer curve, from pairs of images of the standing plate."""
+    stage = SceneStage.of(rig.twin, "hand-eye")
+    row = next(k for k, shot in enumerate(stage.scan.shots) if not shot.sub_poses)
+    points = []
+    for brighter in (30.0, 60.0):
+        exposure_us = 1000.0 * brighter * 10.0 ** (-gain_db / 20.0)
+        rig.settings[0] = replace(SMALL, exposure_us=exposure_us, gain_db=gain_db)
+        scan = rig.scan_by(0, stage)
+        pair = [replace(scan, seed=(k,)).expose(row, ()).image.astype(float) for k in range(2)]
+        points.append((np.mean(pair), 0.5 * np.var(pair[1] - pair[0])))
+    (dark, dark_variance), (bright, bright_variance) = points
+    assert 60.0 < dark < 0.6 * bright < 110.0
+    return float((bright_variance - dark_variance) / (bright - dark))
+
+
+def test_gain_amplifies_the_noise_with_the_light(rig: TwinRig) -> None:
+    found = [variance_per_level(rig, gain_db) for gain_db in (0.0, 24.0)]
+    assert found[0] == pytest.approx(1.0 / 60.0, rel=0.1)
+    assert found[1] == pytest.approx(15.85 * found[0], rel=0.2)
+
+
+def test_a_longer_exposure_blurs_more(rig: TwinRig) -> None:
+    stage, places, squares = SceneStage.of(rig.twin, "plate"), [], []
+    for longer in (1.0, 8.0, 16.0):
+        rig.settings[0] = replace(SMALL, exposure_us=1000.0 * longer)
+        shot = rig.scan_by(0, stage).shots[3]
+        places.append(np.array([pose.translation_mm for pose in shot.sub_poses]))
+        light = exposure_light(
+            rig.twin.instrument.head, shot.station, shot.sub_poses,
+            shot.settings, np.random.default_rng(1),
+        )  # fmt: skip
+        column = light[:, 100:200].mean(axis=1).astype(float) - float(np.median(light))
+        rows = np.arange(len(column))
+        middle = column @ rows / column.sum()
+        squares.append(column @ (rows - middle) ** 2 / column.sum())
+    spread = [np.sqrt(np.var(one, axis=0).sum()) for one in places]
+    np.testing.assert_allclose(np.array(spread) / spread[0], [1.0, 8.0, 16.0], rtol=1e-6)
+    for one in places:
+        np.testing.assert_allclose(one.mean(axis=0), places[0].mean(axis=0), atol=1e-9)
+    # the mean square of the way of a steady motion grows with the square of its time
+    assert (squares[2] - squares[0]) / (squares[1] - squares[0]) == pytest.approx(255 / 63, rel=0.1)
 
 
 @pytest.mark.parametrize(

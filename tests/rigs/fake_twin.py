@@ -23,8 +23,8 @@ N_IMAGES = 6
 class FakeTruth:
     seed: int
 
-    def document(self) -> bytes:
-        return f'{{"simulated": true, "seed": {self.seed}}}\n'.encode()
+    def document(self, scene: str | None = None) -> bytes:
+        return f'{{"simulated": true, "seed": {self.seed}, "scene": "{scene}"}}\n'.encode()
 
 
 @dataclass(frozen=True)

@@ -117,8 +117,8 @@ class TwinTruth(Protocol):
     def workpiece_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
         """Distance (N,) of points (N, 3) in Base from its surface as it was made."""
 
-    def document(self) -> bytes:
-        """All of it as JSON, with the mark ``"simulated": true``."""
+    def document(self, scene: TwinScene | None = None) -> bytes:
+        """All of it as JSON, with the mark ``"simulated": true``; of a scene also what it adds."""
 
 
 class TrueStripe(Protocol):

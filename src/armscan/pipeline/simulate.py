@@ -544,7 +544,7 @@ def simulate_scene(
     part = Path(settings.part) if settings.part else None
     name = TwinName(head, settings.preset, settings.seed, part, settings.unit)
     twin = name.build()
-    beside = {truth: _truth_of(twin, part, settings.unit)}
+    beside = {truth: _truth_of(twin, scene, part, settings.unit)}
     if scene == "probing":
         n_touches = record_touches(folder, twin, beside)
         return SimulatedScene(folder, truth, 0, n_touches, twin.target)
@@ -563,14 +563,14 @@ def simulate_scene(
     )
 
 
-def _truth_of(twin: Twin, part: Path | None, unit: str) -> bytes:
-    """The truth's document; of a part that was given also which file it is, and its unit.
+def _truth_of(twin: Twin, scene: TwinScene, part: Path | None, unit: str) -> bytes:
+    """The truth's document for a scene; of a part that was given also which file it is, its unit.
 
     Its place is ``base_from_workpiece``.
     """
     if part is None:
-        return twin.truth.document()
-    content = json.loads(twin.truth.document())
+        return twin.truth.document(scene)
+    content = json.loads(twin.truth.document(scene))
     content["part"] = {**asdict(fingerprint(part)), "unit": unit}
     return json_bytes(content)
 

@@ -121,8 +121,11 @@ class InstrumentTruth:
         points = self.base_from_workpiece.inverse().apply(points_base_mm)
         return self.instrument.fixtures.workpiece.distance_mm(points)
 
-    def document(self) -> bytes:
-        """All of it as JSON, with the mark ``"simulated": true``."""
+    def document(self, scene: TwinScene | None = None) -> bytes:
+        """All of it as JSON, with the mark ``"simulated": true``.
+
+        The scene ``latency`` alone has a ``latency_ns``.
+        """
         arm, fixtures, head = self.instrument.arm, self.instrument.fixtures, self.instrument.head
         content: dict[str, Any] = {
             "simulated": True,
@@ -159,7 +162,6 @@ class InstrumentTruth:
                 "ring_diameter_mm": RING_DIAMETER_MM,
                 "base_new_from_base_old": _pose(self.moved_from_base),
             },
-            "latency_ns": latency_ns(self.seed),
             "probe": {
                 "tool_from_probe_mm": TRUE_PROBE_MM.tolist(),
                 "tip_diameter_mm": TIP_DIAMETER_MM,
@@ -171,6 +173,8 @@ class InstrumentTruth:
                 "encoder_waves_rad": arm.waves_rad.tolist(),
             },
         }
+        if scene == "latency":
+            content["latency_ns"] = latency_ns(self.seed)
         right = self.right_camera_parameters
         if right is not None and self.right_from_sensor is not None:
             content["right_camera_parameters"] = right.tolist()

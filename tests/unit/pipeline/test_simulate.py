@@ -59,7 +59,8 @@ def test_a_scene_is_a_recording_and_its_truth_lies_beside_it(tmp_path: Path) -> 
     found = simulate_scene(tmp_path / "ball.1", HEAD, "ball", options, events.append)
     check_images(found.folder)
     assert found.truth == tmp_path / "ball.1.truth.json"
-    assert json.loads(found.truth.read_text())["seed"] == 3
+    truth = json.loads(found.truth.read_text())
+    assert (truth["seed"], truth["scene"]) == (3, "ball")
     assert not list(found.folder.rglob("*truth*"))
     assert are_simulated([found.folder / "images/0000.png"])
     assert [(event.done, event.total) for event in events] == [(k, 6) for k in range(1, 7)]

@@ -8,9 +8,10 @@ import json
 import numpy as np
 import pytest
 
+from armscan.devices.sources import TwinScene
 from armscan.simulation.head import HEADS, RIGHT
 from armscan.simulation.instrument import Instrument
-from armscan.simulation.twin import InstrumentTruth
+from armscan.simulation.twin import InstrumentTruth, latency_ns
 
 
 @pytest.mark.parametrize("name", HEADS)
@@ -51,3 +52,11 @@ def test_the_right_camera_is_told_and_missing_ones_are_not() -> None:
     assert np.abs(lens.project(by_document) - [1536.0, 1024.0]).max() < 300.0
     single = InstrumentTruth(Instrument.build("thesis-single", "clean", 6), "clean", 6)
     assert single.right_camera_parameters is None and single.right_from_sensor is None
+
+
+def test_only_the_scene_latency_has_one() -> None:
+    truth = InstrumentTruth(Instrument.build("thesis-single", "thesis", 5), "thesis", 5)
+    assert json.loads(truth.document("latency"))["latency_ns"] == latency_ns(5) != 0
+    others: tuple[TwinScene | None, ...] = (None, "plate", "probing")
+    for scene in others:
+        assert "latency_ns" not in json.loads(truth.document(scene))

@@ -25,7 +25,7 @@ CHI_6_IN_999 = math.sqrt(22.46)
 def instrument(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     folder = tmp_path_factory.mktemp("multi")
     request = DemoRequest(folder, HEAD, SEED, most_views=FEW, processes=1)
-    return calibrate_head(request, folder)
+    return calibrate_head(request, "multi", folder)
 
 
 @pytest.fixture(scope="module")

@@ -280,9 +280,14 @@ def run_all_heads(request: DemoRequest, progress: Progress = silent) -> Summary:
         return summary
 
 
-def calibrate_head(request: DemoRequest, folder: Path, progress: Progress = silent) -> Calibrated:
-    """Record what the calibrations of a head rest on, and run their commands."""
-    run = _Run(request, folder, request.twin.build(), progress, request.command("photos"))
+def calibrate_head(
+    request: DemoRequest, kind: str, folder: Path, progress: Progress = silent
+) -> Calibrated:
+    """Record what the calibrations of a head rest on, and run their commands.
+
+    ``kind``: the demo that asks for it, named in what they write.
+    """
+    run = _Run(request, folder, request.twin.build(), progress, request.command(kind))
     with run.recording(*CALIBRATION_SCENES):
         return _calibrated(run)
 
@@ -307,7 +312,7 @@ def make_head_demo(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibrated:
-    """What the commands of the calibrations wrote, and the warnings of the hand-eye."""
+    """What the commands of the calibrations wrote, and what was warned of at the hand-eye."""
 
     sensor: SensorCalibration
     scanner: ScannerCalibration
@@ -331,8 +336,9 @@ def _calibrated(run: _Run) -> Calibrated:
     hand_eye = partial(calibrate_hand_eye, run.job(document), source, Artefact(plate=table))
     found = run.timed("calibrate_hand_eye", hand_eye)
     plate, _ = read_plate(table, np.zeros(3))
+    marked = tuple(sentence(f"Hand-eye: {text}") for text in found.warnings)
     return Calibrated(
-        read_sensor_calibration(sensor), read_scanner_calibration(document), plate, found.warnings
+        read_sensor_calibration(sensor), read_scanner_calibration(document), plate, marked
     )
 
 
@@ -405,7 +411,6 @@ def _written(run: _Run, demo: HeadDemo, warnings: tuple[str, ...]) -> Summary:
     request, folder, seconds = run.request, run.folder, run.seconds
     name = request.head
     head = {**head_data(demo), "seconds": seconds}
-    marked = tuple(sentence(f"Hand-eye: {text}") for text in warnings)
     commands = _commands(run, demo)
     photographs = {}
     for place in sorted(run.place("").iterdir()):
@@ -419,7 +424,7 @@ def _written(run: _Run, demo: HeadDemo, warnings: tuple[str, ...]) -> Summary:
         name,
         head,
         photographs,
-        warnings=marked,
+        warnings=warnings,
         commands=commands,
         footer=footer(provenance),
     )
@@ -432,7 +437,7 @@ def _written(run: _Run, demo: HeadDemo, warnings: tuple[str, ...]) -> Summary:
         "truth",
         quantities=(fact("time", f"{sum(seconds.values()):.0f} s"),),
         tables=(comparison_table({name: head}), truth_table(demo, head), *naming, commands),
-        warnings=marked,
+        warnings=warnings,
         written=_told(folder, result),
         next_step=f"open {told_path(report)} in a browser",
         extra={

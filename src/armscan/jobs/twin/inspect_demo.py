@@ -45,7 +45,7 @@ def run_workpiece_demo(request: DemoRequest, progress: Progress = silent) -> Sum
         model, limits = folder / MODEL, folder / "tolerances.toml"
         source = files("armscan.simulation") / "workpiece" / MODEL
         write_files({model: source.read_bytes(), limits: TOLERANCES.encode()})
-        calibrate_head(request, folder, progress)
+        instrument = calibrate_head(request, "workpiece", folder, progress)
         scan = folder / "recordings" / "workpiece"
         record_scenes(
             {"workpiece": scan}, request.twin, request.most_views,
@@ -73,7 +73,7 @@ def run_workpiece_demo(request: DemoRequest, progress: Progress = silent) -> Sum
                     "-o part.html",
                 ),
             ),
-            warnings=judged.warnings,
+            warnings=(*instrument.warnings, *judged.warnings),
             written=tuple(map(told_path, (folder, page, cloud, model, limits))),
             next_step=f"open {told_path(page)} in a browser",
             extra={"kind": "demo", "simulated": True, "seed": request.seed, **judged.extra},

@@ -17,7 +17,8 @@ Points are wrong if more than 2 % lie farther from the true surface than 4 of th
 warning bears on an error but those of `HARMLESS`, however many right results have it too: a laxer
 rule than that of `benchmarks/random_instruments.py`.
 A line of JSON is written for each instrument, with the commit; a seed that has its line at this
-commit is not run again. Everything here is simulated.
+commit is not run again, and a tree with changes is refused. The table is of the commit of the last
+line alone. An exception outside a command is a bug, too. Everything here is simulated.
 """
 
 from __future__ import annotations
@@ -26,8 +27,6 @@ import argparse
 import contextlib
 import io
 import json
-import subprocess
-import sys
 import tempfile
 import time
 import traceback
@@ -39,6 +38,7 @@ from typing import Any, cast
 
 import cv2
 import numpy as np
+from heads import commit_of_tree
 from scipy.stats import chi2, norm
 
 from armscan.calibration.hand_eye.observations import PlateReference
@@ -497,14 +497,16 @@ def overall(found: set[str]) -> str:
     return "right"
 
 
-def commit() -> str:
-    """Of the working tree; marked where something is not committed."""
-    root = Path(__file__).resolve().parents[1]
-    name = subprocess.run(
-        ["git", "describe", "--always", "--dirty", "--exclude", "*"],
-        cwd=root, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return name.stdout.strip() or "unknown"
+def failed(seed: int, error: Exception, start: float, cpu: float) -> dict[str, Any]:
+    """An instrument that an exception outside the commands ended, since these clock readings."""
+    stage = Stage("outside a command", "bug", sentence=f"{type(error).__name__}: {error}")
+    return {
+        "seed": seed,
+        "stages": [vars_of(stage)],
+        "outcome": stage.outcome,
+        "wall_s": round(time.perf_counter() - start, 1),
+        "core_s": round(time.process_time() - cpu, 1),
+    }
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
@@ -515,11 +517,16 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def print_table(lines: list[dict[str, Any]]) -> None:
-    """Outcomes by stage, then each instrument that is not right; refusals are judged anew."""
+    """Outcomes by stage, then each instrument that is not right; refusals are judged anew.
+
+    Only of the commit of the last line.
+    """
+    n_all = len(lines)
+    lines = [line for line in lines if line["commit"] == lines[-1]["commit"]]
     for line in lines:
-        drawn = draw_instrument(line["seed"])
         for stage in line["stages"]:
             if "refused" in stage["outcome"]:
+                drawn = draw_instrument(line["seed"])
                 stage["outcome"] = refusal(drawn, stage["name"], stage["sentence"])
         line["outcome"] = overall({stage["outcome"] for stage in line["stages"]})
     counts = {name: Counter[str]() for name in STAGES}
@@ -541,7 +548,7 @@ def print_table(lines: list[dict[str, Any]]) -> None:
         return
     total = Counter(line["outcome"] for line in lines)
     print(" | ".join(("instruments", *(str(total[outcome]) for outcome in outcomes))))
-    print(f"commits: {', '.join(sorted({line['commit'] for line in lines}))}")
+    print(f"commit: {lines[0]['commit']}; {n_all - len(lines)} lines of other commits left out")
     cores = [line["core_s"] for line in lines]
     print(f"core-seconds: median {np.median(cores):.0f}, most {np.max(cores):.0f}")
     for line in lines:
@@ -560,11 +567,15 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="only print the table")
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    here = commit()
+    if options.table:
+        print_table(read_lines(options.o))
+        return
+    here = commit_of_tree()
     done = {line["seed"] for line in read_lines(options.o) if line["commit"] == here}
     for seed in range(options.first, options.first + options.count):
-        if options.table or seed in done:
+        if seed in done:
             continue
+        start, cpu = time.perf_counter(), time.process_time()
         with contextlib.ExitStack() as stack:
             folder = options.keep and options.keep / str(seed)
             if folder is None:
@@ -572,10 +583,9 @@ def main() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             try:
                 line = run_instrument(seed, folder)
-            except Exception:
-                print(f"{seed}: the benchmark itself failed", file=sys.stderr)
+            except Exception as error:  # one of these must not end the study
                 traceback.print_exc()
-                continue
+                line = failed(seed, error, start, cpu)
         line["commit"] = here
         with options.o.open("a") as file:
             file.write(json.dumps(line) + "\n")

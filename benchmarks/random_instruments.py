@@ -7,12 +7,14 @@
 Each draw (`rigs.instruments`) has a field of 20 to 400 mm, a stand-off of 60 to 600 mm and all else
 of its own; about one in eight cannot be calibrated, by construction. Every stage ends as right
 (the joint error and that of each group of parameters within four of their own sigma), wrong,
-rightly refused (degenerate by construction, or the Cramer-Rao bound itself is beyond the limit at
-which the software says that it refuses) or wrongly refused. The tables (`rigs.instrument_tables`)
-tell what is wrong and was warned of from what is silently wrong.
+rightly refused (degenerate by construction, or beyond the limit at which the software says that it
+refuses: of cameras the Cramer-Rao bound, of hand-eyes the bound or the drawn arm, and the reason
+must say so), refused for a line that fewer than two boards show, or wrongly refused. The tables
+(`rigs.instrument_tables`) tell what is wrong and was warned of from what is silently wrong.
 
-A line of JSON a draw is added to FILE, with the commit: a study that was stopped goes on where it
-was, and lines of another commit are refused. ``--table`` prints the tables of what is there.
+A line of JSON a draw is added to FILE, with the commit and the stages: a study that was stopped
+goes on where it was; lines of another commit or of other stages are refused, and so is a tree with
+changes. ``--table`` prints the tables of what is there.
 ``--only`` takes some of camera, sheet, stereo, handeye, naming; a stage runs what it rests on.
 """
 
@@ -20,7 +22,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import time
 from collections.abc import Iterator
 from multiprocessing import Pool
@@ -28,6 +29,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from heads import commit_of_tree
 
 from armscan.models.calibration import SensorCalibration
 from rigs.instrument_arm import run_hand_eye
@@ -78,6 +80,7 @@ def drawn(task: tuple[int, tuple[str, ...]]) -> Row:
     found = [outcome.as_row() for outcome in outcomes(made, stages)]
     return {
         "seed": seed,
+        "stages": list(stages),
         "fault": made.fault,
         "strata": strata(made),
         "outcomes": found,
@@ -107,19 +110,15 @@ def strata(made: Instrument) -> dict[str, float]:
     }
 
 
-def commit() -> str:
-    """Of the tree that is judged; marked if it has changes."""
-    here = Path(__file__).parent
-    said = ["git", "-C", str(here), "describe", "--always", "--dirty", "--exclude", "*"]
-    return subprocess.run(said, capture_output=True, text=True, check=True).stdout.strip()
-
-
-def read(path: Path, head: str) -> list[Row]:
-    """Lines that are there, all of this commit."""
+def read(path: Path, head: str, stages: tuple[str, ...]) -> list[Row]:
+    """Lines that are there, all of this commit and of these stages."""
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     others = {row["commit"] for row in rows} - {head}
     if others:
         raise SystemExit(f"{path} holds draws of commit {', '.join(sorted(others))}, not {head}")
+    ran = {",".join(sorted(row["stages"])) for row in rows} - {",".join(sorted(stages))}
+    if ran:
+        raise SystemExit(f"{path} holds draws of the stages {'; '.join(sorted(ran))}")
     return rows
 
 
@@ -132,14 +131,15 @@ def main() -> None:
     parser.add_argument("--lines", type=Path, default=Path("random_instruments.jsonl"))
     parser.add_argument("--table", action="store_true")
     asked = parser.parse_args()
-    head, stages = commit(), tuple(asked.only.split(","))
+    stages = tuple(dict.fromkeys(asked.only.split(",")))
     if unknown := set(stages) - set(STAGES):
         raise SystemExit(f"no stage {', '.join(unknown)}; there are {', '.join(STAGES)}")
     if asked.table:
         rows = [json.loads(line) for line in asked.lines.read_text().splitlines()]
         print_tables(rows)
         return
-    rows = read(asked.lines, head)
+    head = commit_of_tree()
+    rows = read(asked.lines, head, stages)
     done = {row["seed"] for row in rows}
     seeds = range(asked.seed_first, asked.seed_first + asked.draws)
     tasks = [(seed, stages) for seed in seeds if seed not in done]

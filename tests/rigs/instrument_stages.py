@@ -55,6 +55,15 @@ FOUR_SIGMA = 6.334e-5
 """Probability beyond four standard deviations, both sides."""
 HOPELESS_FOCAL = 0.02
 """Relative sigma of the focal length, by the bound, from which a refusal is right."""
+FEW_BOARDS = "a line on fewer than two boards"
+"""What becomes of sheets that are refused for it: not degenerate, and no fault of the software."""
+SAYS_FEW_BOARDS = (
+    "no board",
+    "no straight stripe",
+    "no line is seen on two board placements",
+    "fewer than two board placements show a stripe",
+    "fewer than two images show",
+)
 LEAST_REST_MM = 1e-6
 """Of true heights that a sheet's parameters explain."""
 
@@ -63,11 +72,10 @@ LEAST_REST_MM = 1e-6
 class Outcome:
     """What became of one stage of one instrument.
 
-    ``result`` is right, wrong, rightly refused, wrongly refused or not reached; ``chi2``
-    the joint normalised error over ``freedom`` parameters; ``over_bound`` the stated standard
-    deviations over the Cramer-Rao bound, ``over_granted`` over that of the question that is
-    answered: sheets of the stored camera, planes that may be bowed as is likely, the hand-eye of
-    the stored sensor.
+    ``result`` is right, wrong, rightly refused, wrongly refused or `FEW_BOARDS`; ``chi2`` the joint
+    normalised error over ``freedom`` parameters; ``over_bound`` the stated standard deviations over
+    the Cramer-Rao bound, ``over_granted`` over that of the question that is answered: sheets of the
+    stored camera, planes that may be bowed as is likely, the hand-eye of the stored sensor.
     """
 
     stage: str
@@ -311,14 +319,29 @@ def run_sheets(
     except ArmscanError as error:
         fit = FitFailure(str(error))
     seconds = time.process_time() - begun
-    shown = _boards_of_lights(made, lines)
-    is_hopeless = made.fault in DEGENERATE["sheet"] or min(shown) < 2
     reasons = (fit.reason,) if isinstance(fit, FitFailure) else sheet_reasons(fit)
     if reasons or isinstance(fit, FitFailure):
-        result = "rightly refused" if is_hopeless else "wrongly refused"
+        result = sheet_refusal(made, reasons[0], _boards_of_lights(made, lines))
         return SheetResult(Outcome("sheet", result, reasons[0], seconds=seconds), None)
     outcome = judge_sheets(made, fit, information, seen, lines, n_cameras, seconds)
     return SheetResult(outcome, fit, tuple(lights_of(made, fit, lines)))
+
+
+def sheet_refusal(made: Instrument, reason: str, shown: Sequence[int]) -> str:
+    """Right of degenerate boards; `FEW_BOARDS` where a line's lack of boards is the reason.
+
+    ``shown`` counts the boards of each line. Lines that boards lack are photographed one at a time
+    (`stripes_on_boards`), so that a sheet in the refusal has its line's name.
+    """
+    if made.fault in DEGENERATE["sheet"]:
+        return "rightly refused"
+    few = [light.name for light, n in zip(made.lights, shown, strict=True) if n < 2]
+    is_named = any(
+        reason.startswith(f"sheet {name}: ") and "board placement shows its stripe" in reason
+        for name in few
+    )
+    is_said = any(one in reason for one in SAYS_FEW_BOARDS)
+    return FEW_BOARDS if is_named or (few and is_said) else "wrongly refused"
 
 
 def _boards_of_lights(made: Instrument, lines: Sequence[SeenLine]) -> list[int]:

@@ -16,8 +16,18 @@ import numpy as np
 from scipy.stats import beta
 
 from armscan.geometry.arrays import FloatArray
+from rigs.instrument_stages import FEW_BOARDS
 
-RESULTS = ("right", "rightly refused", "wrongly refused", "wrong, warned", "silently wrong")
+RESULTS = (
+    "right",
+    "rightly refused",
+    FEW_BOARDS,
+    "wrongly refused",
+    "wrong, warned",
+    "silently wrong",
+)
+ANSWERS = ("right", "wrong, warned", "silently wrong")
+"""Results that are given, not refused."""
 SPARING = 0.1
 """Part of the right results that a warning may be given to and still bear on a wrong one."""
 WANTED = (0.9, 1.15)
@@ -76,6 +86,19 @@ def share_limits(n: int, n_all: int) -> tuple[float, float]:
     return low, high
 
 
+def rate(n: int, n_all: int) -> str:
+    """Count and share with its limits, in words; of none nothing is known."""
+    if not n_all:
+        return "0 of 0"
+    low, high = (100.0 * one for one in share_limits(n, n_all))
+    return f"{n} of {n_all}: {100.0 * n / n_all:.2f} % (95 %: {low:.2f} to {high:.2f} %)"
+
+
+def answered(pairs: Pairs) -> Pairs:
+    """Those that gave an answer, right or wrong."""
+    return [pair for pair in pairs if pair[1]["result"] in ANSWERS]
+
+
 def certainty(outcomes: list[Row]) -> tuple[float, float]:
     """Mean chi2 over its degrees of freedom, and its standard error; NaN for none."""
     judged = [o for o in outcomes if o["freedom"]]
@@ -95,6 +118,7 @@ def print_tables(rows: list[Row]) -> None:
     print(f"{np.mean([row['seconds'] for row in rows]):.1f} core-seconds a draw")
     found = by_stage(rows)
     print_outcomes(found)
+    print_silent(found)
     print_strata(found)
     print_words(found)
 
@@ -102,7 +126,7 @@ def print_tables(rows: list[Row]) -> None:
 def print_outcomes(found: dict[str, Pairs]) -> None:
     """Counts and rates, chi2 over its degrees of freedom, stated sigma over the bound."""
     print(f"\n| stage | judged | {' | '.join(RESULTS)} | chi2 / f of the right | sigma / bound |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("|---" * (len(RESULTS) + 4) + "|")
     for stage, pairs in found.items():
         counts = [str(len(of_result(pairs, result))) for result in RESULTS]
         mean, error = certainty([one for _, one in of_result(pairs, "right")])
@@ -114,13 +138,21 @@ def print_outcomes(found: dict[str, Pairs]) -> None:
     print(f"rightly refused for fewer postures than the software asks for: {few}")
     for result in RESULTS[2:]:
         seen = of_result(whole, result)
-        low, high = share_limits(len(seen), len(whole))
         print(
-            f"{result}: {len(seen)} of {len(whole)} stages, "
-            f"{100 * len(seen) / len(whole):.2f} % (95 %: {100 * low:.2f} to {100 * high:.2f} %); "
+            f"{result}, of judged stages: {rate(len(seen), len(whole))}; "
             f"in {len({row['seed'] for row, _ in seen})} of "
             f"{len({row['seed'] for row, _ in whole})} instruments"
         )
+
+
+def print_silent(found: dict[str, Pairs]) -> None:
+    """Rate of what is silently wrong, of all that was judged and of the answers given."""
+    print("\n| silently wrong | of all judged | of the answers given |")
+    print("|---|---|---|")
+    whole = [pair for pairs in found.values() for pair in pairs]
+    for stage, pairs in {**found, "all": whole}.items():
+        n = len(of_result(pairs, "silently wrong"))
+        print(f"| {stage} | {rate(n, len(pairs))} | {rate(n, len(answered(pairs)))} |")
 
 
 def _median(pairs: Pairs, name: str) -> float:

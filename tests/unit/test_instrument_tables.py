@@ -5,7 +5,18 @@ from __future__ import annotations
 
 import pytest
 
-from rigs.instrument_tables import RESULTS, Row, by_stage, certainty, of_result, share_limits
+from rigs.instrument_stages import FEW_BOARDS
+from rigs.instrument_tables import (
+    RESULTS,
+    Row,
+    answered,
+    by_stage,
+    certainty,
+    of_result,
+    print_outcomes,
+    print_silent,
+    share_limits,
+)
 
 
 def row(seed: int, result: str, *warnings: str) -> Row:
@@ -59,3 +70,35 @@ def test_certainty_weighs_by_degrees_of_freedom() -> None:
     mean, error = certainty([{"chi2": 9.0, "freedom": 9}, {"chi2": 9.0, "freedom": 3}])
     assert mean == 1.5
     assert error == pytest.approx((4.5**2 + 4.5**2) ** 0.5 / 12.0)
+
+
+def test_what_is_silently_wrong_is_told_of_the_answers_given_too(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Refusals give no answer: one of 20 judged is one of four answers. Limits from tables."""
+    refused = [row(k, "rightly refused") for k in range(10)]
+    refused += [row(k, FEW_BOARDS) for k in range(10, 14)]
+    refused += [row(k, "wrongly refused") for k in range(14, 16)]
+    given = [row(k, "right") for k in range(16, 19)] + [row(19, "wrong")]
+    found = by_stage([*refused, *given])
+    assert len(answered(found["camera"])) == 4
+    print_silent(found)
+    said = capsys.readouterr().out
+    judged = "1 of 20: 5.00 % (95 %: 0.13 to 24.87 %)"
+    answers = "1 of 4: 25.00 % (95 %: 0.63 to 80.59 %)"
+    assert f"| camera | {judged} | {answers} |" in said
+    assert f"| all | {judged} | {answers} |" in said
+
+
+def test_a_line_on_fewer_than_two_boards_has_a_column_of_its_own(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rows = [row(1, FEW_BOARDS), row(2, "rightly refused"), row(3, "rightly refused")]
+    for one in rows:
+        one["outcomes"][0]["freedom"] = 0
+    print_outcomes(by_stage(rows))
+    table = [line.split("|") for line in capsys.readouterr().out.splitlines() if "|" in line]
+    assert len({len(line) for line in table}) == 1
+    named = dict(zip((cell.strip() for cell in table[0]), table[2], strict=True))
+    assert named[FEW_BOARDS].strip() == "1"
+    assert named["rightly refused"].strip() == "2"

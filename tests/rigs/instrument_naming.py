@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of the lines of a drawn instrument that sweeps over a plate with a block, one camera."""
+"""Names of the lines of a drawn instrument that sweeps over a plate with a block, one camera.
+
+All lines of the head are on, also those of which the sensor has no sheet: what is named of these
+is wrong. Of a head of one line no name can be wrong, and none is counted.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +35,11 @@ def run_naming(
     made: Instrument, sensor: SensorCalibration, names: Sequence[int]
 ) -> Iterator[Outcome]:
     """Two crossed lines by their past and rays; one line, or unnamed parallel ones, by depth."""
-    lights = [made.lights[k] for k in names]
-    is_cross = made.is_crossed and len(lights) == 2
+    if len(made.lights) == 1:
+        return
+    calibrated = list(dict.fromkeys(names))
+    unknown = [k for k in range(len(made.lights)) if k not in calibrated]
+    is_cross = made.is_crossed and len(names) == 2
     labeller = CrossLabeller(sensor) if is_cross else SingleLabeller(sensor)
     stage = "names, crossed lines" if is_cross else "names, one image"
     rng, wrong, named, asked = made.rng(40), 0, 0, 0
@@ -40,7 +47,8 @@ def run_naming(
     block = made.field_mm * np.array([0.15, 0.12, rng.uniform(0.02, 0.15)])
     try:
         for k, head in enumerate(_sweep(made, rng)):
-            profile, truth = _exposed(made, lights, head, block, rng, f"image{k:02d}")
+            lit = [*calibrated, *unknown]
+            profile, truth = _exposed(made, lit, head, block, rng, f"image{k:02d}")
             if not len(profile):
                 continue
             pose: Pose = Pose(head.rotation, head.shift)
@@ -48,19 +56,25 @@ def run_naming(
             lasers = tuple(sheet.name for sheet in sensor.sheets) if is_cross else ()
             found = labeller.label([profile], lasers, pose, time_ns).profiles[0]
             is_named = found.status == int(PointStatus.MEASURED)
-            wrong += int((is_named & (found.sheet != truth)).sum())
+            wrong += int((np.asarray(names)[found.sheet[is_named]] != truth[is_named]).sum())
             named, asked = named + int(is_named.sum()), asked + len(profile)
     except ArmscanError as error:
         # What several lines in one image are, nothing but their depth tells.
-        result = "rightly refused" if len(lights) > 1 and not is_cross else "wrongly refused"
+        result = "wrongly refused" if is_cross else "rightly refused"
         yield Outcome(stage, result, str(error), seconds=time.process_time() - begun)
         return
     share = wrong / max(named, 1)
+    without = f"; {len(unknown)} of {len(made.lights)} lines have no sheet" if unknown else ""
     yield Outcome(
         stage,
         "right" if share < MOST_WRONG else "wrong",
-        f"{wrong} of {named} named points wrong" if wrong else "",
-        groups={"wrong": float(wrong), "named": float(named), "points": float(asked)},
+        f"{wrong} of {named} named points wrong{without}" if wrong else "",
+        groups={
+            "wrong": float(wrong),
+            "named": float(named),
+            "points": float(asked),
+            "lines without a sheet": float(len(unknown)),
+        },
         seconds=time.process_time() - begun,
     )
 
@@ -101,33 +115,33 @@ def _at_height(
 
 def _exposed(
     made: Instrument,
-    lights: Sequence[Light],
+    lit: Sequence[int],
     head: Placement,
     block: FloatArray,
     rng: np.random.Generator,
     source: str,
 ) -> tuple[Profile, IntArray]:
-    """Stripe points with flags where lines meet, cut where a line jumps, and their true sheets."""
+    """Stripe points with flags where lines meet, cut where a line jumps, and their true lines."""
     points, normals, truth, segments = [], [], [], []
-    for sheet, light in enumerate(lights):
-        q, normal, _ = seen_stripe(made, _lit(light, head, block), 0, 400, rng)
+    for line in lit:
+        q, normal, _ = seen_stripe(made, _lit(made.lights[line], head, block), 0, 400, rng)
         if not len(q):
             continue
         step = np.linalg.norm(np.diff(q, axis=0), axis=1)
         cut = np.concatenate([[0], np.cumsum(step > max(8.0, 4.0 * float(np.median(step))))])
         points.append(q)
         normals.append(normal)
-        truth.append(np.full(len(q), sheet))
-        segments.append(cut + 1000 * sheet)
+        truth.append(np.full(len(q), line))
+        segments.append(cut + 1000 * line)
     if not points:
         empty = np.zeros((0, 2))
         none, numbers = np.zeros(0), np.zeros(0, dtype=np.int64)
         return Profile(source, empty, empty, none, none, none, numbers, numbers), numbers
-    q, of_sheet = np.concatenate(points), np.concatenate(truth)
+    q, of_line = np.concatenate(points), np.concatenate(truth)
     near = np.full(len(q), np.inf)
-    for k in np.unique(of_sheet):
-        if (of_sheet != k).any():
-            near[of_sheet == k] = cKDTree(q[of_sheet != k]).query(q[of_sheet == k])[0]
+    for k in np.unique(of_line):
+        if (of_line != k).any():
+            near[of_line == k] = cKDTree(q[of_line != k]).query(q[of_line == k])[0]
     segment = np.unique(np.concatenate(segments), return_inverse=True)[1].astype(np.int64)
     n = len(q)
     profile = Profile(
@@ -140,4 +154,4 @@ def _exposed(
         flags=np.where(near < 4.5 * WIDTH_PX, int(StripeFlag.NEIGHBOUR), 0),
         segment=segment,
     )
-    return profile, of_sheet.astype(np.int64)
+    return profile, of_line.astype(np.int64)

@@ -14,7 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
+from armscan.calibration.hand_eye.calibrate import (
+    UNDERDETERMINED_MM,
+    UNDERDETERMINED_PART,
+    calibrate_on_plate,
+    calibrate_on_sphere,
+)
+from armscan.calibration.hand_eye.checks import MOST_ARM_MM, MOST_OPEN_MM
+from armscan.calibration.hand_eye.estimate import LEVER_MM
 from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import ArmscanError
@@ -34,16 +41,26 @@ PLATE = Placement(
 )
 N_WAVES = 24
 NODES = 8
-HOPELESS_MM, HOPELESS_RAD = 1.0, 0.01
-"""A hand-eye that the bound itself knows no better than this may be refused."""
+TOO_FEW = ("too few", "no exposure has a stripe")
+OPEN = (
+    "the postures determine only",
+    "the postures hardly determine",
+    "the postures do not determine",
+    "explain the stripes equally well",
+)
+SCATTERS = (
+    "the arm would have to scatter by",
+    "no hand-eye fits: the stripes of the typical posture lie",
+    "no hand-eye puts the points on one sphere",
+)
+BLAMES_OTHERS = ("plane left free", "would leave", "would fit", "agree with each other")
+"""Words of refusals, by what they say; the last with what else some name as the cause."""
 LEAST_POSTURES, LEAST_CROSSED = 5, 4
 """The software says that fewer are refused; of crossed stripes on a plate the second."""
-LARGEST_SCATTER_MM = 0.2
-"""Of an arm at the ends of a stripe, from which a refusal is right: 0.25 mm is the software's."""
 TYPICAL_TILT = np.radians(25.0)
 """Of plates against the optical axis: by its sine a turn about a point behind shows."""
-TIP_VARIANCE = 3.0 / 20.0
-"""Of a centre found by twenty touches, along one direction, over that of a touch."""
+TIP_RATIO = (0.1, 0.8)
+"""What a tip's calibration errs by over what a touch does: the software expects 0.39."""
 MOST_BEHIND_MM = 400.0
 GROUPS = {"rotation": (0, 1, 2), "translation": (3, 4, 5)}
 
@@ -107,9 +124,9 @@ def run_hand_eye(
     if isinstance(found, FitFailure):
         least = LEAST_CROSSED if len(lights) > 1 and not on_sphere else LEAST_POSTURES
         are_few = len({one.posture for one in seen}) < least
-        if _is_hopeless(made, best, seen):
-            return Outcome(stage, "rightly refused", found.reason, seconds=seconds)
-        result = "rightly refused" if are_few else "wrongly refused"
+        limit_mm = _most_open_mm(made, on_sphere)
+        is_open = best is None or _open_mm(best) > limit_mm
+        result = refusal(made, found.reason, are_few=are_few, is_open=is_open)
         reason = f"few postures: {found.reason}" if are_few else found.reason
         return Outcome(stage, result, reason, seconds=seconds)
     calibration = found.calibration
@@ -157,19 +174,47 @@ def _calibrated(
     return calibrate_on_plate(stripes, plate, HandEyeOptions(), sensor_covariance=sensor.covariance)
 
 
-def _is_hopeless(made: Instrument, best: FloatArray | None, seen: list[Seen]) -> bool:
-    """Degenerate by construction, or beyond what the software says that it refuses."""
-    if made.fault in DEGENERATE["handeye"] or best is None or not seen:
-        return True
-    sigma = np.sqrt(np.diag(best))
+def refusal(made: Instrument, reason: str, *, are_few: bool, is_open: bool) -> str:
+    """Right where the instrument is beyond a limit of the software, and the reason says which.
+
+    ``are_few``: fewer postures than it asks for; ``is_open``: the bound itself leaves more open
+    than it takes.
+    """
+    is_degenerate = made.fault in DEGENERATE["handeye"]
+    is_right = (
+        ((are_few or is_degenerate) and _says(reason, TOO_FEW))
+        or ((is_open or is_degenerate) and _says(reason, OPEN))
+        or (
+            arm_scatter_mm(made) > MOST_ARM_MM
+            and _says(reason, SCATTERS)
+            and not _says(reason, BLAMES_OTHERS)
+        )
+    )
+    return "rightly refused" if is_right else "wrongly refused"
+
+
+def _says(reason: str, words: tuple[str, ...]) -> bool:
+    return any(one in reason for one in words)
+
+
+def arm_scatter_mm(made: Instrument) -> float:
+    """Of a point at the ends of a stripe, an axis."""
     half = 0.35 * made.field_mm
     apart = np.linalg.norm(_scan_point(made) - turning_point(made)) * np.sin(TYPICAL_TILT)
-    scatter = made.arm.position_mm * np.hypot(1.0, np.hypot(half, apart) / made.arm.lever_mm)
-    return bool(
-        sigma[3:].max() > HOPELESS_MM
-        or sigma[:3].max() > HOPELESS_RAD
-        or scatter > LARGEST_SCATTER_MM
-    )
+    return float(made.arm.position_mm * np.hypot(1.0, np.hypot(half, apart) / made.arm.lever_mm))
+
+
+def _most_open_mm(made: Instrument, on_sphere: bool) -> float:
+    if not on_sphere:
+        return MOST_OPEN_MM
+    part_mm = UNDERDETERMINED_PART * made.references.diameter_mm
+    return min(max(part_mm, UNDERDETERMINED_MM), MOST_OPEN_MM)
+
+
+def _open_mm(covariance: FloatArray) -> float:
+    """Sigma of the combination that is known least, turns by what they move at ``LEVER_MM``."""
+    scale = np.array([LEVER_MM] * 3 + [1.0] * 3)
+    return float(np.sqrt(np.linalg.eigvalsh(covariance * scale[:, None] * scale)[-1]))
 
 
 def plate_heads(made: Instrument, rng: np.random.Generator) -> list[Placement]:
@@ -350,11 +395,16 @@ def probed_places(made: Instrument) -> FloatArray:
     return rng.uniform(-size, size, (made.references.n_probed, 2))
 
 
+def tip_ratio(made: Instrument) -> float:
+    """What the tip's calibration errs by, along one direction, over what a touch does."""
+    return float(np.exp(made.rng(32).uniform(*np.log(TIP_RATIO))))
+
+
 def probed(made: Instrument, waves: Waves, rng: np.random.Generator) -> PlateReference:
     """The plate as touches show it, all of them shifted by what the tip's calibration errs."""
     places = probed_places(made)
     heights = waves.height(places) + made.references.probing_mm * rng.normal(size=len(places))
-    heights += made.references.probing_mm * np.sqrt(TIP_VARIANCE) * made.rng(31).normal()
+    heights += made.references.probing_mm * tip_ratio(made) * made.rng(31).normal()
     fitted = fit_plane(PLATE.apply(np.column_stack([places, heights])))
     assert isinstance(fitted, Estimate)
     plane = fitted.value
@@ -426,7 +476,7 @@ def hand_eye_bound(
         whole = np.zeros((len(design), len(design)))
         whole[: len(covariance), : len(covariance)] = covariance
         whole[len(covariance) :, len(covariance) :] = (
-            np.eye(len(touched)) + TIP_VARIANCE
+            np.eye(len(touched)) + tip_ratio(made) ** 2
         ) * made.references.probing_mm**2
         waves = Waves.draw(made, np.random.default_rng(12345), 300, 1.0)
         shape = waves.features(np.concatenate([*places, touched]))

@@ -13,11 +13,22 @@ from dataclasses import replace
 import pytest
 
 from armscan.calibration.cameras.result import CameraOptions
-from rigs.instrument_arm import run_hand_eye
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import LaserFit
+from rigs.instrument_arm import arm_scatter_mm, refusal, run_hand_eye
 from rigs.instrument_naming import run_naming
-from rigs.instrument_stages import Outcome, run_camera, run_sheets
+from rigs.instrument_stages import (
+    FEW_BOARDS,
+    Outcome,
+    drawn_camera,
+    lights_of,
+    run_camera,
+    run_sheets,
+    sheet_refusal,
+    stripes_on_boards,
+)
 from rigs.instrument_stereo import run_stereo
-from rigs.instruments import Instrument, draw_instrument
+from rigs.instruments import Instrument, board_placements, draw_instrument
 from rigs.sheet_rig import PROVENANCE
 
 OPTIONS = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
@@ -37,7 +48,7 @@ def drawn(first: int, n: int, *, has_right: bool = False) -> list[Instrument]:
 def assert_certain(outcomes: Sequence[Outcome]) -> None:
     """Pooled chi2 over its degrees of freedom: half and 1.67 times the variance lie outside."""
     judged = [one for one in outcomes if one.freedom]
-    assert all(one.result in ("right", "rightly refused") for one in outcomes)
+    assert all(one.result in ("right", "rightly refused", FEW_BOARDS) for one in outcomes)
     freedom = sum(one.freedom for one in judged)
     level = sum(one.chi2 for one in judged) / freedom
     assert freedom > 80
@@ -184,3 +195,80 @@ def test_parallel_lines_are_not_named_by_what_was_calibrated_alone(seed: int) ->
     assert sheets.fit is not None
     (found,) = run_naming(made, sheets.fit.to_calibration(PROVENANCE), sheets.names)
     assert found.result in {"right", "rightly refused"}
+
+
+SCATTERS = "the arm would have to scatter by 0.64 mm an axis to explain the stripes"
+OPEN = "the postures hardly determine the hand-eye (limit 10 mm; least known: turning)"
+DISAGREES = "probed plane and scan disagree (p 0.0001): the plane solved along lies 0.3 mm off"
+
+
+def with_arm(seed: int, scatter_mm: float) -> Instrument:
+    """A sound instrument whose arm scatters so at the ends of a stripe."""
+    made = replace(draw_instrument(seed), fault="")
+    factor = scatter_mm / arm_scatter_mm(made)
+    return replace(made, arm=replace(made.arm, position_mm=factor * made.arm.position_mm))
+
+
+def test_an_arm_that_scatters_excuses_only_the_refusal_that_says_so() -> None:
+    bad, fair = with_arm(7300, 0.26), with_arm(7300, 0.24)
+    assert refusal(bad, SCATTERS, are_few=False, is_open=False) == "rightly refused"
+    assert refusal(bad, DISAGREES, are_few=False, is_open=False) == "wrongly refused"
+    assert refusal(bad, OPEN, are_few=False, is_open=False) == "wrongly refused"
+    assert refusal(fair, SCATTERS, are_few=False, is_open=False) == "wrongly refused"
+    far = "no hand-eye fits: the stripes of the typical posture lie 0.71 mm from the plate"
+    plane = f"{far}; with the plate's plane left free it is 0.2 mm"
+    assert refusal(bad, far, are_few=False, is_open=False) == "rightly refused"
+    assert refusal(bad, plane, are_few=False, is_open=False) == "wrongly refused"
+
+
+def test_what_is_known_badly_and_few_postures_are_refused_in_their_own_words() -> None:
+    made = with_arm(7300, 0.1)
+    few = "4 postures are too few: one stripe tells two numbers of a posture"
+    assert refusal(made, OPEN, are_few=False, is_open=True) == "rightly refused"
+    assert refusal(made, SCATTERS, are_few=False, is_open=True) == "wrongly refused"
+    assert refusal(made, few, are_few=True, is_open=False) == "rightly refused"
+    assert refusal(made, few, are_few=False, is_open=False) == "wrongly refused"
+    shifted = replace(made, fault="pure translation")
+    assert refusal(shifted, OPEN, are_few=False, is_open=False) == "rightly refused"
+    assert refusal(shifted, DISAGREES, are_few=False, is_open=False) == "wrongly refused"
+
+
+def test_a_refusal_must_name_the_line_that_boards_lack() -> None:
+    made = draw_instrument(4500010)
+    assert len(made.lights) == 2
+    first, second = (
+        f"sheet {name}: 1 board placement shows its stripe, and one stripe is a line"
+        for name in "AB"
+    )
+    assert sheet_refusal(made, first, (1, 2)) == FEW_BOARDS
+    assert sheet_refusal(made, second, (1, 2)) == "wrongly refused"
+    assert sheet_refusal(made, first, (2, 2)) == "wrongly refused"
+    assert sheet_refusal(made, "sheet A: its stripes lie 8.7 px (rms) from it", (1, 2)) == (
+        "wrongly refused"
+    )
+    assert sheet_refusal(made, "no board", (0, 0)) == FEW_BOARDS
+    one = replace(made, fault="one board")
+    assert sheet_refusal(one, first, (1, 1)) == "rightly refused"
+
+
+def test_no_name_of_a_head_of_one_line_is_counted() -> None:
+    made = draw_instrument(4500000)
+    made = replace(made, lights=made.lights[:1])
+    sensor = None  # nothing is asked of it
+    assert list(run_naming(made, sensor, (0,))) == []  # type: ignore[arg-type]
+
+
+def test_a_line_without_a_sheet_is_lit_and_its_names_are_wrong() -> None:
+    """Of two lines the boards show one: its sheet is given to all points, as the only one."""
+    made = draw_instrument(4500049)
+    camera = drawn_camera(made)
+    boards, _, lines = stripes_on_boards(
+        made, camera, board_placements(made, made.rng(2), made.n_boards, for_sheets=True), 1
+    )
+    fit = calibrate_sheets(boards, camera)
+    assert isinstance(fit, LaserFit)
+    (found,) = run_naming(made, fit.to_calibration(PROVENANCE), lights_of(made, fit, lines))
+    assert found.result == "wrong"
+    assert found.groups["lines without a sheet"] == 1.0
+    assert found.groups["wrong"] > 0.3 * found.groups["named"]
+    assert "1 of 2 lines have no sheet" in found.reason

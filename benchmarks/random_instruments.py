@@ -145,8 +145,8 @@ def main() -> None:
     tasks = [(seed, stages) for seed in seeds if seed not in done]
     with Pool(asked.processes) as pool, asked.lines.open("a") as file:
         for number, row in enumerate(pool.imap_unordered(drawn, tasks), 1):
-            rows.append(row)
-            file.write(json.dumps({"commit": head, **row}) + "\n")
+            rows.append({"commit": head, **row})
+            file.write(json.dumps(rows[-1]) + "\n")
             file.flush()
             if number % 50 == 0:
                 print(f"{number} of {len(tasks)}", flush=True)

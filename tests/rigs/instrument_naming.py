@@ -2,7 +2,8 @@
 """Names of the lines of a drawn instrument that sweeps over a plate with a block, one camera.
 
 All lines of the head are on, also those of which the sensor has no sheet: what is named of these
-is wrong. Of a head of one line no name can be wrong, and none is counted.
+is wrong. Of a head of one line no name can be wrong, and none is counted; where no point at all is
+named, none is given, as in a refusal.
 """
 
 from __future__ import annotations
@@ -58,10 +59,13 @@ def run_naming(
             is_named = found.status == int(PointStatus.MEASURED)
             wrong += int((np.asarray(names)[found.sheet[is_named]] != truth[is_named]).sum())
             named, asked = named + int(is_named.sum()), asked + len(profile)
+        refused = "" if named else "no point was given a name"
     except ArmscanError as error:
+        refused = str(error)
+    if refused:
         # What several lines in one image are, nothing but their depth tells.
         result = "wrongly refused" if is_cross else "rightly refused"
-        yield Outcome(stage, result, str(error), seconds=time.process_time() - begun)
+        yield Outcome(stage, result, refused, seconds=time.process_time() - begun)
         return
     share = wrong / max(named, 1)
     without = f"; {len(unknown)} of {len(made.lights)} lines have no sheet" if unknown else ""
@@ -134,9 +138,18 @@ def _exposed(
         truth.append(np.full(len(q), line))
         segments.append(cut + 1000 * line)
     if not points:
-        empty = np.zeros((0, 2))
         none, numbers = np.zeros(0), np.zeros(0, dtype=np.int64)
-        return Profile(source, empty, empty, none, none, none, numbers, numbers), numbers
+        profile = Profile(
+            source=source,
+            points_px=np.zeros((0, 2)),
+            normals_px=np.zeros((0, 2)),
+            sigma_px=none,
+            width_px=none,
+            intensity=none,
+            flags=numbers,
+            segment=numbers,
+        )
+        return profile, numbers
     q, of_line = np.concatenate(points), np.concatenate(truth)
     near = np.full(len(q), np.inf)
     for k in np.unique(of_line):

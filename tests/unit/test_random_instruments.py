@@ -267,8 +267,13 @@ def test_a_line_without_a_sheet_is_lit_and_its_names_are_wrong() -> None:
     )
     fit = calibrate_sheets(boards, camera)
     assert isinstance(fit, LaserFit)
-    (found,) = run_naming(made, fit.to_calibration(PROVENANCE), lights_of(made, fit, lines))
+    sensor, names = fit.to_calibration(PROVENANCE), lights_of(made, fit, lines)
+    (found,) = run_naming(made, sensor, names)
     assert found.result == "wrong"
     assert found.groups["lines without a sheet"] == 1.0
     assert found.groups["wrong"] > 0.3 * found.groups["named"]
     assert "1 of 2 lines have no sheet" in found.reason
+    away = tuple(replace(light, forward=-light.forward) for light in made.lights)
+    (dark,) = run_naming(replace(made, lights=away), sensor, names)
+    assert dark.result == "rightly refused"
+    assert dark.reason == "no point was given a name"

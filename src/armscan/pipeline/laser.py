@@ -5,6 +5,7 @@ the stripes, extraction, and the fit.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -265,8 +266,22 @@ def _fit_sheets(
         lost = "; ".join(f"{image.source}: {image.reason}" for image in skipped)
         reason = f"{fit.reason} (not used: {lost})" if lost else fit.reason
         return FitFailure("; ".join((reason, *about_camera)), fit.remedy)
-    warnings = (*about_camera, *about_views, *about_widths(fit), *fit.warnings)
-    return replace(fit, skipped=(*skipped, *fit.skipped), warnings=warnings)
+    about = (*about_camera, *about_views, *about_widths(fit))
+    if not options.sheet_names:
+        about = (*about, *about_unseen(pairs, [sheet.name for sheet in fit.sheets]))
+    return replace(fit, skipped=(*skipped, *fit.skipped), warnings=(*about, *fit.warnings))
+
+
+def about_unseen(pairs: Sequence[ExposurePair], sheets: Sequence[str]) -> tuple[str, ...]:
+    """Names lasers that images name and of which no sheet, or line of a fan, came."""
+    named = Counter(name for exposure, _ in pairs for name in exposure.lasers)
+    return tuple(
+        f"laser {name} was on in {n} of {len(pairs)} images, and no sheet came of it: where it "
+        "shines in a scan that does not name its lasers, its points may be given to another "
+        "sheet; take boards that show it, or leave it off"
+        for name, n in named.items()
+        if not any(sheet == name or sheet.startswith(f"{name}.") for sheet in sheets)
+    )
 
 
 SAID_SHIFT_PX = 0.3

@@ -10,7 +10,12 @@ from armscan.calibration.sheets.result import LaserFit
 from armscan.errors import EstimationError, InputError
 from armscan.models.calibration import SensorCalibration
 from armscan.models.light_sheet import LightSheet
-from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_pairs
+from armscan.pipeline.laser import (
+    BOARDS_STAGE,
+    STRIPES_STAGE,
+    about_unseen,
+    calibrate_sheets_from_pairs,
+)
 from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.pipeline.progress import ProgressEvent
 from armscan.reconstruction.labels import PointStatus
@@ -123,3 +128,11 @@ def test_an_image_with_little_clean_line_is_pointed_out() -> None:
     result = reconstruct([Exposure(image, "torn.png")], sensor())
     assert 0 < len(result.cloud) < 0.5 * len(result.images[0].profile)
     assert any("torn.png" in warning and "half" in warning for warning in result.warnings)
+
+
+def test_a_laser_of_which_no_sheet_came_is_named() -> None:
+    """In a scan that does not name its lasers its points would go to other sheets."""
+    lit = [replace(picture(f"{k}.png"), lasers=(name,)) for k, name in enumerate("AABC")]
+    (told,) = about_unseen([(one, None) for one in lit], ["A", "C.1", "C.2"])
+    assert "laser B was on in 1 of 4 images" in told
+    assert about_unseen([(lit[0], None), (picture("unnamed.png"), None)], ["A"]) == ()

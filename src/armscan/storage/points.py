@@ -38,6 +38,8 @@ STRIPE_NUMBERS: Final = (
     *("x_px", "y_px", "sigma_px", "normal_x", "normal_y", "width_px", "intensity"),
 )
 PLANE_NAMES = ("a", "b", "c", "d")
+NAMED_POINT = re.compile(rb"^#[#\s]*(?:\w+[\s,;]+)*?x(?:_mm)?[\s,;]+y(?:_mm)?[\s,;]+z", re.I | re.M)
+"""A comment that names the columns of points."""
 MOST_OF_A_PLANE = 2000
 """Bytes of a file with four numbers, a header and comments."""
 
@@ -110,7 +112,7 @@ def read_points_or_plane(path: Path) -> ProbedPoints | FloatArray:
 def is_plane(data: bytes) -> bool:
     """Whether a file holds a plane's four numbers and nothing else, no names of coordinates."""
     is_short = len(data) < MOST_OF_A_PLANE
-    return is_short and _plane_words(data) is not None and not re.search(rb"#.*\bx\b", data, re.I)
+    return is_short and _plane_words(data) is not None and not NAMED_POINT.search(data)
 
 
 def _plane_words(data: bytes) -> str | None:

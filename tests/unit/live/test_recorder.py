@@ -375,6 +375,29 @@ def test_samples_that_come_late_keep_their_ids(since: int, tmp_path: Path) -> No
     assert recorder.n_of_other_count == recorder.n_samples_of_other_count == 0
 
 
+def test_an_arm_that_is_always_late_and_stalls_keeps_its_images(tmp_path: Path) -> None:
+    """A quarter of a second late, and another 0.4 s once its clock is known."""
+
+    def late(k: int) -> int:
+        return 250_000_000 + max(0, 400_000_000 - 50_000_000 * (k - 100)) * (k >= 100)
+
+    path, step_ns = tmp_path / "scan.mcap", 50_000_000
+    recorder, _, posed = counted(path, 200, lambda k: k, lambda k: k, late_ns=late, step_ns=step_ns)
+    assert posed == [list(range(200))] and recorder.n_of_other_count == 0
+
+
+def test_samples_that_a_transport_held_back_for_long_keep_their_ids(tmp_path: Path) -> None:
+    """For three seconds, by a transport whose jitter leaves the arm's clock unknown."""
+    jitter_ns = np.random.default_rng(0).exponential(2e6, 160).astype(int).tolist()
+
+    def late(k: int) -> int:
+        return max(int(jitter_ns[k]), (3_000_000_000 - 10**8 * (k - 60)) * (k >= 60))
+
+    path = tmp_path / "scan.mcap"
+    recorder, _, posed = counted(path, 160, lambda k: k, lambda k: k, late_ns=late)
+    assert posed == [list(range(160))] and recorder.n_samples_of_other_count == 0
+
+
 def test_ids_are_kept_in_eight_bytes_a_device() -> None:
     ids, n = CommonIds(), 20_000
     sample = ArmSample(0, 1, 10**10)

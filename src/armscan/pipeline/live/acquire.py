@@ -186,7 +186,7 @@ class IdWatch:
         self._begun_ns: dict[int, int] = {}
         self._cameras_with_ids: set[int] = set()
         self._triggered_ns: int | None = None
-        self._has_arm_ids = False
+        self._arm_ids_ns: int | None = None
         self._has_sample = False
         self._unknown_ns: int | None = None
 
@@ -202,12 +202,14 @@ class IdWatch:
 
     def see_samples(self, samples: Sequence[ArmSample]) -> str:
         """The same of the arm."""
-        for one in samples:
-            self._has_arm_ids |= one.trigger_id is not None
+        if self._arm_ids_ns is None:
+            told = (one.t_host_ns for one in samples if one.trigger_id is not None)
+            self._arm_ids_ns = next(told, None)
         since_ns = self._triggered_ns
         if not self._is_triggered or self._has_sample or since_ns is None or not samples:
             return ""
-        text = IDS_APART if self._has_arm_ids else SAMPLES_WITHOUT
+        text = SAMPLES_WITHOUT if self._arm_ids_ns is None else IDS_APART
+        since_ns = max(since_ns, self._arm_ids_ns or 0)
         return text if samples[-1].t_host_ns > since_ns + WATCHED_NS else ""
 
     def see_instant(self, instant: MatchedInstant) -> str:

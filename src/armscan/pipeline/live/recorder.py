@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from armscan.devices.clocks import ElementStatus
+from armscan.devices.clocks import LARGEST_DRIFT, ElementStatus
 from armscan.devices.matching import (
     ARRIVED_TOGETHER_NS,
     SAME_COUNT_NS,
-    SAME_TRIGGER_NS,
     MatchedInstant,
     TimedSample,
 )
@@ -43,6 +42,9 @@ from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions
 
 BATCH_NS = 100_000_000
 """Samples of the arm are written so many together."""
+AHEAD_NS = 400_000_000
+"""An arm that has come so far past an image, with a lesser id, counts otherwise than its camera. A
+time by the arm's clock holds its whole least delay, and images wait half a second for samples."""
 _REPEATED = (ElementStatus.DUPLICATE, ElementStatus.LATE)
 _PAGE = 256
 
@@ -59,18 +61,25 @@ class CommonIds:
     def __init__(self) -> None:
         self._first_ns: tuple[dict[int, array[int]], dict[int, array[int]]] = ({}, {})
         self._arm_id = self._arm_ns = -1
+        self._device_ns = self._came_ns = -1
         self.is_found = False
 
     def see_sample(self, trigger_id: int, one: TimedSample) -> bool:
         """Take a sample; False if an image bears its id from another count."""
         self._arm_id, self._arm_ns = trigger_id, -1 if one.t_ns is None else one.t_ns
-        return self._see(trigger_id, one.t_ns, one.sample.t_host_ns, is_arm=True)
+        came_ns, passed_ns = one.sample.t_host_ns, one.sample.t_device_ns - self._device_ns
+        if self._came_ns >= 0 and passed_ns >= 0:
+            # samples that a transport held back came when the arm's own clock says, at the latest
+            longest_ns = round((1.0 + 2.0 * LARGEST_DRIFT) * passed_ns)
+            came_ns = min(came_ns, self._came_ns + longest_ns)
+        self._came_ns, self._device_ns = came_ns, one.sample.t_device_ns
+        return self._see(trigger_id, one.t_ns, came_ns, is_arm=True)
 
     def see_frame(self, trigger_id: int, frame: Frame, instant: MatchedInstant) -> bool:
         """Take an image; False if the arm's count is another."""
         t_ns = instant.t_ns
         # of one count no later sample bears a lesser id
-        is_ahead = t_ns is not None and self._arm_ns > t_ns + SAME_TRIGGER_NS
+        is_ahead = t_ns is not None and self._arm_ns > t_ns + AHEAD_NS
         if is_ahead and self._arm_id < trigger_id:
             return False
         is_known = instant.has_sample

@@ -366,7 +366,11 @@ def stripes_on_boards(
         poses = [
             estimate_board_pose(side.found[k], cameras.model(c)) for c, side in enumerate(sides)
         ]
-        usable = [(c, sides[c].found[k], pose) for c, pose in enumerate(poses) if pose]
+        usable = [
+            (c, sides[c].found[k], pose)
+            for c, pose in enumerate(poses)
+            if not isinstance(pose, FitFailure)
+        ]
         if not usable:
             continue
         placed = place_board(usable, cameras) if n_cameras == 2 else None

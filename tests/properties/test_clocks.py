@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from armscan.devices.clocks import (
-    LARGEST_SIGMA_NS,
     ClockFit,
     ClockModel,
     ElementStatus,
@@ -87,42 +86,19 @@ def test_sigma_tells_the_error_under_one_sided_delay(kind):
     assert 30 * 0.4 < np.sum(np.square(ratios)) < 30 * 1.7
 
 
-@pytest.mark.parametrize("kind", ["three stages", "jitter"])
-def test_sigma_tells_how_a_delay_without_a_sharp_limit_goes_on_sinking(kind):
-    """The longer it is watched, the rarer and faster is the fastest element."""
-    ratios = []
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        device, true = stream(80.0, 30.0, 50e-6, host0=10**15)
-        delay = 1e6 + (3e5 * rng.gamma(3, size=len(true)) if kind == "three stages" else
-                       1e5 * rng.standard_normal(len(true)))  # fmt: skip
-        host = arrivals(true, delay)
-        model, fits = ClockModel(), []
-        for k, (one, other) in enumerate(zip(device.tolist(), host.tolist(), strict=True)):
-            model.add(one, other)
-            fits += [model.fit] if k in (799, 2399) else []
-        early, late = fits
-        assert isinstance(early, ClockFit) and isinstance(late, ClockFit)
-        then = int(device[799])
-        sunk_ns = early.to_other_ns(then) - late.to_other_ns(then)
-        ratios.append(sunk_ns / np.hypot(early.sigma_ns(then), late.sigma_ns(then)))
-    assert np.sqrt(np.mean(np.square(ratios))) < 1.6
-
-
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_line_that_is_stable_and_sinks_is_known(seed):
-    """Jitter of the stamps by 0.4 ms: what it will still sink by is told, and hides no time."""
+def test_a_line_that_is_stable_under_jitter_is_known(seed):
+    """Of the stamps, by 0.4 ms: it has no sharp lower limit, and hides no time."""
     rng = np.random.default_rng(seed)
     device, true = stream(80.0, 240.0, 50e-6, host0=10**15)
     host = true + np.rint(3e6 + 4e5 * rng.standard_normal(len(true))).astype(np.int64)
-    model, n_unknown, n_rough = ClockModel(), 0, 0
+    model, n_unknown = ClockModel(), 0
     for k, (one, other) in enumerate(zip(device.tolist(), host.tolist(), strict=True)):
         model.add(one, other)
         if k >= 2400:
             assert isinstance(model.fit, ClockFit)
             n_unknown += model.missing(one) != ""
-            n_rough += model.fit.sigma_ns(one) > LARGEST_SIGMA_NS
-    assert n_unknown == model.n_jumps == 0 and n_rough > 100
+    assert n_unknown == model.n_jumps == 0
 
 
 def test_least_squares_through_all_would_be_wrong():

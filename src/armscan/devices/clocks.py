@@ -12,7 +12,7 @@ seen; it stays in the offset, is as constant as the transport, and is what
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from math import hypot, inf, sqrt
 
@@ -53,13 +53,9 @@ class ClockFit:
     drift
         Part by which the other clock runs faster.
     sigma_offset_ns, sigma_drift
-        Standard deviations of ``other_ns`` and of the drift, which do not correlate, of delays
-        with a sharp lower limit.
+        Standard deviations of ``other_ns`` and of the drift, which do not correlate.
     scatter_ns
         Of the fastest elements of the blocks about the line.
-    sunk_ns
-        By how much the line would sink if blocks were twice as long: delays whose least ones are
-        rare have no sharp limit. It is told, and decides nothing: such a line is stable.
     """
 
     device_ns: int
@@ -68,7 +64,6 @@ class ClockFit:
     sigma_offset_ns: float
     sigma_drift: float
     scatter_ns: float
-    sunk_ns: float = 0.0
 
     def to_other_ns(self, t_device_ns: int) -> int:
         """Time of the other clock, in whole ns."""
@@ -77,10 +72,6 @@ class ClockFit:
 
     def sigma_ns(self, t_device_ns: int) -> float:
         """Standard deviation of `to_other_ns`, the constant least delay apart."""
-        return hypot(self.line_sigma_ns(t_device_ns), self.sunk_ns)
-
-    def line_sigma_ns(self, t_device_ns: int) -> float:
-        """The same without what the line goes on sinking: whether a time is known."""
         return hypot(self.sigma_offset_ns, self.sigma_drift * (t_device_ns - self.device_ns))
 
 
@@ -138,7 +129,7 @@ class ClockModel:
         """Why a time cannot be told by the other clock; empty if it can."""
         if isinstance(self.fit, FitFailure):
             return self.fit.reason
-        sigma = self.fit.line_sigma_ns(t_device_ns)
+        sigma = self.fit.sigma_ns(t_device_ns)
         if sigma > LARGEST_SIGMA_NS:
             return (
                 f"its sigma is {sigma / 1e3:.3g} us, more than {LARGEST_SIGMA_NS / 1e3:g} us; "
@@ -150,7 +141,7 @@ class ClockModel:
         """Whether an element came before it can have been taken."""
         ahead = fit.to_other_ns(t_device_ns) - t_other_ns
         return ahead > SMALLEST_JUMP_NS and ahead > JUMP_SIGMAS * (
-            fit.scatter_ns + fit.line_sigma_ns(t_device_ns)
+            fit.scatter_ns + fit.sigma_ns(t_device_ns)
         )
 
     def _begin_anew(self, blocks: list[tuple[int, int]]) -> None:
@@ -190,8 +181,13 @@ class ClockModel:
         if last - first > WINDOW_NS:
             del self._blocks[0]
             return
-        self._blocks = _merged(self._blocks, self._slope)
+        pairs = zip(self._blocks[::2], self._blocks[1::2], strict=False)
+        odd = self._blocks[-1:] if len(self._blocks) % 2 else []
+        self._blocks = [min(pair, key=self._excess) for pair in pairs] + odd
         self._block_size *= 2
+
+    def _excess(self, block: tuple[int, int]) -> float:
+        return block[1] - block[0] - self._slope * (block[0] - self._blocks[0][0])
 
     def _refit(self) -> None:
         self.fit = fit_clock(self._blocks)
@@ -205,40 +201,20 @@ def _ahead_ns(fit: ClockFit, block: tuple[int, int]) -> int:
 
 
 def _limit_ns(fit: ClockFit, block: tuple[int, int]) -> float:
-    return max(SMALLEST_JUMP_NS, JUMP_SIGMAS * (fit.scatter_ns + fit.line_sigma_ns(block[0])))
-
-
-def _merged(fastest: list[tuple[int, int]], slope: float) -> list[tuple[int, int]]:
-    """The faster one of each two blocks, and the last one where it is alone."""
-    device0 = fastest[0][0]
-    pairs = zip(fastest[::2], fastest[1::2], strict=False)
-    odd = fastest[-1:] if len(fastest) % 2 else []
-    return [min(p, key=lambda b: b[1] - b[0] - slope * (b[0] - device0)) for p in pairs] + odd
+    return max(SMALLEST_JUMP_NS, JUMP_SIGMAS * (fit.scatter_ns + fit.sigma_ns(block[0])))
 
 
 def fit_clock(fastest: list[tuple[int, int]]) -> ClockFit | FitFailure:
     """Fit the line of two clocks under pairs of times.
 
-    Pairs of times (device, other) in ns are in time order, each the fastest of a block.
-    """
-    fit = _fit(fastest, FEWEST_BLOCKS)
-    if isinstance(fit, FitFailure):
-        return fit
-    longer = _fit(_merged(fastest, fit.drift), FEWEST_BLOCKS // 2)
-    if isinstance(longer, FitFailure):
-        return fit
-    return replace(fit, sunk_ns=abs(longer.to_other_ns(fit.device_ns) - fit.other_ns))
-
-
-def _fit(fastest: list[tuple[int, int]], fewest: int) -> ClockFit | FitFailure:
-    """The line, and the sigma of a sharp limit.
-
     Starts from the edge of the lower convex hull over the middle, below which no pair lies;
     leaves out pairs that are late as a whole; then fits by least squares and lowers the line by
     the scatter, by which the mean of delays with a hard lower limit lies above that limit.
+
+    Pairs of times (device, other) in ns are in time order, each the fastest of a block.
     """
-    if len(fastest) < fewest:
-        return FitFailure(f"{len(fastest)} of {fewest} blocks of elements are complete")
+    if len(fastest) < FEWEST_BLOCKS:
+        return FitFailure(f"{len(fastest)} of {FEWEST_BLOCKS} blocks of elements are complete")
     device0, other0 = fastest[len(fastest) // 2]
     x = np.array([device - device0 for device, _ in fastest], dtype=np.float64)
     y = np.array([other - other0 for _, other in fastest], dtype=np.float64) - x
@@ -246,8 +222,8 @@ def _fit(fastest: list[tuple[int, int]], fewest: int) -> ClockFit | FitFailure:
     above = y - low - slope * x
     is_kept = above <= SLOWEST * np.median(above) + RESOLUTION_NS
     n = int(is_kept.sum())
-    if n < fewest:
-        return FitFailure(f"{n} of {fewest} blocks of elements came without long delay")
+    if n < FEWEST_BLOCKS:
+        return FitFailure(f"{n} of {FEWEST_BLOCKS} blocks of elements came without long delay")
     x, y = x[is_kept], y[is_kept]
     middle = float(x.mean())
     spread = float(((x - middle) ** 2).sum())
@@ -255,7 +231,7 @@ def _fit(fastest: list[tuple[int, int]], fewest: int) -> ClockFit | FitFailure:
     residual = y - y.mean() - drift * (x - middle)
     # of few blocks the scatter itself is badly known: Student's variance in place of the normal's
     scatter = sqrt(float(residual @ residual) / (n - 2)) + RESOLUTION_NS
-    known = scatter * sqrt((n - 2) / max(n - 4, 1))
+    known = scatter * sqrt((n - 2) / (n - 4))
     if abs(drift) > LARGEST_DRIFT:
         return FitFailure(f"it would drift by {drift * 1e6:.0f} ppm, more than a clock does")
     offset = round(middle)

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of the lines of a drawn instrument that sweeps over a plate with a block, one camera.
 
-All lines of the head are on, also those of which the sensor has no sheet: what is named of these
-is wrong. Of a head of one line no name can be wrong, and none is counted; where no point at all is
-named, none is given, as in a refusal.
+By the rule that `labeller_for` gives a user, and of the points that are left in the cloud. No
+exposure names its lasers, and all lines of the head are on, also those of which the sensor has no
+sheet: what is named of these is wrong. Of a head of one line no name can be wrong, and none is
+counted; where no point at all is named, none is given, as in a refusal.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,15 +19,17 @@ from scipy.spatial.transform import Rotation
 
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
-from armscan.reconstruction.label_cross import CrossLabeller
-from armscan.reconstruction.labels import PointStatus, SingleLabeller
+from armscan.pipeline.measure import MeasureOptions, labeller_for, laser_warnings
+from armscan.reconstruction.labels import PointStatus
+from armscan.reconstruction.points import measure_points
 from armscan.records.profile import Profile, StripeFlag
 from rigs.instrument_stages import Outcome
 from rigs.instruments import Instrument, Light, Placement, seen_stripe
 
 N_EXPOSURES = 20
+FIRST_NS = 1_000_000_000
 TICK_NS = 12_500_000
 WIDTH_PX = 2.8
 MOST_WRONG = 0.001
@@ -35,43 +39,49 @@ MOST_WRONG = 0.001
 def run_naming(
     made: Instrument, sensor: SensorCalibration, names: Sequence[int]
 ) -> Iterator[Outcome]:
-    """Two crossed lines by their past and rays; one line, or unnamed parallel ones, by depth."""
+    """Names in each image by itself, and in a scan, whose exposures are known to follow."""
     if len(made.lights) == 1:
         return
+    yield _judged(made, sensor, names, is_scan=False)
+    if len(sensor.sheets) > 1:
+        yield _judged(made, sensor, names, is_scan=True)
+
+
+def _judged(
+    made: Instrument, sensor: SensorCalibration, names: Sequence[int], *, is_scan: bool
+) -> Outcome:
+    stage = "names, a scan" if is_scan else "names, one image"
     calibrated = list(dict.fromkeys(names))
     unknown = [k for k in range(len(made.lights)) if k not in calibrated]
-    is_cross = made.is_crossed and len(names) == 2
-    labeller = CrossLabeller(sensor) if is_cross else SingleLabeller(sensor)
-    stage = "names, crossed lines" if is_cross else "names, one image"
-    rng, wrong, named, asked = made.rng(40), 0, 0, 0
+    # Each line was on alone before the boards, so that those of which no sheet came are known.
+    sensor = replace(sensor, lasers_without_sheet=tuple(f"line {k}" for k in unknown))
+    options, wrong, named, asked = MeasureOptions(), 0, 0, 0
+    labeller = labeller_for(sensor, options, is_scan=is_scan)
+    swept = _swept(made, [*calibrated, *unknown])
     begun = time.process_time()
-    block = made.field_mm * np.array([0.15, 0.12, rng.uniform(0.02, 0.15)])
     try:
-        for k, head in enumerate(_sweep(made, rng)):
-            lit = [*calibrated, *unknown]
-            profile, truth = _exposed(made, lit, head, block, rng, f"image{k:02d}")
-            if not len(profile):
-                continue
-            pose: Pose = Pose(head.rotation, head.shift)
-            time_ns = 1_000_000_000 + k * TICK_NS
-            lasers = tuple(sheet.name for sheet in sensor.sheets) if is_cross else ()
-            found = labeller.label([profile], lasers, pose, time_ns).profiles[0]
-            is_named = found.status == int(PointStatus.MEASURED)
-            wrong += int((np.asarray(names)[found.sheet[is_named]] != truth[is_named]).sum())
-            named, asked = named + int(is_named.sum()), asked + len(profile)
+        for k, (profile, truth, pose) in enumerate(swept):
+            if not is_scan:
+                labeller.reset()
+            known = pose if is_scan else None
+            instant = labeller.label([profile], (), known, FIRST_NS + k * TICK_NS)
+            found = measure_points(instant, sensor, options.accepted_depths(sensor))[0].labelled
+            sheet = np.where(found.status == int(PointStatus.MEASURED), found.sheet, -1)
+            is_named = sheet >= 0
+            wrong += int((np.asarray(names)[sheet[is_named]] != truth[is_named]).sum())
+            named, asked = named + int(is_named.sum()), asked + len(sheet)
         refused = "" if named else "no point was given a name"
     except ArmscanError as error:
         refused = str(error)
+    seconds = time.process_time() - begun
     if refused:
-        # What several lines in one image are, nothing but their depth tells.
-        result = "wrongly refused" if is_cross else "rightly refused"
-        yield Outcome(stage, result, refused, seconds=time.process_time() - begun)
-        return
-    share = wrong / max(named, 1)
+        # What several lines are that do not cross, nothing but their depth tells.
+        result = "wrongly refused" if is_scan and made.is_crossed else "rightly refused"
+        return Outcome(stage, result, refused, seconds=seconds)
     without = f"; {len(unknown)} of {len(made.lights)} lines have no sheet" if unknown else ""
-    yield Outcome(
+    return Outcome(
         stage,
-        "right" if share < MOST_WRONG else "wrong",
+        "right" if wrong < MOST_WRONG * named else "wrong",
         f"{wrong} of {named} named points wrong{without}" if wrong else "",
         groups={
             "wrong": float(wrong),
@@ -79,8 +89,23 @@ def run_naming(
             "points": float(asked),
             "lines without a sheet": float(len(unknown)),
         },
-        seconds=time.process_time() - begun,
+        warnings=laser_warnings([()] * len(swept), labeller, sensor, options),
+        seconds=seconds,
     )
+
+
+def _swept(
+    made: Instrument, lit: Sequence[int]
+) -> list[tuple[Profile, IntArray, Pose[Base, Sensor]]]:
+    """What each exposure of a sweep shows, the points' true lines, and where the sensor was."""
+    rng, seen = made.rng(40), []
+    block = made.field_mm * np.array([0.15, 0.12, rng.uniform(0.02, 0.15)])
+    for k, head in enumerate(_sweep(made, rng)):
+        profile, truth = _exposed(made, lit, head, block, rng, f"image{k:02d}")
+        if len(profile):
+            pose: Pose[Base, Sensor] = Pose(head.rotation, head.shift)
+            seen.append((profile, truth, pose))
+    return seen
 
 
 def _sweep(made: Instrument, rng: np.random.Generator) -> list[Placement]:

@@ -311,6 +311,8 @@ class SensorCalibration(ArrayRecord):
     laser_colour
         The channel of colour images in which the stripes of the calibration were found, and in
         which stripes are sought from then on; ``auto`` where none was chosen.
+    lasers_without_sheet
+        Lasers that images of the calibration name and of which no sheet came.
     """
 
     camera: CameraCalibration
@@ -320,6 +322,7 @@ class SensorCalibration(ArrayRecord):
     diagnostics: SensorDiagnostics | None = None
     second: SecondCamera | None = None
     laser_colour: str = "auto"
+    lasers_without_sheet: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -266,22 +266,26 @@ def _fit_sheets(
         lost = "; ".join(f"{image.source}: {image.reason}" for image in skipped)
         reason = f"{fit.reason} (not used: {lost})" if lost else fit.reason
         return FitFailure("; ".join((reason, *about_camera)), fit.remedy)
-    about = (*about_camera, *about_views, *about_widths(fit))
-    if not options.sheet_names:
-        about = (*about, *about_unseen(pairs, [sheet.name for sheet in fit.sheets]))
-    return replace(fit, skipped=(*skipped, *fit.skipped), warnings=(*about, *fit.warnings))
-
-
-def about_unseen(pairs: Sequence[ExposurePair], sheets: Sequence[str]) -> tuple[str, ...]:
-    """Names lasers that images name and of which no sheet, or line of a fan, came."""
-    named = Counter(name for exposure, _ in pairs for name in exposure.lasers)
-    return tuple(
+    unseen = {} if options.sheet_names else unseen_lasers(pairs, fit.sheet_names)
+    about_lasers = (
         f"laser {name} was on in {n} of {len(pairs)} images, and no sheet came of it: where it "
         "shines in a scan that does not name its lasers, its points may be given to another "
         "sheet; take boards that show it, or leave it off"
+        for name, n in unseen.items()
+    )
+    about = (*about_camera, *about_views, *about_widths(fit), *about_lasers, *fit.warnings)
+    skipped = [*skipped, *fit.skipped]
+    return replace(fit, skipped=tuple(skipped), warnings=about, lasers_without_sheet=tuple(unseen))
+
+
+def unseen_lasers(pairs: Sequence[ExposurePair], sheets: Sequence[str]) -> dict[str, int]:
+    """Lasers that images name, and how many do, of which no sheet, or line of a fan, came."""
+    named = Counter(name for exposure, _ in pairs for name in exposure.lasers)
+    return {
+        name: n
         for name, n in named.items()
         if not any(sheet == name or sheet.startswith(f"{name}.") for sheet in sheets)
-    )
+    }
 
 
 SAID_SHIFT_PX = 0.3
@@ -397,7 +401,11 @@ def calibrate_sheets_again(
     fit = calibrate_sheets(boards, sensor, options)
     if isinstance(fit, FitFailure):
         return fit
-    return replace(fit, laser_colour=cast(LaserColour, sensor.laser_colour))
+    return replace(
+        fit,
+        laser_colour=cast(LaserColour, sensor.laser_colour),
+        lasers_without_sheet=sensor.lasers_without_sheet,
+    )
 
 
 def _poor_images(

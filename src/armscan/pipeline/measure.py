@@ -36,7 +36,7 @@ from armscan.pipeline.progress import (
     in_order,
     silent,
 )
-from armscan.reconstruction.label_cross import CrossLabeller
+from armscan.reconstruction.label_cross import CrossLabeller, stripes_apart
 from armscan.reconstruction.label_stereo import StereoLabeller
 from armscan.reconstruction.labels import (
     LabelledProfile,
@@ -68,8 +68,6 @@ EXTRACTION, NAMING, PLACING = "extraction", "naming", "placing"
 """Stages whose processor time is told."""
 TRIMMED_AFTER = 100
 """Instants after which the cache is kept small."""
-LEAST_APART_RAD = 0.5
-"""Stripes whose directions differ by more are told from each other by direction."""
 LOOKED_AT, LEAST_LINE = 10, 30
 """Images of a scan of which the channel is judged, evenly spread, and points that make a line in
 one: a glint in a single image decides nothing."""
@@ -157,18 +155,10 @@ def labeller_for(
                 remedy="leave --sheet out",
             )
         return StereoLabeller(sensor, options.depths or LABEL_DEPTHS)
-    if n_sheets > 1 and not options.sheet and (is_scan or stripes_cross(sensor)):
+    if n_sheets > 1 and not options.sheet and (is_scan or stripes_apart(sensor).any()):
         return CrossLabeller(sensor, options.depths or LABEL_DEPTHS)
     depths = options.accepted_depths(sensor)
     return SingleLabeller(sensor, depths, options.sheet, options.depths or LABEL_DEPTHS)
-
-
-def stripes_cross(sensor: SensorCalibration) -> bool:
-    """True if the stripes of two sheets on a wall that faces the camera run clearly apart."""
-    normals = np.array([calibrated.sheet.axes[2][:2] for calibrated in sensor.sheets])
-    angles = np.arctan2(normals[:, 1], normals[:, 0])
-    apart = np.abs(np.sin(angles[:, None] - angles))
-    return bool((apart > np.sin(LEAST_APART_RAD)).any())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -652,7 +642,8 @@ def laser_warnings(
     sensor: SensorCalibration,
     options: MeasureOptions,
 ) -> tuple[str, ...]:
-    """Warn of exposures that name other lasers than the calibrated ones, or than the one chosen.
+    """Warn of exposures that name other lasers than the calibrated ones, or than the one chosen,
+    or that name none where one camera's stripe may be of a laser that has no sheet.
 
     Parameters
     ----------
@@ -685,5 +676,12 @@ def laser_warnings(
             f"no sheet: their stripes were measured as if they were of {names}. If one of these is "
             "it under another name, `armscan reconstruct` takes that by --sheet; else the "
             "calibration is of another head"
+        )
+    unnamed, unseen = named[()], sensor.lasers_without_sheet
+    if unnamed and unseen and not options.sheet and sensor.second is None:
+        warnings.append(
+            f"{unnamed} exposures do not name their lasers, and of the laser {', '.join(unseen)} "
+            "the calibration has no sheet: where it was on, its points may be given to another "
+            "sheet"
         )
     return tuple(warnings)

@@ -276,7 +276,7 @@ LAYOUTS: Mapping[type, Layout] = {
     SecondCamera: Layout(lends={"camera": "camera_provenance"}),
     SensorCalibration: Layout(
         lends={"camera": "camera_provenance"},
-        optional=("second", "laser_colour"),
+        optional=("second", "laser_colour", "lasers_without_sheet"),
         covariance_names=lambda sensor: sensor.parameter_names,
         check=_fault_of_colour,
     ),

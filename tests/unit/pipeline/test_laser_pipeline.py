@@ -13,8 +13,8 @@ from armscan.models.light_sheet import LightSheet
 from armscan.pipeline.laser import (
     BOARDS_STAGE,
     STRIPES_STAGE,
-    about_unseen,
     calibrate_sheets_from_pairs,
+    unseen_lasers,
 )
 from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.pipeline.progress import ProgressEvent
@@ -130,9 +130,8 @@ def test_an_image_with_little_clean_line_is_pointed_out() -> None:
     assert any("torn.png" in warning and "half" in warning for warning in result.warnings)
 
 
-def test_a_laser_of_which_no_sheet_came_is_named() -> None:
-    """In a scan that does not name its lasers its points would go to other sheets."""
-    lit = [replace(picture(f"{k}.png"), lasers=(name,)) for k, name in enumerate("AABC")]
-    (told,) = about_unseen([(one, None) for one in lit], ["A", "C.1", "C.2"])
-    assert "laser B was on in 1 of 4 images" in told
-    assert about_unseen([(lit[0], None), (picture("unnamed.png"), None)], ["A"]) == ()
+def test_lasers_of_which_no_sheet_came_are_found() -> None:
+    """In a scan that does not name its lasers their points would go to other sheets."""
+    lit = [replace(picture(f"{k}.png"), lasers=(name,)) for k, name in enumerate("ABBC")]
+    assert unseen_lasers([(one, None) for one in lit], ["A", "C.1", "C.2"]) == {"B": 2}
+    assert unseen_lasers([(lit[0], None), (picture("unnamed.png"), None)], ["A"]) == {}

@@ -119,6 +119,17 @@ def test_the_users_word_names_a_laser_that_the_calibration_does_not_know() -> No
         assert not laser_warnings([lasers], labeller_for(sensor, options), sensor, options)
 
 
+def test_a_scan_that_names_no_laser_is_told_of_those_without_sheet() -> None:
+    """A stripe of one camera that meets a sheet may be any laser's; the user's word settles it."""
+    sensor, options = replace(two_sheets(), lasers_without_sheet=("far",)), MeasureOptions()
+    labeller = labeller_for(sensor, options)
+    (told,) = laser_warnings([(), ("left",), ()], labeller, sensor, options)
+    assert told.startswith("2 exposures do not name their lasers, and of the laser far the cal")
+    assert not laser_warnings([("left",), ("right",)], labeller, sensor, options)
+    assert not laser_warnings([()], labeller, two_sheets(), options)
+    assert not laser_warnings([()], labeller, sensor, MeasureOptions(sheet="left"))
+
+
 def test_a_laser_without_sheet_beside_a_calibrated_one_is_not_taken_for_it() -> None:
     choice = labelled(stripes(0.13), two_sheets(), DepthRange(1.0), lasers=("left", "C"))
     assert choice.reason == "of C, which was on, too, the calibration has no sheet"

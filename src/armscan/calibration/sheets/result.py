@@ -391,6 +391,8 @@ class LaserFit(ArrayRecord):
     board_bow_mm
         (2,) bow of the board along x and along y that stripes were placed with; zero where its
         views show none, empty where nothing of it was asked of them.
+    lasers_without_sheet
+        Lasers that images name and of which no sheet came.
     """
 
     sheets: tuple[SheetFit, ...]
@@ -407,6 +409,7 @@ class LaserFit(ArrayRecord):
     channel_reason: str = ""
     print_reason: str = ""
     board_bow_mm: tuple[float, ...] = ()
+    lasers_without_sheet: tuple[str, ...] = ()
 
     @property
     def sheet_names(self) -> tuple[str, ...]:
@@ -425,6 +428,7 @@ class LaserFit(ArrayRecord):
             diagnostics=self.diagnostics,
             second=self.second,
             laser_colour=self.laser_colour,
+            lasers_without_sheet=self.lasers_without_sheet,
         )
 
 

@@ -27,7 +27,13 @@ from armscan.calibration.hand_eye.estimate import (
     joint_covariance,
     minimise_distances,
 )
-from armscan.calibration.hand_eye.noise import estimate_noise, solve_linear, total_covariance
+from armscan.calibration.hand_eye.noise import (
+    NoiseComponent,
+    NoiseEstimate,
+    estimate_noise,
+    solve_linear,
+    total_covariance,
+)
 from armscan.calibration.hand_eye.observations import CondensedObservations, PlateReference
 from armscan.calibration.hand_eye.search import (
     Start,
@@ -56,6 +62,8 @@ ASKED_FOR = 0.05
 is. Scaled down to nothing, by a scale or by a sheet shifted on to the camera, any stripes lie on
 one point of any plate: scatter that is estimated beside such unknowns vanishes."""
 OF_SENSOR = ("scale", "sheet")
+LEAST_FREEDOM = 2.0
+"""Up to which an F statistic has no mean."""
 FACTS_OF_POSTURE = 2
 """What a stripe says of its posture's error: a shift and a slope."""
 SUSPICIOUS = 2e-3
@@ -232,7 +240,9 @@ def _judged(
     if np.linalg.cond(covariance) > 1e12:
         return None
     statistic = float(values @ np.linalg.solve(covariance, values)) / n_new
-    chance = float(fdtrc(n_new, n_facts - n_known - n_new, max(statistic, 0.0)))
+    told = freedom_of(fit.components, fit.noise, solution.gain[n_known:], covariance)
+    freedom = min(float(n_facts - n_known - n_new), told)
+    chance = float(fdtrc(n_new, freedom, max(statistic, 0.0)))
     moved = unknowns.jacobian @ (values / scale)
     quadratic = float(residual @ solution.projected @ residual)
     determinant = float(np.linalg.slogdet(total)[1])
@@ -248,6 +258,39 @@ def _judged(
         hand_eye_covariance=solution.covariance[:N_HAND_EYE, :N_HAND_EYE],
         arm_mm=fit.arm_mm,
     )
+
+
+def freedom_of(
+    components: Sequence[NoiseComponent],
+    noise: NoiseEstimate,
+    gain: FloatArray,
+    covariance: FloatArray,
+) -> float:
+    """Degrees of freedom of a covariance (Q, Q) of unknowns that rests on estimated scatter.
+
+    A cause or two may set it, and each is known only as the covariance of its logarithm says:
+    how many numbers the postures tell of all causes together is no measure of that. Of each
+    principal direction they are those of the chi-square of equal mean and variance
+    (Satterthwaite), of all together as by Fai and Cornelius, J. Statist. Comput. Simul. 54, 1996.
+    ``gain`` (Q, M) takes residuals to the unknowns.
+    """
+    variances, axes = np.linalg.eigh(covariance)
+    turned = axes.T @ gain
+    by_log = np.array(
+        [
+            2.0 * sigma**2 * np.einsum("qm,qm->q", turned @ one.covariance, turned)
+            for one, sigma in zip(components, noise.sigmas, strict=True)
+        ]
+    )
+    spread = np.einsum("kq,kl,lq->q", by_log, noise.log_covariance, by_log)
+    each = 2.0 * variances**2 / np.maximum(spread, 1e-12 * variances**2)
+    if len(each) == 1:
+        return float(each[0])
+    usable = each[each > LEAST_FREEDOM]
+    mean = float((usable / (usable - LEAST_FREEDOM)).sum())
+    if mean <= len(each):
+        return float(each.min())
+    return 2.0 * mean / (mean - len(each))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

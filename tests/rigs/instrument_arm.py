@@ -9,6 +9,7 @@ stripes reach the hand-eye through the sensor as it was calibrated.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,10 +56,15 @@ SCATTERS = (
 )
 BLAMES_OTHERS = ("plane left free", "would leave", "would fit", "agree with each other")
 """Words of refusals, by what they say; the last with what else some name as the cause."""
-LEAST_POSTURES, LEAST_CROSSED = 5, 4
-"""The software says that fewer are refused; of crossed stripes on a plate the second."""
+LEAST_TOLD, LEAST_TOLD_ON_SPHERE = 10, 13
+"""Numbers that the postures must tell of their poses, four more than there are unknowns. A section
+of the sphere tells three, a stripe on a plate two, stripes that cross three: the software refuses
+fewer than five, five and four postures."""
+CROSSED = 0.2
+"""Second extent over the first from which stripes cross (equal ones at their middles: 23 degrees);
+below, the software counts them as one."""
 TYPICAL_TILT = np.radians(25.0)
-"""Of plates against the optical axis: by its sine a turn about a point behind shows."""
+"""Of plates against the optical axis."""
 TIP_RATIO = (0.1, 0.8)
 """What a tip's calibration errs by over what a touch does: the software expects 0.39."""
 MOST_BEHIND_MM = 400.0
@@ -122,8 +128,7 @@ def run_hand_eye(
     best = hand_eye_bound(made, seen, sensor.covariance, on_sphere)
     stage = "hand-eye on sphere" if on_sphere else "hand-eye on plate"
     if isinstance(found, FitFailure):
-        least = LEAST_CROSSED if len(lights) > 1 and not on_sphere else LEAST_POSTURES
-        are_few = len({one.posture for one in seen}) < least
+        are_few = are_few_postures(seen, on_sphere)
         limit_mm = _most_open_mm(made, on_sphere)
         is_open = best is None or _open_mm(best) > limit_mm
         result = refusal(made, found.reason, are_few=are_few, is_open=is_open)
@@ -193,15 +198,34 @@ def refusal(made: Instrument, reason: str, *, are_few: bool, is_open: bool) -> s
     return "rightly refused" if is_right else "wrongly refused"
 
 
+def are_few_postures(seen: Sequence[Seen], on_sphere: bool) -> bool:
+    """Whether the postures tell fewer numbers than the software asks for."""
+    postures = {one.posture for one in seen}
+    if on_sphere:
+        return 3 * len(postures) < LEAST_TOLD_ON_SPHERE
+    told = 0
+    for posture in postures:
+        points = np.concatenate([one.points for one in seen if one.posture == posture])
+        extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        told += 3 if extent[1] > CROSSED * extent[0] else 2
+    return told < LEAST_TOLD
+
+
 def _says(reason: str, words: tuple[str, ...]) -> bool:
     return any(one in reason for one in words)
 
 
 def arm_scatter_mm(made: Instrument) -> float:
-    """Of a point at the ends of a stripe, an axis."""
+    """Of a point at the ends of a stripe, along a plate's normal.
+
+    A turn about an axis of any direction moves the point by its distance from the turning point
+    across the normal, which is tilted by `TYPICAL_TILT` against the optical axis to any side.
+    """
     half = 0.35 * made.field_mm
-    apart = np.linalg.norm(_scan_point(made) - turning_point(made)) * np.sin(TYPICAL_TILT)
-    return float(made.arm.position_mm * np.hypot(1.0, np.hypot(half, apart) / made.arm.lever_mm))
+    x, y, z = _scan_point(made) - turning_point(made)
+    along, aside = np.sin(TYPICAL_TILT) ** 2, 1.0 - 0.5 * np.sin(TYPICAL_TILT) ** 2
+    across = np.sqrt(along * z**2 + aside * (x**2 + y**2))
+    return float(made.arm.position_mm * np.hypot(1.0, np.hypot(half, across) / made.arm.lever_mm))
 
 
 def _most_open_mm(made: Instrument, on_sphere: bool) -> float:

@@ -63,7 +63,7 @@ def chosen(
         solve,
         validate,
         lambda solution: name_of(solution) in folding,
-        lambda solution, _names: (chances or {}).get(name_of(solution), 0.0),
+        lambda _smaller, larger, _names: (chances or {}).get(name_of(larger), 0.0),
         lambda solution: name_of(solution) in alike,
     )
 
@@ -149,7 +149,7 @@ def test_a_gain_that_scatters_more_than_it_is_does_not_count() -> None:
         ),
         validate,
         lambda _solution: False,
-        lambda _solution, _names: 0.0,
+        lambda _smaller, _larger, _names: 0.0,
         lambda _solution: False,
     )
     assert isinstance(found, ChosenModel)

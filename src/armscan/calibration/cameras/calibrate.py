@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, reduce
 
 import numpy as np
 
 from armscan.calibration.cameras.adjustment import (
     Observations,
+    State,
     free_basis,
     gather,
     joint_covariance,
@@ -47,9 +48,11 @@ from armscan.calibration.cameras.result import (
 from armscan.calibration.cameras.robust import (
     MISFIT_LEVEL,
     MISFIT_OUTLIERS,
+    SUSPECT_LEVEL,
     WRONG_LEVEL,
     BoardResiduals,
     Solution,
+    better_fit,
     board_residuals,
     board_warp,
     chi2_of_points,
@@ -65,12 +68,13 @@ from armscan.calibration.cameras.robust import (
 )
 from armscan.calibration.cameras.start import (
     estimate_board_pose,
+    mirrored_pose,
     seen_stretch,
     starting_state,
     view_homography,
 )
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import PARAMETER_NAMES, TANGENTIAL, CameraModel
@@ -577,11 +581,16 @@ def _solve(
     model: DistortionModel,
     options: CameraOptions,
 ) -> Solution | FitFailure:
-    start = starting_state(used, observations, prepared.homographies, model, options)
-    if isinstance(start, FitFailure):
-        return start
     basis, _ = free_basis(model, options)
-    solution = solve_robustly(observations, start[0], basis, start[1], options.max_steps)
+    starts = _starts(used, observations, prepared, model, options)
+    if isinstance(starts, FitFailure):
+        return starts
+    trusted = starts[0][1]
+    found = [
+        solve_robustly(observations, state, basis, trusted, options.max_steps)
+        for state, _ in starts
+    ]
+    solution = reduce(better_fit, [_unmirrored(each, trusted, options) for each in found])
     for _ in range(EXCESS_ROUNDS):
         if isinstance(solution, FitFailure):
             return solution
@@ -589,12 +598,74 @@ def _solve(
         if excess <= 0.0:
             break
         noisier = with_excess(observations, excess)
-        solution = solve_robustly(noisier, solution.state, basis, start[1], options.max_steps)
+        solution = solve_robustly(noisier, solution.state, basis, trusted, options.max_steps)
     if isinstance(solution, FitFailure):
         return solution
     if largest_angle_deg(solution.state.rotations[:, :, 2]) < MIN_ANGLE_DEG:
         return PARALLEL
     return solution
+
+
+def _starts(
+    used: Sequence[TargetView],
+    observations: Observations,
+    prepared: PreparedViews,
+    model: DistortionModel,
+    options: CameraOptions,
+) -> list[tuple[State, BoolArray]] | FitFailure:
+    """The closed form, and for a pinhole the one of square pixels with its axis in the middle.
+
+    Where views tell little, noise throws the principal point out of the image or makes one focal
+    length twice the other, from where the adjustment may end in a minimum that is not the least.
+    """
+    first = starting_state(used, observations, prepared.homographies, model, options)
+    if isinstance(first, FitFailure):
+        return first
+    if model == "fisheye" or options.is_principal_point_fixed:
+        return [first]
+    second = starting_state(
+        used, observations, prepared.homographies, model, options, is_centred=True
+    )
+    if isinstance(second, FitFailure) or np.array_equal(first[0].shared, second[0].shared):
+        return [first]
+    return [first, second]
+
+
+MIRROR_ROUNDS = 5
+
+
+def _unmirrored(
+    solution: Solution | FitFailure, trusted: BoolArray, options: CameraOptions
+) -> Solution | FitFailure:
+    """The solution, or a better one with boards mirrored that fit badly: all of them, or the worst.
+
+    A distant board fits almost as well when it is mirrored at the line of sight; from a poor start
+    some boards stay so, and draw the camera with them.
+    """
+    for _ in range(MIRROR_ROUNDS):
+        if isinstance(solution, FitFailure):
+            break
+        before, seen, steps = solution, solution.observations, options.max_steps
+        bad = np.flatnonzero(before.view_levels > SUSPECT_LEVEL)
+        worst = bad[np.argsort(before.view_levels[bad])[-1:]]
+        for chosen in [bad, worst][: len(bad)]:
+            turned = _mirrored(before, chosen)
+            other = solve_robustly(seen, turned, before.basis, trusted, steps)
+            solution = better_fit(before, other)
+            if solution is not before:
+                break
+        if solution is before:
+            break
+    return solution
+
+
+def _mirrored(solution: Solution, views: IntArray) -> State:
+    """The state with the boards of some views mirrored at the line of sight."""
+    state, seen = solution.state, solution.observations
+    poses = [state.pose(v) for v in range(seen.n_views)]
+    for v in views:
+        poses[v] = mirrored_pose(poses[v], seen.board_mm[seen.rows(v)].mean(axis=0))
+    return State.from_poses(state.shared, poses)
 
 
 def _excess_variance_px2(observations: Observations, solution: Solution) -> float:

@@ -210,6 +210,28 @@ def _reweighted(
     return state
 
 
+SAME_FIT = 1e-6
+"""Part of the cost by which two solutions of one minimum differ at most."""
+
+
+def better_fit(
+    first: Solution | FitFailure, second: Solution | FitFailure
+) -> Solution | FitFailure:
+    """Of two solutions over the same points the one that all of them fit better; else the first.
+
+    By Cauchy's cost at the level of the typical view of the better one, so that neither outliers
+    nor which of them were left out decide.
+    """
+    if isinstance(second, FitFailure):
+        return first
+    if isinstance(first, FitFailure):
+        return second
+    squares = [chi2_of_points(each.observations, each.state) for each in (first, second)]
+    typical = min(_typical(_view_levels(first.observations, chi2)) for chi2 in squares)
+    cost = [float(np.log1p(chi2 / (CAUCHY_SCALE**2 * typical)).sum()) for chi2 in squares]
+    return second if cost[1] < (1.0 - SAME_FIT) * cost[0] else first
+
+
 def judge(observations: Observations, chi2: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Relative level (V,) of each view and which points (N,) are outliers against their own view.
 

@@ -163,13 +163,13 @@ def constraint_rows(homography: FloatArray) -> FloatArray:
 
 
 def intrinsics_from_homographies(
-    homographies: Sequence[FloatArray], width_px: int, height_px: int
+    homographies: Sequence[FloatArray], width_px: int, height_px: int, *, is_centred: bool = False
 ) -> FloatArray | FitFailure:
     """Solve eq. 2.34 for the intrinsic matrix (3, 3) of eq. 2.18, without skew.
 
     From (3, 3) homographies from board to pixels: first with all five unknowns of B; if noise
     leaves no positive definite B (eq. 2.32), with the principal point in the middle of the image;
-    and then with one focal length.
+    and then with one focal length; only that if ``is_centred``.
     """
     centre = np.array([0.5 * (width_px - 1), 0.5 * (height_px - 1)])
     scale = 0.5 * (width_px + height_px)
@@ -180,7 +180,8 @@ def intrinsics_from_homographies(
         blocks.append(constraint_rows(unit / np.linalg.norm(unit[:, :2])))
     # Without skew B12 is zero: its column drops out.
     rows = np.concatenate(blocks)[:, [0, 2, 3, 4, 5]]
-    for solution in (_solve(rows, _FREE_CENTRE), _solve(rows, _FIXED_CENTRE), _solve_square(rows)):
+    solutions = (_solve(rows, _FREE_CENTRE), _solve(rows, _FIXED_CENTRE), _solve_square(rows))
+    for solution in solutions[2 * is_centred :]:
         matrix = _matrix_from_b(solution)
         if matrix is not None:
             return np.asarray(np.linalg.inv(to_unit) @ matrix)
@@ -309,8 +310,12 @@ def starting_state(
     homographies: Sequence[FloatArray],
     model: DistortionModel,
     options: CameraOptions,
+    *,
+    is_centred: bool = False,
 ) -> tuple[State, BoolArray] | FitFailure:
     """Closed-form camera and poses, from one homography (3, 3) a view, from board mm to pixels.
+
+    ``is_centred`` puts the principal point in the middle of the image and takes pixels as square.
 
     Returns
     -------
@@ -326,7 +331,9 @@ def starting_state(
     rms = np.array([homography_rms_px(v, h) for v, h in zip(views, homographies, strict=True)])
     trusted = np.asarray(rms <= max(SUSPECT_HOMOGRAPHY * float(np.median(rms)), 1e-6))
     chosen = [h for h, ok in zip(homographies, trusted, strict=True) if ok]
-    matrix = intrinsics_from_homographies(chosen, width, height)
+    matrix = intrinsics_from_homographies(chosen, width, height, is_centred=is_centred)
+    if isinstance(matrix, FitFailure) and is_centred:
+        return matrix
     if isinstance(matrix, FitFailure):
         # lines that are bent by much hide what the closed form looks for
         bent = _fisheye_start(views, replace(observations, lens="fisheye"))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -216,3 +217,16 @@ def test_a_board_before_ribs_that_make_larger_lattices_is_found() -> None:
     view = found(np.clip(gaussian_filter(image, 0.8), 0.0, 255.0), 2)
     assert len(view) == 40
     assert_right(view, corners)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_of_a_tangle_of_crossings_no_count_is_said(seed: int) -> None:
+    """Chance crossings of a texture lie thinly spread: no rectangle as large as the board is full
+    of them, so that none of that size may be told as corners that were seen.
+    """
+    texture = gaussian_filter(np.random.default_rng(seed).normal(size=(480, 640)), 1.2)
+    levels = np.clip(128.0 + 60.0 * texture / texture.std(), 0.0, 255.0).astype(np.uint8)
+    found = detect_target(Exposure(levels, "texture.png"), BOARD)
+    assert not isinstance(found, TargetView)
+    said = re.search(r"(\d+) x (\d+) corners were seen", found.reason)
+    assert said is None or int(said[1]) * int(said[2]) < BOARD.columns * BOARD.rows

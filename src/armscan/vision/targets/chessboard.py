@@ -679,18 +679,17 @@ def _is_board(extent: Extent) -> bool:
 
 
 def _not_found(exposure: Exposure, target: Chessboard, extents_seen: list[Extent]) -> FitFailure:
-    wanted = f"{target.columns} x {target.rows}"
-    seen = max(extents_seen, key=lambda e: (_is_board(e), e.is_whole, len(e.cells)), default=None)
+    wanted = f"{target.columns} x {target.rows} inner corners"
+    none = f"{exposure.source}: no chessboard of {wanted} in view"
+    # a tangle of a few crossings within a large rectangle says nothing of a board's counts
+    filled = [e for e in extents_seen if len(e.cells) >= _MIN_FILLED * e.size[0] * e.size[1]]
+    seen = max(filled, key=lambda e: (_is_board(e), e.is_whole, len(e.cells)), default=None)
     if seen is None:
         return FitFailure(
-            f"{exposure.source}: no chessboard of {wanted} inner corners in view",
-            f"show the board sharp and evenly lit, at least {SMALLEST} corners each way",
+            none, f"show the board sharp and evenly lit, at least {SMALLEST} corners each way"
         )
     columns, rows = max(seen.counts), min(seen.counts)
-    reason = (
-        f"{exposure.source}: no chessboard of {wanted} inner corners in view; "
-        f"{columns} x {rows} corners were seen"
-    )
+    reason = f"{none}; {columns} x {rows} corners were seen"
     if _is_board(seen):
         return OtherCountSeen(
             reason, "count the corners where four squares meet", columns=columns, rows=rows

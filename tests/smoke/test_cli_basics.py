@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -159,6 +160,58 @@ def test_failures_become_codes(
     assert out == ""
     assert message in err
     assert "Traceback" not in err
+
+
+LONG_WORK = """
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from armscan.cli import app, main
+from armscan.pipeline import progress
+progress.count_cores = lambda: 2
+def work(item):
+    if item == 0:
+        print("begun", file=sys.stderr, flush=True)
+    time.sleep(60.0)
+app.command = lambda: lambda **_: list(progress.in_order(work, range(6), 2))
+sys.exit(main())
+"""
+WITHIN_EXEC = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from armscan.cli import app, main
+wait = "import time; print('begun', file=sys.stderr, flush=True); time.sleep(60.0)"
+app.command = lambda: lambda **_: exec(wait)
+sys.exit(main())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
+@pytest.mark.parametrize("program", [LONG_WORK, WITHIN_EXEC], ids=["threads", "exec"])
+@pytest.mark.parametrize(
+    ("numbers", "code", "word"),
+    [
+        ([signal.SIGINT], 130, "interrupted"),
+        ([signal.SIGINT] * 3, 130, "interrupted"),
+        ([signal.SIGTERM], 143, "ended"),
+    ],
+    ids=["one", "three", "term"],
+)
+def test_what_ends_a_command_does_not_wait_for_what_it_had_begun(
+    program: str, numbers: list[signal.Signals], code: int, word: str
+) -> None:
+    words = [sys.executable, "-c", program]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as run:
+        assert run.stderr is not None
+        while run.stderr.readline() != "begun\n":
+            assert run.poll() is None, "it ended by itself"
+        for number in numbers:
+            run.send_signal(number)
+        try:
+            err = run.communicate(timeout=20.0)[1]
+        finally:
+            run.kill()
+    assert run.returncode == code
+    assert err.removeprefix("begun\n") == f"{word}; no file is left half-written\n"
 
 
 def test_a_bug_shows_its_traceback_on_request(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import io
 import os
@@ -12,11 +13,11 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import cast
+from typing import NoReturn, cast
 
 import typer
 
@@ -130,7 +131,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
     word = "ended" if ending.is_asked else "interrupted"
     code = EXIT_ENDED if ending.is_asked else EXIT_INTERRUPTED
-    return _fail(f"{word}; no file is left half-written", code, prefix="")
+    sentence = f"{word}; no file is left half-written"
+    return _leave(sentence, code) if arguments is None else _fail(sentence, code, prefix="")
+
+
+def _leave(sentence: str, code: int) -> NoReturn:
+    """End the process without waiting for threads, whose work nobody wants any more.
+
+    Nor does Python end it, which takes an interrupt within ``exec`` for one that nobody caught, and
+    ends by the signal instead of with the code.
+    """
+    with suppress(ValueError):
+        # of another thread than the main one
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _fail(sentence, code, prefix="")
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        # nobody may read them any more
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def _run(arguments: Sequence[str] | None) -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import cast
@@ -35,6 +34,7 @@ from armscan.pipeline.progress import (
     count_cores,
     in_order,
     silent,
+    worker_threads,
 )
 from armscan.reconstruction.label_cross import CrossLabeller, stripes_apart
 from armscan.reconstruction.label_stereo import StereoLabeller
@@ -227,7 +227,7 @@ def measure_instants(
             stack.callback(cache.trim)
         # where no instant is read ahead the cameras of one are the work that there is at a time
         is_shared = not reads_ahead and len(cameras) > 1 and count_cores() > 1
-        pool = stack.enter_context(ThreadPoolExecutor(len(cameras))) if is_shared else None
+        pool = stack.enter_context(worker_threads(len(cameras))) if is_shared else None
         each_camera = map if pool is None else pool.map
         n_ahead = MOST_THREADS if reads_ahead else 1
         for n, (images, profiles) in enumerate(in_order(extract, instants, n_ahead)):

@@ -50,6 +50,24 @@ def count_cores() -> int:
     return os.cpu_count() or 1
 
 
+@contextmanager
+def worker_threads(n_threads: int) -> Iterator[ThreadPoolExecutor]:
+    """Threads for the block; an error in it drops the work that nobody has begun.
+
+    An interrupt does not wait for the work under way either: a first run compiles kernels in it for
+    half a minute on a busy machine, and Ctrl-C would seem to do nothing.
+    """
+    pool = ThreadPoolExecutor(n_threads)
+    is_awaited = True
+    try:
+        yield pool
+    except (KeyboardInterrupt, GeneratorExit):
+        is_awaited = False
+        raise
+    finally:
+        pool.shutdown(wait=is_awaited, cancel_futures=True)
+
+
 def in_order(
     work: Callable[[Item], Result], items: Iterable[Item], most_threads: int
 ) -> Generator[tuple[Item, Result]]:
@@ -64,18 +82,15 @@ def in_order(
         yield from ((item, work(item)) for item in items)
         return
     pending: deque[tuple[Item, Future[Result]]] = deque()
-    with ThreadPoolExecutor(n_threads) as pool:
-        try:
-            for item in items:
-                pending.append((item, pool.submit(work, item)))
-                if len(pending) > n_threads:
-                    first, future = pending.popleft()
-                    yield first, future.result()
-            while pending:
+    with worker_threads(n_threads) as pool:
+        for item in items:
+            pending.append((item, pool.submit(work, item)))
+            if len(pending) > n_threads:
                 first, future = pending.popleft()
                 yield first, future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        while pending:
+            first, future = pending.popleft()
+            yield first, future.result()
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 """Items in a few threads: in order, few at a time, ended by the first error and by closing."""
 
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -73,3 +74,45 @@ def test_closing_drops_what_waits() -> None:
     going_on.set()
     results.close()
     assert len(started) <= 4
+
+
+def test_an_interrupt_does_not_wait_for_work_that_was_begun() -> None:
+    release = threading.Event()
+    under_way = threading.Event()
+
+    def work(item: int) -> None:
+        under_way.set()
+        release.wait(WAIT_S)
+
+    def items() -> Iterator[int]:
+        yield 0
+        assert under_way.wait(WAIT_S)
+        raise KeyboardInterrupt
+
+    try:
+        start = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            list(in_order(work, items(), 2))
+        assert time.monotonic() - start < 0.5 * WAIT_S
+    finally:
+        release.set()
+
+
+def test_an_error_waits_for_work_that_was_begun() -> None:
+    """It may use what the caller clears away next."""
+    is_done = threading.Event()
+    under_way = threading.Event()
+
+    def work(item: int) -> None:
+        under_way.set()
+        time.sleep(0.2)
+        is_done.set()
+
+    def items() -> Iterator[int]:
+        yield 0
+        assert under_way.wait(WAIT_S)
+        raise ValueError("no more")
+
+    with pytest.raises(ValueError, match="no more"):
+        list(in_order(work, items(), 2))
+    assert is_done.is_set()

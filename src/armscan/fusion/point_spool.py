@@ -257,6 +257,8 @@ class PointSpool:
         try:
             file.seek(0, io.SEEK_END)
             file.write(np.ascontiguousarray(values).data)
+            # a full disk is told here, not where the points are read
+            file.flush()
         except OSError as error:
             raise OutputError(
                 f"the growing cloud cannot be kept ({error.strerror})",

@@ -73,6 +73,15 @@ def test_a_full_disk_is_told(tmp_path: Path) -> None:
             spool.add(cloud)
 
 
+def test_a_full_disk_is_told_where_few_points_would_fit_into_a_buffer(tmp_path: Path) -> None:
+    """The error came without a place or what to do, where the points were read."""
+    if not Path("/dev/full").exists():
+        pytest.skip("no device that is always full")
+    (tmp_path / "rest").symlink_to("/dev/full")
+    with spool_of([], tmp_path) as spool, pytest.raises(OutputError, match="free some space"):
+        spool.add(stripes(1)[0].select(slice(20)))
+
+
 @pytest.mark.parametrize("n", [1, 2, 1001, 40_000])
 def test_percentiles_of_many_values_are_those_of_sorting(
     monkeypatch: pytest.MonkeyPatch, n: int

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -147,6 +148,27 @@ def test_a_step_by_its_buttons_alone_and_a_browser_closed_and_a_job_killed(
             # eight placements may leave remarks
             one.sees("o on with 'Light sheets'.")
     assert page.journey.state(StepName.CAMERA).status in ("good", "doubtful")
+
+
+# the page may be told of a take that ends after its server
+@pytest.mark.filterwarnings("ignore:Queued a")
+def test_closing_the_console_ends_taking_all_that_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C seemed to do nothing until the last placement was rendered."""
+    is_taking = threading.Event()
+
+    def take(page: ConsolePage, step: StepName) -> None:
+        is_taking.set()
+        time.sleep(0.05)
+
+    monkeypatch.setattr(ConsolePage, "take", take)
+    with open_console(tmp_path / "first", RIG, port=0) as (page, _):
+        taking = threading.Thread(target=page.take_all, daemon=True)
+        taking.start()
+        assert is_taking.wait(30.0)
+    taking.join(30.0)
+    assert not taking.is_alive()
 
 
 @pytest.mark.skipif(

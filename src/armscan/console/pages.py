@@ -113,6 +113,7 @@ class ConsolePage:
 
     def close(self) -> None:
         """End a scan and the work under way, and let others open the session."""
+        self.cancel()
         self.scanning.close()
         self.worker.close()
         self._held.close()
@@ -304,8 +305,7 @@ class ConsolePage:
 
     def take_all(self) -> None:
         """Record all that is left, as the twin shows it."""
-        self._seen, self._is_cancelled = None, False
-        step, n_wanted = self.step, self._n_wanted()
+        self._seen, self._is_cancelled, step, n_wanted = None, False, self.step, self._n_wanted()
         with self._busy("Taking all that is left ..."):
             while self.journey.n_taken(step) < n_wanted and not self._is_cancelled:
                 put(self._bar, 100.0 * self.journey.n_taken(step) / n_wanted)

@@ -342,8 +342,6 @@ def test_a_line_without_a_sheet_is_lit_and_its_names_are_wrong() -> None:
     assert "1 of 2 lines have no sheet" in found.reason
     of_it = "of the laser line 1 the calibration has no sheet"
     assert any(of_it in text for text in found.warnings)
-        "of the laser line 1 the calibration has no sheet" in text for text in found.warnings
-    )
     away = tuple(replace(light, forward=-light.forward) for light in made.lights)
     (dark,) = run_naming(replace(made, lights=away), sensor, names)
     assert dark.result == "rightly refused"

@@ -32,7 +32,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -256,7 +256,10 @@ def calibrate_cameras(chain: Chain, shoot: Photographer, views: int) -> bool:
     ]
     stage.figures = max(both, key=lambda one: one["rays"])
     judge(chain, stage, stage.figures["rays"], LIMIT_SIGMAS)
-    error = stereo.right_from_left.step_from(drawn.head.cameras[1].camera_from_sensor)
+    truth = drawn.head.cameras[1].camera_from_sensor
+    # a target's true pitch cannot be known: lengths are judged as if it were the one that is said
+    truth = replace(truth, translation_mm=truth.translation_mm / (1.0 + drawn.facts["scale_error"]))
+    error = stereo.right_from_left.step_from(truth)
     covariance = stereo.covariance[-6:, -6:]
     ratio = normalised_length(error, covariance, np.diag(covariance) > 0.0)
     stage.figures["pose"] = round(ratio, 2)

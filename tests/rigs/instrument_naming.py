@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of the lines of a drawn instrument that sweeps over a plate with a block, one camera.
 
-By the rule that `labeller_for` gives a user, and of the points that are left in the cloud. No
-exposure names its lasers, and all lines of the head are on, also those of which the sensor has no
-sheet: what is named of these is wrong. Of a head of one line no name can be wrong, and none is
-counted; where no point at all is named, none is given, as in a refusal.
+By the rule that `labeller_for` gives a user, and of the points that are left in the cloud. In an
+image by itself all lines of the head are on and none is named; in a scan those that the software
+asks for, and if the sensor lacks a sheet of one, all again: what is named of that is wrong. Of a
+head of one line no name can be wrong, and none is counted; where no point at all is named, none is
+given, as in a refusal.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.measure import MeasureOptions, labeller_for, laser_warnings
-from armscan.reconstruction.labels import PointStatus
+from armscan.reconstruction.labels import PointStatus, sheets_of
 from armscan.reconstruction.points import measure_points
 from armscan.records.profile import Profile, StripeFlag
 from rigs.instrument_stages import Outcome
@@ -57,14 +58,22 @@ def _judged(
     sensor = replace(sensor, lasers_without_sheet=tuple(f"line {k}" for k in unknown))
     options, wrong, named, asked = MeasureOptions(), 0, 0, 0
     labeller = labeller_for(sensor, options, is_scan=is_scan)
-    swept = _swept(made, [*calibrated, *unknown])
+    rng, lasers_on = made.rng(40), []
+    block = made.field_mm * np.array([0.15, 0.12, rng.uniform(0.02, 0.15)])
     begun = time.process_time()
     try:
-        for k, (profile, truth, pose) in enumerate(swept):
+        for k, head in enumerate(_sweep(made, rng)):
             if not is_scan:
                 labeller.reset()
-            known = pose if is_scan else None
-            instant = labeller.label([profile], (), known, FIRST_NS + k * TICK_NS)
+            lasers = labeller.next_lasers() if is_scan and not unknown else ()
+            on = [names[sheet] for sheet in sheets_of(sensor, lasers)]
+            lit = on if lasers else [*calibrated, *unknown]
+            profile, truth = _exposed(made, lit, head, block, rng, f"image{k:02d}")
+            if not len(profile):
+                continue
+            lasers_on.append(lasers)
+            pose: Pose[Base, Sensor] | None = Pose(head.rotation, head.shift) if is_scan else None
+            instant = labeller.label([profile], lasers, pose, FIRST_NS + k * TICK_NS)
             found = measure_points(instant, sensor, options.accepted_depths(sensor))[0].labelled
             sheet = np.where(found.status == int(PointStatus.MEASURED), found.sheet, -1)
             is_named = sheet >= 0
@@ -89,23 +98,9 @@ def _judged(
             "points": float(asked),
             "lines without a sheet": float(len(unknown)),
         },
-        warnings=laser_warnings([()] * len(swept), labeller, sensor, options),
+        warnings=laser_warnings(lasers_on, labeller, sensor, options),
         seconds=seconds,
     )
-
-
-def _swept(
-    made: Instrument, lit: Sequence[int]
-) -> list[tuple[Profile, IntArray, Pose[Base, Sensor]]]:
-    """What each exposure of a sweep shows, the points' true lines, and where the sensor was."""
-    rng, seen = made.rng(40), []
-    block = made.field_mm * np.array([0.15, 0.12, rng.uniform(0.02, 0.15)])
-    for k, head in enumerate(_sweep(made, rng)):
-        profile, truth = _exposed(made, lit, head, block, rng, f"image{k:02d}")
-        if len(profile):
-            pose: Pose[Base, Sensor] = Pose(head.rotation, head.shift)
-            seen.append((profile, truth, pose))
-    return seen
 
 
 def _sweep(made: Instrument, rng: np.random.Generator) -> list[Placement]:

@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -185,6 +186,25 @@ sys.exit(main())
 """
 
 
+PERSON_S = 0.05
+"""Between two Ctrl-C of a person at the least."""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
+def test_an_interrupt_ends_a_command_whose_messages_nobody_reads_any_more() -> None:
+    """Ctrl-C in ``armscan ... 2>&1 | tee log`` ends tee as well."""
+    with subprocess.Popen([sys.executable, "-c", LONG_WORK], stderr=subprocess.PIPE) as run:
+        assert run.stderr is not None
+        while run.stderr.readline() != b"begun\n":
+            assert run.poll() is None, "it ended by itself"
+        run.stderr.close()
+        run.send_signal(signal.SIGINT)
+        try:
+            assert run.wait(timeout=20.0) == 130
+        finally:
+            run.kill()
+
+
 @pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
 @pytest.mark.parametrize("program", [LONG_WORK, WITHIN_EXEC], ids=["threads", "exec"])
 @pytest.mark.parametrize(
@@ -206,6 +226,7 @@ def test_what_ends_a_command_does_not_wait_for_what_it_had_begun(
             assert run.poll() is None, "it ended by itself"
         for number in numbers:
             run.send_signal(number)
+            time.sleep(PERSON_S)
         try:
             err = run.communicate(timeout=20.0)[1]
         finally:

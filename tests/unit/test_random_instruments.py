@@ -303,16 +303,16 @@ def test_no_name_of_a_head_of_one_line_is_counted() -> None:
     assert list(run_naming(made, sensor, (0,))) == []  # type: ignore[arg-type]
 
 
-def test_lines_that_cross_are_named_in_a_scan_in_which_none_is_ever_alone() -> None:
-    """Three lines 55 degrees apart: by the past alone no exposure gave a first name."""
+def test_lines_that_cross_are_named_in_a_scan_that_lights_one_alone_where_it_is_asked_to() -> None:
+    """Three lines 55 degrees apart; in single images nothing but their direction tells them."""
     made = draw_instrument(7000097)
     camera = run_camera(made)
     sheets = run_sheets(made, camera.calibration, camera.information)
     assert sheets.fit is not None
     by_image, in_scan = run_naming(made, sheets.fit.to_calibration(PROVENANCE), sheets.names)
-    assert by_image.result == in_scan.result == "right"
-    late = 0.75 * in_scan.groups["points"]
-    assert in_scan.groups["named"] > 0.9 * late
+    assert by_image.result != "wrong"
+    assert in_scan.result == "right"
+    assert in_scan.groups["named"] > 0.8 * in_scan.groups["points"]
 
 
 def test_a_surface_beyond_its_own_depths_is_not_named_for_being_within_another_ones() -> None:

@@ -7,7 +7,7 @@ import functools
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -121,13 +121,16 @@ def run(
             summary = work(job)
         except KeyboardInterrupt:
             if job.cache is not None and job.cache.folder.is_dir():
-                typer.echo("what was found in images is kept: the same command uses it", err=True)
+                with suppress(OSError):
+                    # nobody may read it any more
+                    typer.echo(FOUND_IS_KEPT, err=True)
             raise
     show(summary, as_json=as_json)
     _tell_compilation()
     return summary
 
 
+FOUND_IS_KEPT = "what was found in images is kept: the same command uses it"
 LONG_COMPILED_S = 3.0
 
 

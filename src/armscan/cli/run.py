@@ -126,7 +126,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # a terminal that has no sign for ± or ° shows a question mark instead of failing
         sys.stdout.reconfigure(errors="replace")
     with ended_in_order() as ending:
-        code = _run(arguments)
+        try:
+            code = _run(arguments)
+        except KeyboardInterrupt:
+            # a second one, while the first was told
+            code = EXIT_INTERRUPTED
     if code != EXIT_INTERRUPTED:
         return code
     word = "ended" if ending.is_asked else "interrupted"
@@ -141,22 +145,22 @@ def _leave(sentence: str, code: int) -> NoReturn:
     Nor does Python end it, which takes an interrupt within ``exec`` for one that nobody caught, and
     ends by the signal instead of with the code.
     """
-    with suppress(ValueError):
-        # of another thread than the main one
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _fail(sentence, code, prefix="")
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        # nobody may read them any more
+    try:
+        # nobody may read the streams any more
         with suppress(OSError, ValueError):
-            stream.flush()
-    os._exit(code)
+            _fail(sentence, code, prefix="")
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+    finally:
+        os._exit(code)
 
 
 def _run(arguments: Sequence[str] | None) -> int:
-    from armscan.cli.app import command
-
     try:
+        from armscan.cli.app import command
+
         result = command()(
             args=None if arguments is None else list(arguments),
             prog_name="armscan",
@@ -164,6 +168,10 @@ def _run(arguments: Sequence[str] | None) -> int:
         )
         return result if isinstance(result, int) else 0
     except (KeyboardInterrupt, typer.Abort):
+        with suppress(ValueError):
+            # of another thread than the main one
+            if arguments is None:
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
         return EXIT_INTERRUPTED
     except (ArmscanError, OSError, MemoryError, USAGE_ERROR) as error:
         return _fail(_sentence(error), EXIT_INPUT)

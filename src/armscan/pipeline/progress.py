@@ -61,7 +61,7 @@ def worker_threads(n_threads: int) -> Iterator[ThreadPoolExecutor]:
     is_awaited = True
     try:
         yield pool
-    except (KeyboardInterrupt, GeneratorExit):
+    except KeyboardInterrupt:
         is_awaited = False
         raise
     finally:

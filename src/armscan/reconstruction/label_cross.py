@@ -250,6 +250,9 @@ ALIKE_PIECES = 8
 """A still has nothing but depth, direction and rays. Direction and rays count again every so many
 pieces; depth does not: all of a surface that lies beyond those of its own line may be within those
 of another."""
+MOST_IN_STILL = 2
+"""Of more lines direction does not count again either: on a surface that leans by 40 degrees one
+runs as another does on one that faces the camera."""
 INDEPENDENT = 0.5
 """Of sharp predictions: neighbouring pieces share some of what they err by."""
 TAKEN = -3.0
@@ -467,8 +470,6 @@ UNDECIDED_SHARE, LEAST_BETWEEN = 0.2, 4
 exposures with all lasers."""
 MOST = 0.5
 """With a larger share undecided, one stripe alone gives no less than all of them together."""
-N_TOLD_APART = 2
-"""Of so many lines the first names come by themselves; over more the odds are not reached."""
 ROUNDS = 2
 """Times that the rays held by other segments are looked up."""
 
@@ -492,10 +493,6 @@ class CrossLabeller:
     alone. Without the arm's pose each stripe is predicted in the image, from its last place and
     motion.
 
-    A pass of three lines and more in which no laser is ever alone begins with doubt that nothing
-    ends. Where stripes cross, its exposures are named as stills are, and only if all cross each
-    other also by the past: what one took for another line that runs alike, the next would continue.
-
     Parameters
     ----------
     sensor
@@ -511,9 +508,6 @@ class CrossLabeller:
         limits = [depths.limits_mm(sheet) for sheet in sensor.sheets]
         self._scale = max(1.0, field_mm(sensor) / FIELD_MM)
         span = max(high - low for low, high in limits)
-        are_apart = stripes_apart(sensor)
-        self._are_some_apart = bool(are_apart.any())
-        self._are_all_apart = bool((are_apart | np.eye(len(are_apart), dtype=np.bool_)).all())
         self._surface = SurfaceMemory(depth_span_mm=span, scale=self._scale)
         self._image = ImageMemory()
         self.reset()
@@ -525,7 +519,6 @@ class CrossLabeller:
         self._last_ns: int | None = None
         self._next = self._sources[:1]
         self._since_single = 0
-        self._had_single = False
 
     def next_lasers(self) -> tuple[str, ...]:
         """One laser alone at the start of a pass and when labels are in doubt, else all."""
@@ -610,11 +603,10 @@ class CrossLabeller:
             else:
                 points = hypotheses.points_mm[h]
                 gain[:, h], sharpness[:, h] = self._surface.evidence(points, pose)
-        is_unending = pose is not None and self._is_doubt_unending()
-        is_still = is_unending or (pose is None and not len(self._image))
-        evidence = still_evidence(pieces, hypotheses, self._sensor, is_still=is_still)
-        if self._are_all_apart or not is_unending:
-            evidence += past_evidence(pieces, gain, sharpness)
+        past = past_evidence(pieces, gain, sharpness)
+        is_alone = pose is None and not len(self._image)
+        is_still = is_alone and len(hypotheses.sheets) <= MOST_IN_STILL
+        evidence = past + still_evidence(pieces, hypotheses, self._sensor, is_still=is_still)
         switch = switch_probability(pieces, len(hypotheses.sheets))
         posterior = smoothed_posterior(evidence, switch)
         for _ in range(ROUNDS):
@@ -623,11 +615,6 @@ class CrossLabeller:
             )
             posterior = smoothed_posterior(evidence + taken, switch)
         return posterior
-
-    def _is_doubt_unending(self) -> bool:
-        """True if many stripes cross and no laser was alone when the pass asked for it."""
-        is_late = self._since_single > LEAST_BETWEEN and not self._had_single
-        return is_late and self._are_some_apart and len(self._source_of) > N_TOLD_APART
 
     def _learn(self, profile: Profile, found: _Assignment, pose: Pose[Base, Sensor] | None) -> None:
         known = found.sheet >= 0
@@ -641,7 +628,6 @@ class CrossLabeller:
     def _plan(self, found: _Assignment, possible: tuple[int, ...]) -> None:
         """Choose the lasers of the next exposure: all, or the one that most undecided are of."""
         on = {self._source_of[k] for k in possible}
-        self._had_single |= len(on) == 1
         self._since_single = 0 if len(on) == 1 else self._since_single + 1
         expected = dict.fromkeys(self._sources, 0.0)
         for source, points in zip(self._source_of, found.undecided.tolist(), strict=True):

@@ -9,10 +9,12 @@ changed, renamed or not understood counts as absent. The folder may be deleted a
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import io
 import json
 import os
+import threading
 import time
 import zipfile
 from collections.abc import Mapping
@@ -47,6 +49,17 @@ TAG = """Signature: 8a477f597d28d172789f06886806bc55
 # Target and stripe points that armscan found in images, so that the next run is quicker.
 # This folder may be deleted at any time.
 """
+
+_WRITING = threading.Lock()
+WAITED_S = 1.0
+"""An interrupted program waits at most so long for the entry that is being written."""
+
+
+@atexit.register
+def end_writing() -> None:
+    """Let no entry be cut: what is being written is finished, and no other begun."""
+    _WRITING.acquire(timeout=WAITED_S)
+
 
 Found: TypeAlias = TargetView | Profile | FitFailure
 KEPT: Mapping[str, type[Any]] = {
@@ -93,11 +106,12 @@ class DetectionCache:
             return
         temporary = self.folder / f".{uuid4().hex}.part"
         try:
-            if not self.folder.is_dir():
-                self.folder.mkdir(exist_ok=True)
-                (self.folder / "CACHEDIR.TAG").write_text(TAG, "utf-8")
-            temporary.write_bytes(content)
-            temporary.replace(self.folder / f"{key}{SUFFIX}")
+            with _WRITING:
+                if not self.folder.is_dir():
+                    self.folder.mkdir(exist_ok=True)
+                    (self.folder / "CACHEDIR.TAG").write_text(TAG, "utf-8")
+                temporary.write_bytes(content)
+                temporary.replace(self.folder / f"{key}{SUFFIX}")
         except OSError:
             return
         finally:

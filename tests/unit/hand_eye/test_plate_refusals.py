@@ -469,5 +469,18 @@ def test_an_unknown_is_judged_by_the_numbers_that_tell_its_own_scatter() -> None
     shared = (4.0 + 9.0) ** 2 / (4.0**2 / n + 9.0**2 / m)
     assert freedom([[1.0, 0.0, 1.0, 0.0]]) == pytest.approx(shared)
     assert freedom([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]) == pytest.approx(n)
+    alike = NoiseEstimate(sigmas, np.array([[0.5 / n, 0.03], [0.03, 0.5 / m]]))
+    spread = 4.0**2 / n + 9.0**2 / m + 4.0 * 4.0 * 9.0 * 0.03
+    assert freedom([[1.0, 0.0, 1.0, 0.0]], alike) == pytest.approx((4.0 + 9.0) ** 2 / spread)
     given = NoiseEstimate(sigmas, np.zeros((2, 2)))
     assert freedom([[1.0, 0.0, 0.0, 0.0]], given) > 1e9
+
+    def of_both(n: float, m: float) -> float:
+        each = NoiseEstimate(sigmas, np.diag([0.5 / n, 0.5 / m]))
+        return freedom([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], each)
+
+    # means of F statistics of 5 and 8 numbers: 5/3 + 8/6 = 3 = 2 f / (f - 2) of f = 6
+    assert of_both(5.0, 8.0) == pytest.approx(6.0)
+    # one that has no mean tells no more beside others that have
+    assert of_both(1.5, 3.9) == pytest.approx(1.5)
+    assert of_both(1.99, 3.99) == pytest.approx(1.99)

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import os
+import threading
+import time
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from armscan.pipeline.measure import cached_profile
 from armscan.pipeline.targets import cached_target
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.storage import detection_cache
-from armscan.storage.detection_cache import SUFFIX, DetectionCache, detection_key
+from armscan.storage.detection_cache import SUFFIX, DetectionCache, detection_key, end_writing
 from armscan.vision.stripe.image import StripeOptions
 from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView
 
@@ -234,3 +236,27 @@ def test_no_cache_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     cached_target(circles(), GRID)
     cached_profile(stripe())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_entry_that_is_written_while_the_program_ends_is_whole_and_none_is_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C waits for no thread, and would cut what one is writing."""
+    monkeypatch.setattr(detection_cache, "_WRITING", threading.Lock())
+    under_way, moved = threading.Event(), Path.replace
+
+    def move_slowly(self: Path, target: Path) -> Path:
+        under_way.set()
+        time.sleep(0.3)
+        return moved(self, target)
+
+    monkeypatch.setattr(Path, "replace", move_slowly)
+    cache, nothing = DetectionCache(tmp_path / "cache"), FitFailure("none", "look")
+    first = threading.Thread(target=cache.put, args=("first", nothing))
+    first.start()
+    assert under_way.wait(10.0)
+    end_writing()
+    threading.Thread(target=cache.put, args=("second", nothing), daemon=True).start()
+    time.sleep(0.1)
+    assert {one.name for one in cache.folder.iterdir()} == {"CACHEDIR.TAG", f"first{SUFFIX}"}
+    first.join()

@@ -98,21 +98,29 @@ def test_an_interrupt_does_not_wait_for_work_that_was_begun() -> None:
         release.set()
 
 
-def test_an_error_waits_for_work_that_was_begun() -> None:
+@pytest.mark.parametrize("is_in_items", [True, False], ids=["items", "consumer"])
+def test_an_error_waits_for_work_that_was_begun(is_in_items: bool) -> None:
     """It may use what the caller clears away next."""
     is_done = threading.Event()
     under_way = threading.Event()
 
     def work(item: int) -> None:
-        under_way.set()
-        time.sleep(0.2)
-        is_done.set()
+        if item:
+            under_way.set()
+            time.sleep(0.2)
+            is_done.set()
 
     def items() -> Iterator[int]:
-        yield 0
+        yield from range(4)
         assert under_way.wait(WAIT_S)
-        raise ValueError("no more")
+        if is_in_items:
+            raise ValueError("no more")
+
+    def consume() -> None:
+        for _ in in_order(work, items(), 2):
+            assert under_way.wait(WAIT_S)
+            raise ValueError("no more")
 
     with pytest.raises(ValueError, match="no more"):
-        list(in_order(work, items(), 2))
+        list(in_order(work, items(), 2)) if is_in_items else consume()
     assert is_done.is_set()

@@ -295,7 +295,7 @@ def predicts_better(
 ) -> bool:
     """Whether unseen views ask for the coefficients of ``before`` that a later choice gave up.
 
-    Where the residuals of a view are alike, Wald's test has little power: what showed on flat
+    Where the residuals of a view are alike, Rao's test has little power: what showed on flat
     boards is given up with the bow free only if views that took no part do without it, too.
     """
     if isinstance(before, FitFailure) or not before.is_converged:

@@ -271,7 +271,8 @@ def freedom_of(
     A cause or two may set it, and each is known only as the covariance of its logarithm says:
     how many numbers the postures tell of all causes together is no measure of that. Of each
     principal direction they are those of the chi-square of equal mean and variance
-    (Satterthwaite), of all together as by Fai and Cornelius, J. Statist. Comput. Simul. 54, 1996.
+    (Satterthwaite), of all together as by Fai and Cornelius, J. Statist. Comput. Simul. 54, 1996,
+    but the least where one has no mean.
     ``gain`` (Q, M) takes residuals to the unknowns.
     """
     variances, axes = np.linalg.eigh(covariance)
@@ -284,12 +285,9 @@ def freedom_of(
     )
     spread = np.einsum("kq,kl,lq->q", by_log, noise.log_covariance, by_log)
     each = 2.0 * variances**2 / np.maximum(spread, 1e-12 * variances**2)
-    if len(each) == 1:
-        return float(each[0])
-    usable = each[each > LEAST_FREEDOM]
-    mean = float((usable / (usable - LEAST_FREEDOM)).sum())
-    if mean <= len(each):
+    if len(each) == 1 or each.min() <= LEAST_FREEDOM:
         return float(each.min())
+    mean = float((each / (each - LEAST_FREEDOM)).sum())
     return 2.0 * mean / (mean - len(each))
 
 

@@ -19,13 +19,7 @@ from armscan.calibration.sheets.board_points import N_CAMERA, HeadCameras, place
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, SheetFit
 from armscan.calibration.sheets.result import reasons_to_refuse as sheet_reasons
-from armscan.calibration.sheets.solve import (
-    BOW_SHARES,
-    LIKELY_BOW,
-    N_PLANE,
-    bow_precision,
-    likely_lean,
-)
+from armscan.calibration.sheets.solve import BOW_SHARES, LIKELY_BOW
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -493,10 +487,9 @@ def _not_erred(sheet: SheetFit, given_camera: FloatArray) -> float:
     Beside a camera that is held the sheet ``H A' W r`` with ``H = (A' W A + P)^-1`` errs by
     ``H A' W A H = H - H P H``; its covariance says H, and what follows the camera.
     """
-    lean = likely_lean(sheet.sheet.bow_mm, given_camera[N_PLANE:, N_PLANE:])
-    precision = np.zeros((N_TERMS, N_TERMS))
-    precision[N_PLANE:, N_PLANE:] = bow_precision(sheet.sheet.scale_mm, lean)
-    known = given_camera @ precision @ given_camera
+    precision = np.zeros(N_TERMS)
+    precision[3:] = (LIKELY_BOW * sheet.sheet.scale_mm * BOW_SHARES) ** -2.0
+    known = given_camera @ (precision[:, None] * given_camera)
     return float(np.trace(np.linalg.solve(sheet.covariance, known)))
 
 
@@ -527,10 +520,7 @@ def _given_camera(fit: LaserFit, n_shared: int) -> list[FloatArray]:
 
 
 def _likely_bows(made: Instrument, fit: LaserFit, names: Sequence[int]) -> dict[int, FloatArray]:
-    """(5,) precision of the bow's terms of each light of which no test asked for one.
-
-    Those of a lean of zero (`bow_precision`): v of the bound is the light's own ray.
-    """
+    """(5,) precision of the bow's terms of each light of which no test asked for one."""
     half = 0.5 * made.field_mm
     degrees = np.array([sum(term) for term in BOW_TERMS])
     return {

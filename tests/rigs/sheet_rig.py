@@ -34,17 +34,13 @@ PROVENANCE = Provenance(
 
 @dataclass(frozen=True)
 class SheetTruth:
-    """A sheet: plane ``a b c D`` and a bow ``bow(u, v)`` in mm over ``reach_mm``.
-
-    The bow along the stripe follows rays that ``lean`` on it.
-    """
+    """A sheet: plane ``a b c D`` and a bow ``bow(u, v)`` in mm over ``reach_mm``."""
 
     plane: FloatArray
     bow_uu_mm: float = 0.0
     bow_uv_mm: float = 0.0
     centre_mm: tuple[float, float, float] = (0.0, 0.0, 135.5)
     reach_mm: float = 20.0
-    lean: float = 0.0
 
     def height_mm(self, points: FloatArray) -> FloatArray:
         """Distance of points (N, 3) from the sheet along its normal."""
@@ -54,8 +50,7 @@ class SheetTruth:
         along = along / np.linalg.norm(along)
         u = (points - self.centre_mm) @ along / self.reach_mm
         v = (points - self.centre_mm) @ np.cross(normal, along) / self.reach_mm
-        along_rays = u - self.lean * v
-        return np.asarray(flat - self.bow_uu_mm * along_rays**2 - self.bow_uv_mm * u * v)
+        return np.asarray(flat - self.bow_uu_mm * u * u - self.bow_uv_mm * u * v)
 
 
 @dataclass(frozen=True)

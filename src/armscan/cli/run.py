@@ -150,9 +150,10 @@ def _leave(sentence: str, code: int) -> NoReturn:
         with suppress(OSError, ValueError):
             _fail(sentence, code, prefix="")
         atexit._run_exitfuncs()
-        for stream in (sys.stdout, sys.stderr):
-            with suppress(OSError, ValueError):
-                stream.flush()
+        with suppress(OSError, ValueError):
+            sys.stdout.flush()
+        with suppress(OSError, ValueError):
+            sys.stderr.flush()
     finally:
         os._exit(code)
 

@@ -14,13 +14,7 @@ import pytest
 
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import LACK_OF_FIT_P, LaserFit, SheetOptions
-from armscan.calibration.sheets.solve import (
-    BOW_SHARES,
-    LIKELY_BOW,
-    LIKELY_LEAN,
-    bow_precision,
-    likely_lean,
-)
+from armscan.calibration.sheets.solve import LIKELY_BOW
 from armscan.geometry.arrays import FloatArray
 from armscan.models.light_sheet import LightSheet
 from rigs.sheet_rig import SheetRig, SheetTruth, thesis_rig
@@ -91,7 +85,6 @@ def square_of_all_eight(
     noise_px: float = 0.3,
     n_boards: int = 8,
     explained: bool | None = None,
-    lean: float = 0.0,
 ) -> float:
     """``e' C^-1 e`` of plane and bow, where cameras and boards hardly err and the stripes do.
 
@@ -105,22 +98,21 @@ def square_of_all_eight(
         sigma_corner_px=0.002,
         camera_covariance=1e-12 * np.eye(9),
     )
-    sheet = replace(rig.sheets[0], lean=lean)
-    rig = replace(rig, poses=rig.poses[:n_boards], sheets=(sheet,))
+    rig = replace(rig, poses=rig.poses[:n_boards])
     camera = rig.noisy_camera(rng)
     fit = calibrate_sheets(rig.boards(camera, rng), rig.calibration(camera))
     assert isinstance(fit, LaserFit)
-    found, known = fit.sheets[0].sheet, fit.sheets[0].diagnostics
+    sheet, known = fit.sheets[0].sheet, fit.sheets[0].diagnostics
     assert not fit.sheets[0].is_bow_free
     if explained is not None:
         assert (known.plane_test.p_value >= LACK_OF_FIT_P) == explained
         assert known.final_test.p_value >= LACK_OF_FIT_P
         assert not any("does not explain" in text for text in fit.warnings)
     u, v = np.meshgrid(np.linspace(-0.9, 0.9, 9), np.linspace(-0.7, 0.7, 7))
-    on_plane = np.column_stack([u.ravel(), v.ravel()]) @ found.axes[:2]
-    places = found.origin_mm + found.scale_mm * on_plane
-    terms = -found.height_with_jacobian(places)[2]
-    error, *_ = np.linalg.lstsq(terms, height_of(sheet, found, places), rcond=None)
+    on_plane = np.column_stack([u.ravel(), v.ravel()]) @ sheet.axes[:2]
+    places = sheet.origin_mm + sheet.scale_mm * on_plane
+    terms = -sheet.height_with_jacobian(places)[2]
+    error, *_ = np.linalg.lstsq(terms, height_of(rig.sheets[0], sheet, places), rcond=None)
     return float(error @ np.linalg.solve(fit.covariance[9:17, 9:17], error))
 
 
@@ -156,41 +148,6 @@ def test_three_boards_that_show_a_bow_do_not_take_it_for_noise() -> None:
         for seed in range(12)
     ]
     assert 5.0 < np.mean(squares) < 11.5
-
-
-@pytest.mark.parametrize("lean", [-0.8, 0.8])
-def test_rays_that_lean_carry_the_bow_along_the_depth(lean: float) -> None:
-    """Of a cone of likely size, on three boards: the mean of twelve draws is 8 +- 1.2.
-
-    Light of one source that lies aside of the stripe's middle by 0.8 of its distance bends along
-    the depth by 0.64 of the bow along the stripe; a ninth of a likely one was expected.
-    """
-    likely_mm = LIKELY_BOW * 20.0
-    squares = [
-        square_of_all_eight(
-            likely_mm * (-1.0) ** seed, seed, noise_px=0.1, n_boards=3, explained=False, lean=lean
-        )
-        for seed in range(12)
-    ]
-    assert np.mean(squares) < 11.5
-
-
-@pytest.mark.parametrize("lean", [0.0, 0.4, -0.9])
-def test_a_cone_costs_what_its_bow_along_the_stripe_and_its_lean_do(lean: float) -> None:
-    """``b (u - lean v)**2`` is what light from one source makes: its ``v**2`` is no surprise."""
-    bow = 0.02 * np.array([1.0, -2.0 * lean, lean**2, 0.0, 0.0])
-    alike = LIKELY_BOW * 25.0 * BOW_SHARES
-    cost = float(bow @ bow_precision(25.0, lean) @ bow)
-    assert cost == pytest.approx(float(((bow[:2] / alike[:2]) ** 2).sum()))
-    assert likely_lean(bow, 1e-12 * np.eye(5)) == pytest.approx(lean, abs=1e-4)
-
-
-def test_a_bow_that_hardly_shows_has_no_lean() -> None:
-    """Bows of their own sigma at random: the lean stays below what is likely of it."""
-    rng, covariance = np.random.default_rng(9), np.diag([1.0, 4.0, 1.0, 1.0, 1.0])
-    bows = rng.multivariate_normal(np.zeros(5), covariance, 999)
-    leans = [likely_lean(one, covariance) for one in bows]
-    assert np.sqrt(np.mean(np.square(leans))) < LIKELY_LEAN
 
 
 @pytest.mark.parametrize("seed", [0, 3])

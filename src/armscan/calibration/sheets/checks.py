@@ -465,11 +465,10 @@ def _cells(
     by_all = np.array(design)
     is_used = np.any(by_all != 0.0, axis=0)
     is_free = np.arange(system.n_columns) < system.n_sheet
-    likely = np.flatnonzero(np.diag(system.precision))
+    likely = np.flatnonzero(system.precision)
     is_free[likely] = False
     without_bow = np.array(height) - by_all[:, likely] @ system.bow_mm[likely]
-    root = np.linalg.cholesky(system.precision[np.ix_(likely, likely)])
-    by_all[:, likely] = np.linalg.solve(root, by_all[:, likely].T).T
+    by_all[:, likely] /= np.sqrt(system.precision[likely])
     return _Cells(
         without_bow,
         float(np.sqrt(np.mean(np.square(height)))),

@@ -26,7 +26,7 @@ from armscan.calibration.sheets.stripes_on_board import BoardImage
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import eigen, huber_weights, robust_sigma, square_root
-from armscan.models.light_sheet import BOW_TERMS, LightSheet
+from armscan.models.light_sheet import LightSheet
 
 ITERATIONS = 12
 SETTLED_SIGMA = 1e-4
@@ -46,12 +46,7 @@ size: of a line lens that is 1 degree askew, three half sizes away."""
 BOW_SHARES = np.array([3.0, 2.0, 1.0 / 3.0, 1.0, 1.0]) / 3.0
 """Likely size of the bow's terms (`BOW_TERMS`) over that of ``u**2``. Light spreads in straight
 rays: what bends along the depth is the bow along the stripe, carried by rays that lean, and spread,
-by a third, as from that source. Of ``v**2`` it is what a lean that shows leaves (`bow_precision`).
-"""
-LIKELY_LEAN = 1.0 / 3.0
-MAX_LEAN = 1.0
-"""Rays that lie farther than 45 degrees from square to the stripe are not believed."""
-U2, UV, V2 = (BOW_TERMS.index(term) for term in ((2, 0), (1, 1), (0, 2)))
+by a third, as from that source."""
 
 
 class SheetObservations(RowRecord):
@@ -252,7 +247,7 @@ class SheetSolution:
     @property
     def n_parameters(self) -> int:
         """Parameters of all sheets of which nothing is known beforehand."""
-        return int(np.count_nonzero(np.diag(self.system.precision) == 0.0))
+        return int(np.count_nonzero(self.system.precision == 0.0))
 
     @property
     def has_converged(self) -> bool:
@@ -277,9 +272,9 @@ def solve_sheets(
     ``sigma_factor`` multiplies the stripes' sigmas, one number or one a point; ``is_robust`` weighs
     points down by Huber's function on what remains, for finding outliers; ``are_cameras_held``
     solves for the sheets that belong to the cameras as calibrated. With ``may_bow`` a bow that is
-    not free is not zero but known beforehand to be so to `bow_precision`: a plane is kept as long
-    as no test asks for more, which is no proof that the sheet is one. Where the stripes say nothing
-    of a bow it stays zero, and uncertain by as much; where they show that there is none, next to
+    not free is not zero but known beforehand to be so to `LIKELY_BOW`: a plane is kept as long as
+    no test asks for more, which is no proof that the sheet is one. Where the stripes say nothing of
+    a bow it stays zero, and uncertain by as much; where they show that there is none, next to
     nothing is added.
 
     A failure where the points do not determine a sheet, or a step turns one by more than 45
@@ -290,7 +285,7 @@ def solve_sheets(
         [np.arange(N_SHEET) < (N_SHEET if bowed else N_PLANE) for bowed in is_bowed]
     )
     active = is_free | may_bow
-    precision = _precision(sheets, np.zeros(len(sheets)), is_free, active)
+    precision = np.where(is_free, 0.0, _likely_bows_mm(sheets) ** -2.0)[active]
     n_active = int(active.sum())
     sigma = observations.sigma_px * sigma_factor
     robust = np.ones(len(observations))
@@ -308,7 +303,6 @@ def solve_sheets(
         sheets = [
             sheet.updated(full[N_SHEET * k : N_SHEET * (k + 1)]) for k, sheet in enumerate(sheets)
         ]
-        precision = _precision(sheets, _leans(sheets, normal, active), is_free, active)
         remaining = system.residual_px + system.times(normal.step)
         if is_robust:
             scale = max(1.0, robust_sigma(remaining / sigma))
@@ -327,7 +321,7 @@ def solve_sheets(
         chi2=float(
             (robust * (remaining / sigma) ** 2).sum()
             + common @ common
-            + system.bow_mm @ system.precision @ system.bow_mm
+            + system.precision @ system.bow_mm**2
         ),
         last_step_sigma=last_step_sigma,
         active=active,
@@ -342,56 +336,10 @@ def _in_sigmas(normal: NormalSolution, n_active: int) -> float:
     return float((np.abs(normal.step[:n_active]) / np.sqrt(np.diag(normal.covariance))).max())
 
 
-def bow_precision(scale_mm: float, lean: float) -> FloatArray:
-    """(5, 5) with which a bow that no test asks for is known to be small, 1/mm^2.
-
-    Rays from one source make a cone, which bends across them only: ``b (u - lean v)**2``, so that
-    the terms obey ``v2 = uv**2 / (4 u2)``. Near the lean that they show, ``-uv / (2 u2)``, this is
-    ``v2 = -lean**2 u2 - lean uv`` to first order; what is left of ``v2`` has its share of
-    `BOW_SHARES`. A lean of zero gives the shares alone.
-    """
-    precision = np.diag((LIKELY_BOW * scale_mm * BOW_SHARES) ** -2.0)
-    left = np.zeros(len(BOW_TERMS))
-    left[[U2, UV, V2]] = lean**2, lean, 1.0
-    known = precision[V2, V2]
-    precision[V2, V2] = 0.0
-    return np.asarray(precision + known * np.outer(left, left))
-
-
-def likely_lean(bow_mm: FloatArray, covariance: FloatArray) -> float:
-    """Lean of the light's rays that a bow (5,) of a covariance (5, 5) shows; zero if it shows none.
-
-    The likeliest beside `LIKELY_LEAN`, as far as the bow along the stripe is known at all.
-    """
-    along, sideways = float(bow_mm[U2]), float(bow_mm[UV])
-    unknown = covariance[U2, U2] + 0.25 * covariance[UV, UV] / LIKELY_LEAN**2
-    lean = -0.5 * along * sideways / max(along**2 + float(unknown), 1e-300)
-    return float(np.clip(lean, -MAX_LEAN, MAX_LEAN))
-
-
-def _precision(
-    sheets: Sequence[LightSheet], leans: FloatArray, is_free: BoolArray, active: BoolArray
-) -> FloatArray:
-    """(A, A) of the active parameters; zero of those of which nothing is known beforehand."""
-    whole = np.zeros((N_SHEET * len(sheets), N_SHEET * len(sheets)))
-    for k, (sheet, lean) in enumerate(zip(sheets, leans, strict=True)):
-        bow = slice(N_SHEET * k + N_PLANE, N_SHEET * (k + 1))
-        if not is_free[bow].any():
-            whole[bow, bow] = bow_precision(sheet.scale_mm, float(lean))
-    return whole[np.ix_(active, active)]
-
-
-def _leans(sheets: Sequence[LightSheet], normal: NormalSolution, active: BoolArray) -> FloatArray:
-    """(S,) of the rays of each sheet; zero of planes."""
-    whole = np.zeros((len(active), len(active)))
-    whole[np.ix_(active, active)] = normal.covariance
-    bows = [slice(N_SHEET * k + N_PLANE, N_SHEET * (k + 1)) for k in range(len(sheets))]
-    return np.array(
-        [
-            likely_lean(sheet.bow_mm, whole[bow, bow])
-            for sheet, bow in zip(sheets, bows, strict=True)
-        ]
-    )
+def _likely_bows_mm(sheets: Sequence[LightSheet]) -> FloatArray:
+    """(8 S,) likely size of the sheets' bows; of no meaning for the planes' parameters."""
+    shares = np.concatenate([np.ones(N_PLANE), BOW_SHARES])
+    return np.concatenate([LIKELY_BOW * sheet.scale_mm * shares for sheet in sheets])
 
 
 _UNDETERMINED = FitFailure(
@@ -485,9 +433,9 @@ class StripeSystem:
     """All residuals (N,), in the image and in space, with their derivatives stripe by stripe.
 
     Of the ``n_columns`` unknowns the ``n_sheet`` free parameters of all sheets come first, then six
-    for each of ``n_boards`` boards. ``precision`` (n_sheet, n_sheet) is that with which the
-    sheets' bows are known to be 0 beforehand, 0 for those of which nothing is, ``bow_mm``
-    (n_sheet,) what they are; both are 0 for other parameters.
+    for each of ``n_boards`` boards. ``precision`` (n_sheet,) is that with which the sheets' bows
+    are known to be 0 beforehand, 0 for those of which nothing is, ``bow_mm`` (n_sheet,) what they
+    are; both are 0 for other parameters.
     """
 
     stripes: tuple[StripeRows, ...]
@@ -524,10 +472,10 @@ class StripeSystem:
         place = np.full(self.n_columns, -1)
         place[shared] = np.arange(len(shared))
         full = np.diag((np.arange(len(shared)) >= n_sheet).astype(np.float64))
-        full[:n_sheet, :n_sheet] = self.precision
+        full[np.arange(n_sheet), np.arange(n_sheet)] = self.precision
         cross, board = np.zeros((n_boards, len(shared), 6)), np.tile(np.eye(6), (n_boards, 1, 1))
         pull = np.zeros(self.n_columns)
-        pull[:n_sheet] = self.precision @ self.bow_mm
+        pull[:n_sheet] = self.precision * self.bow_mm
         for stripe in self.stripes:
             if stripe.board == without_board:
                 continue

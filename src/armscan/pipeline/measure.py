@@ -44,6 +44,7 @@ from armscan.reconstruction.labels import (
     SingleLabeller,
     StripeCounts,
     StripeLabeller,
+    sheets_of,
     without_sheet,
 )
 from armscan.reconstruction.place import merge_clouds
@@ -66,6 +67,9 @@ from armscan.vision.stripe.image import StripeOptions
 STAGE = "reconstruct"
 EXTRACTION, NAMING, PLACING = "extraction", "naming", "placing"
 """Stages whose processor time is told."""
+MOST_ALIKE = 2
+"""Lines that run alike and are told by a scan's past; of five and more some scans name one in five
+wrongly (docs/explanations/random-instruments.md)."""
 TRIMMED_AFTER = 100
 """Instants after which the cache is kept small."""
 LOOKED_AT, LEAST_LINE = 10, 30
@@ -643,7 +647,8 @@ def laser_warnings(
     options: MeasureOptions,
 ) -> tuple[str, ...]:
     """Warn of exposures that name other lasers than the calibrated ones, or than the one chosen,
-    or that name none where one camera's stripe may be of a laser that has no sheet.
+    or that name none where one camera's stripe may be of a laser that has no sheet; and of many
+    lines that one camera cannot tell.
 
     Parameters
     ----------
@@ -683,5 +688,13 @@ def laser_warnings(
             f"{unnamed} exposures do not name their lasers, and of the laser {', '.join(unseen)} "
             "the calibration has no sheet: where it was on, its points may be given to another "
             "sheet"
+        )
+    n_lit = [len(sheets_of(sensor, on) if on else sensor.sheets) for on in named]
+    lit = max(n_lit, default=0)
+    if isinstance(labeller, CrossLabeller) and lit > MOST_ALIKE and not stripes_apart(sensor).any():
+        warnings.append(
+            f"{lit} lines that run alike were on at once before one camera: nothing but the scan's "
+            "past tells them, and names may be wrong; light one or two at a time, or use two "
+            "cameras"
         )
     return tuple(warnings)

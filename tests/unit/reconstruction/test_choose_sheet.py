@@ -130,6 +130,24 @@ def test_a_scan_that_names_no_laser_is_told_of_those_without_sheet() -> None:
     assert not laser_warnings([()], labeller, sensor, MeasureOptions(sheet="left"))
 
 
+def test_many_lines_that_run_alike_before_one_camera_are_warned_of_in_a_scan() -> None:
+    """Drawn heads of five and more had up to a fifth of wrong names, of two none."""
+    few, options = two_sheets(), MeasureOptions()
+    more = tuple(replace(sheet, name=f"far {sheet.name}") for sheet in few.sheets)
+    many = replace(few, sheets=(*few.sheets, *more), covariance=np.zeros((41, 41)))
+
+    def told(sensor: SensorCalibration, lasers: tuple[str, ...], is_scan: bool = True) -> str:
+        labeller = labeller_for(sensor, options, is_scan=is_scan)
+        return " ".join(laser_warnings([("left",), lasers], labeller, sensor, options))
+
+    assert told(many, ("left", "right", "far left")).startswith(
+        "3 lines that run alike were on at once"
+    )
+    assert told(many, ()).startswith("4 lines")
+    assert told(many, ("left", "right")) == told(few, ()) == ""
+    assert told(many, (), is_scan=False) == ""
+
+
 def test_a_laser_without_sheet_beside_a_calibrated_one_is_not_taken_for_it() -> None:
     choice = labelled(stripes(0.13), two_sheets(), DepthRange(1.0), lasers=("left", "C"))
     assert choice.reason == "of C, which was on, too, the calibration has no sheet"

@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments
-        Words after ``armscan``; those of the process if None.
+        Words after ``armscan``; those of the process if None. An interrupt then ends the process.
     """
     gc.set_threshold(YOUNG_OBJECTS)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")

@@ -306,6 +306,17 @@ def test_info_of_documents(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert "does not know this kind of file" in capsys.readouterr().err
 
 
+def test_info_tells_of_lasers_without_a_sheet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tree = json.loads((Path(__file__).parents[1] / "golden/sensor_v1.json").read_text())
+    assert main(["info", str(Path(__file__).parents[1] / "golden/sensor_v1.json")]) == 0
+    assert "without" not in capsys.readouterr().out
+    (tmp_path / "sensor.json").write_text(json.dumps({**tree, "lasers_without_sheet": ["far"]}))
+    assert main(["info", str(tmp_path / "sensor.json")]) == 0
+    assert "lasers without sheet: far" in capsys.readouterr().out
+
+
 def test_doctor_is_content(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)

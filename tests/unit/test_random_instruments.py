@@ -268,7 +268,7 @@ def test_lines_that_hardly_cross_count_as_one(angle_deg: float, are_few: bool) -
 
 def test_what_is_known_badly_and_few_postures_are_refused_in_their_own_words() -> None:
     made = with_arm(7300, 0.1)
-    few = "4 postures are too few: one stripe tells two numbers of a posture"
+    few = "4 postures are too few: points along a line tell two numbers of a posture"
     assert refusal(made, OPEN, are_few=False, is_open=True) == "rightly refused"
     assert refusal(made, SCATTERS, are_few=False, is_open=True) == "wrongly refused"
     assert refusal(made, few, are_few=True, is_open=False) == "rightly refused"

@@ -655,9 +655,11 @@ def _size_of(camera: CameraModel) -> str:
 def _sensor(calibration: SensorCalibration) -> dict[str, Any]:
     camera = calibration.camera.camera
     sheets = [_sheet_line(sheet) for sheet in calibration.sheets]
+    unseen = calibration.lasers_without_sheet
     return {
         "what": f"sensor calibration, {len(sheets)} light sheets, camera {_size_of(camera)}",
         "sheets": sheets,
+        **({"lasers_without_sheet": list(unseen)} if unseen else {}),
         **({} if calibration.second is None else second_camera_facts(calibration.second)),
         **_origin(calibration.provenance),
     }

@@ -4,9 +4,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import LaserFit, PointUse, SheetOptions
+from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from rigs.sheet_rig import SheetRig, SheetTruth, placed, thesis_rig
 
@@ -122,6 +124,14 @@ def test_names_given_run_across_the_first_image() -> None:
     west, east = (first.profile.points_px[first.sheet == k, 0].mean() for k in (0, 1))
     assert fit.sheet_names == ("west", "east")
     assert west < east
+
+
+@pytest.mark.parametrize(
+    ("names", "said"), [(("west", "west"), "repeat"), (("west", " "), "empty")]
+)
+def test_names_that_tell_no_sheet_are_refused(names: tuple[str, ...], said: str) -> None:
+    with pytest.raises(OptionError, match=said):
+        SheetOptions(sheet_names=names)
 
 
 def test_several_sheets_share_the_boards_errors() -> None:

@@ -175,7 +175,7 @@ def _told_in_words(problem: Problem, each: int) -> str:
         return "a section of the sphere tells three numbers of a posture, where its centre lies"
     if each == TOLD_BY_AREA:
         return "crossed stripes tell three numbers of a posture, the plate's distance and two tilts"
-    return "one stripe tells two numbers of a posture, the plate's distance and one tilt"
+    return "points along a line tell two numbers of a posture, the plate's distance and one tilt"
 
 
 def _unknowns_in_words(problem: Problem) -> str:

@@ -87,6 +87,11 @@ class SheetOptions:
                 "give each sheet its own name",
             ),
             (
+                all(name.strip() for name in self.sheet_names),
+                "a sheet name is empty",
+                "give each sheet a name that can be read",
+            ),
+            (
                 not n or self.n_sheets in (0, n),
                 f"{n} names for {self.n_sheets} sheets",
                 "give one name a sheet",

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from armscan.calibration.hand_eye.calibrate import (
@@ -21,12 +22,12 @@ from armscan.calibration.hand_eye.calibrate import (
     calibrate_on_plate,
     calibrate_on_sphere,
 )
-from armscan.calibration.hand_eye.checks import MOST_ARM_MM, MOST_OPEN_MM
+from armscan.calibration.hand_eye.checks import LIKELIER, MOST_ARM_MM, MOST_OPEN_MM
 from armscan.calibration.hand_eye.estimate import LEVER_MM
 from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import ArmscanError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray, homogeneous
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Pose
 from armscan.geometry.shapes import Plane, fit_plane
@@ -43,16 +44,18 @@ PLATE = Placement(
 N_WAVES = 24
 NODES = 8
 TOO_FEW = ("too few", "no exposure has a stripe")
+AMBIGUOUS = "explain the stripes equally well"
 OPEN = (
     "the postures determine only",
     "the postures hardly determine",
     "the postures do not determine",
-    "explain the stripes equally well",
+    AMBIGUOUS,
 )
 SCATTERS = (
     "the arm would have to scatter by",
     "no hand-eye fits: the stripes of the typical posture lie",
     "no hand-eye puts the points on one sphere",
+    "the scatter of arm and stripes or the sensor leaves it open",
 )
 BLAMES_OTHERS = ("plane left free", "would leave", "would fit", "agree with each other")
 """Words of refusals, by what they say; the last with what else some name as the cause."""
@@ -68,6 +71,8 @@ TYPICAL_TILT = np.radians(25.0)
 TIP_RATIO = (0.1, 0.8)
 """What a tip's calibration errs by over what a touch does: the software expects 0.39."""
 MOST_BEHIND_MM = 400.0
+N_STARTS = 40
+APART_DEG = 1.0
 GROUPS = {"rotation": (0, 1, 2), "translation": (3, 4, 5)}
 
 
@@ -119,9 +124,10 @@ def run_hand_eye(
     heads = sphere_heads(made, rng) if on_sphere else plate_heads(made, rng)
     seen = observed(made, sensor, lights, heads, waves, rng, on_sphere)
     stripes = [one.stripe for one in seen]
+    plate = None if on_sphere else probed(made, waves, rng)
     begun = time.process_time()
     try:
-        found = _calibrated(made, stripes, sensor, waves, rng, on_sphere)
+        found = _calibrated(made, stripes, sensor, plate)
     except ArmscanError as error:
         found = FitFailure(str(error))
     seconds = time.process_time() - begun
@@ -131,6 +137,8 @@ def run_hand_eye(
         are_few = are_few_postures(seen, on_sphere)
         limit_mm = _most_open_mm(made, on_sphere)
         is_open = best is None or _open_mm(best) > limit_mm
+        if plate is not None and AMBIGUOUS in found.reason:
+            is_open |= lead_of_the_likeliest(made, seen, plate, sensor.covariance) < LIKELIER
         result = refusal(made, found.reason, are_few=are_few, is_open=is_open)
         reason = f"few postures: {found.reason}" if are_few else found.reason
         return Outcome(stage, result, reason, seconds=seconds)
@@ -168,14 +176,11 @@ def _calibrated(
     made: Instrument,
     stripes: list[PosedStripe],
     sensor: SensorCalibration,
-    waves: Waves,
-    rng: np.random.Generator,
-    on_sphere: bool,
+    plate: PlateReference | None,
 ) -> HandEyeFit | FitFailure:
-    if on_sphere:
+    if plate is None:
         diameter = made.references.diameter_mm
         return calibrate_on_sphere(stripes, diameter, sensor_covariance=sensor.covariance)
-    plate = probed(made, waves, rng)
     return calibrate_on_plate(stripes, plate, HandEyeOptions(), sensor_covariance=sensor.covariance)
 
 
@@ -183,7 +188,8 @@ def refusal(made: Instrument, reason: str, *, are_few: bool, is_open: bool) -> s
     """Right where the instrument is beyond a limit of the software, and the reason says which.
 
     ``are_few``: fewer postures than it asks for; ``is_open``: the bound itself leaves more open
-    than it takes.
+    than it takes, or, where other hand-eyes are said to explain the stripes equally well, they do
+    so by the true variances.
     """
     is_degenerate = made.fault in DEGENERATE["handeye"]
     is_right = (
@@ -511,3 +517,76 @@ def hand_eye_bound(
     if not np.linalg.eigvalsh(scaled)[0] > 1e-12:
         return None
     return np.asarray((np.linalg.inv(scaled) / np.outer(size, size))[:6, :6])
+
+
+def lead_of_the_likeliest(
+    made: Instrument, seen: Sequence[Seen], plate: PlateReference, sensor: FloatArray
+) -> float:
+    """Logarithm of the likelihood ratio of the likeliest hand-eye and the next, a degree and more
+    apart, by the true variances; infinite if there is no other. Means of neighbouring points stand
+    for all.
+
+    Each is a minimum of the stripes' distances from the probed plane under their covariance, that
+    descents from random rotations end in, all cameras before the plate; what is open beside it
+    counts by its determinant.
+    """
+    rows = [
+        (one, part)
+        for one in seen
+        for part in np.array_split(np.arange(len(one.points)), min(NODES, len(one.points)))
+    ]
+    normal, point = plate.plane.normal, plate.plane.point_mm
+    poses = [one.stripe.base_from_tool for one, _ in rows]
+    in_sensor = np.array([one.stripe.points_mm[part].mean(axis=0) for one, part in rows])
+    in_tool = np.array([normal @ pose.rotation for pose in poses])
+    constants = np.array([normal @ (pose.translation_mm - point) for pose in poses])
+    lower = np.linalg.cholesky(_covariance_on_plate(made, rows, sensor))
+    found: list[tuple[float, FloatArray]] = []
+    random = Rotation.random(N_STARTS, random_state=np.random.default_rng(5)).as_matrix()
+    for first in (made.tool_from_sensor.rotation, *random):
+
+        def whitened(x: FloatArray, first: FloatArray = first) -> FloatArray:
+            placed = in_sensor @ first.T @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:]
+            return np.linalg.solve(lower, (in_tool * placed).sum(axis=1) + constants)
+
+        flat = (in_tool * (in_sensor @ first.T)).sum(axis=1) + constants
+        shift = -np.linalg.pinv(in_tool, rcond=1e-6) @ flat
+        end = least_squares(whitened, [0.0, 0.0, 0.0, *shift], x_scale=[0.01] * 3 + [1.0] * 3)
+        if (in_tool @ end.x[3:] + constants > 0.0).all():
+            open_by = float(np.linalg.slogdet(end.jac.T @ end.jac)[1])
+            turned = Rotation.from_rotvec(end.x[:3]).as_matrix() @ first
+            found.append((-end.cost - 0.5 * open_by, turned))
+    found.sort(key=lambda one: -one[0])
+    for likelihood, turned in found[1:]:
+        apart = Rotation.from_matrix(turned.T @ found[0][1]).magnitude()
+        if np.degrees(apart) > APART_DEG:
+            return found[0][0] - likelihood
+    return float("inf")
+
+
+def _covariance_on_plate(
+    made: Instrument, rows: Sequence[tuple[Seen, IntArray]], sensor: FloatArray
+) -> FloatArray:
+    """(M, M) of the distances of means of points, ``rows``, from the probed plane."""
+    normal, sigma, share = PLATE.rotation[:, 2], made.arm.position_mm, made.arm.exposure_share
+    lever, noise, known, places = [], [], [], []
+    for one, part in rows:
+        base, gradient = one.head.apply(one.points[part]).mean(axis=0), normal @ one.head.rotation
+        centre = one.head.apply(turning_point(made)[None])[0]
+        lever.append([*(np.cross(base - centre, normal) / made.arm.lever_mm), *normal])
+        size = one.stripe.noise_mm[part, :, 0] @ gradient / made.claimed[1]
+        noise.append((size**2).mean() / len(part))
+        known.append(gradient @ one.stripe.dpoint_dsensor[part].mean(axis=0))
+        places.append(PLATE.back(base[None])[0, :2])
+    pulled, by_sensor, at = sigma * np.array(lever), np.array(known), np.array(places)
+    posture = np.array([one.posture for one, _ in rows])
+    exposure = np.array([id(one) for one, _ in rows])
+    alike = (1.0 - share**2) * (posture[:, None] == posture)
+    alike += share**2 * (exposure[:, None] == exposure)
+    covariance = pulled @ pulled.T * alike + by_sensor @ sensor @ by_sensor.T + np.diag(noise)
+    touched, tip = probed_places(made), tip_ratio(made)
+    by_touch = homogeneous(at) @ np.linalg.pinv(homogeneous(touched))
+    waves = Waves.draw(made, np.random.default_rng(12345), 300, 1.0)
+    shape = made.references.flatness_mm * (waves.features(at) - by_touch @ waves.features(touched))
+    covariance += made.references.probing_mm**2 * (by_touch @ by_touch.T + tip**2)
+    return np.asarray(covariance + shape @ shape.T)

@@ -14,14 +14,20 @@ import numpy as np
 import pytest
 
 from armscan.calibration.cameras.result import CameraOptions
+from armscan.calibration.hand_eye.checks import LIKELIER
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import LaserFit
 from rigs.instrument_arm import (
+    N_WAVES,
     PLATE,
     Seen,
+    Waves,
     are_few_postures,
     arm_scatter_mm,
+    lead_of_the_likeliest,
+    observed,
     plate_heads,
+    probed,
     refusal,
     run_hand_eye,
     turning_point,
@@ -38,7 +44,7 @@ from rigs.instrument_stages import (
     stripes_on_boards,
 )
 from rigs.instrument_stereo import run_stereo
-from rigs.instruments import Instrument, board_placements, draw_instrument
+from rigs.instruments import ArmKind, Instrument, board_placements, draw_instrument
 from rigs.sheet_rig import PROVENANCE
 
 OPTIONS = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
@@ -231,6 +237,35 @@ def test_an_arm_that_scatters_excuses_only_the_refusal_that_says_so() -> None:
     plane = f"{far}; with the plate's plane left free it is 0.2 mm"
     assert refusal(bad, far, are_few=False, is_open=False) == "rightly refused"
     assert refusal(bad, plane, are_few=False, is_open=False) == "wrongly refused"
+    ball = (
+        f"{OPEN[:42]}, though the tool turns: the scatter of arm and stripes or the sensor leaves"
+    )
+    ball += " it open (limit 3.11 mm; least known: turning)"
+    assert refusal(bad, ball, are_few=False, is_open=False) == "rightly refused"
+    assert refusal(fair, ball, are_few=False, is_open=False) == "wrongly refused"
+
+
+def test_hand_eyes_that_true_variances_do_not_tell_apart_are_rightly_refused() -> None:
+    """Postures that hardly tilt leave two, whose likelihoods part with the arm's scatter."""
+    made = draw_instrument(6100165)
+    assert made.arm.spread == "nearly parallel"
+    camera = run_camera(made)
+    sheets = run_sheets(made, camera.calibration, camera.information)
+    assert sheets.fit is not None
+    sensor = sheets.fit.to_calibration(PROVENANCE)
+    lights = {0: made.lights[sheets.names[0]]}
+
+    def lead(arm: ArmKind) -> float:
+        drawn, rng = replace(made, arm=arm), made.rng(20)
+        waves = Waves.draw(drawn, rng, N_WAVES, drawn.references.flatness_mm)
+        heads = plate_heads(drawn, rng)
+        seen = observed(drawn, sensor, lights, heads, waves, rng, on_sphere=False)
+        plate = probed(drawn, waves, rng)
+        return lead_of_the_likeliest(drawn, seen, plate, sensor.covariance)
+
+    good, bad = (replace(made.arm, position_mm=size_mm) for size_mm in (0.02, 0.3))
+    assert lead(replace(bad, spread="all round")) > lead(good) > 50.0
+    assert lead(bad) < LIKELIER
 
 
 @pytest.mark.parametrize("seed", [5500076, 7300, 7301, 7305])

@@ -101,6 +101,10 @@ TURN_THE_TOOL = (
     "scan the sphere from 8 or more postures that turn about at least two axes, each cutting it "
     "at another height"
 )
+SCAN_MORE = (
+    "scan from more postures, which turn further and whose stripes cross the sphere at other "
+    "heights, or take a larger sphere"
+)
 _OPEN = FitFailure("the postures do not determine hand-eye and sphere together", TURN_THE_TOOL)
 
 
@@ -364,13 +368,14 @@ def _refuse_open(
     problem: Problem, conditioning: Conditioning, diameter_mm: float, most_mm: float = np.inf
 ) -> FitFailure | None:
     """Refuse postures that leave a combination of the unknowns open or nearly so."""
-    cause = ": the tool hardly turns, or about one axis only"
+    cause, remedy = ": the tool hardly turns, or about one axis only", TURN_THE_TOOL
     if turns_about_two_axes(problem.observations):
-        cause = (
-            ", though the tool turns: the scatter of arm and stripes or the sensor leaves it open"
+        cause, remedy = (
+            ", though the tool turns: the scatter of arm and stripes or the sensor leaves it open",
+            SCAN_MORE,
         )
     most_mm = min(max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM), most_mm)
-    return refuse_hardly_determined(conditioning, most_mm, cause, TURN_THE_TOOL)
+    return refuse_hardly_determined(conditioning, most_mm, cause, remedy)
 
 
 def _plain(problem: Problem) -> Problem:

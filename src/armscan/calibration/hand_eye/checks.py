@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -43,6 +44,7 @@ from armscan.calibration.hand_eye.search import (
     GROSS_RATIO,
     Start,
     camera_heights_mm,
+    evenly_spread,
     find_start,
     posture_rms_at,
     thinned,
@@ -51,6 +53,7 @@ from armscan.calibration.hand_eye.search import (
 from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.shapes import Plane
 
 MAX_CONDITION = 100.0
@@ -63,6 +66,9 @@ AS_AREA = 0.2
 """Second extent over the first from which stripes of a posture show two slopes of the plate."""
 LIKELIER = 6.0
 """Logarithm of the likelihood ratio from which one minimum is preferred to another: 400 to 1."""
+SURELY_LIKELIER = 20.0
+"""And from which three points of each stripe are enough: they hardly tell flatness and noise of the
+stripes from the arm, by which the logarithm is up to 9 off."""
 MOST_ALTERNATIVES = 4
 APART_DEG = 1.0
 ALIKE_DEG, SMALL_DEG = 3.0, 8.0
@@ -274,27 +280,57 @@ def likeliest_start(problem: Problem, start: Start, cause: str) -> Start | FitFa
     """
     if not start.alternatives:
         return start
-    few = replace(problem, observations=thinned(problem.without(start.is_wrong).observations))
-    found = []
-    for pose in (start.tool_from_sensor, *start.alternatives[:MOST_ALTERNATIVES]):
-        fit = estimate(few, few.start(pose))
-        if fit is not None:
-            found.append((fit.linear.log_likelihood, pose, fit.state.tool_from_sensor))
+    kept = problem.without(start.is_wrong).observations
+    poses = (start.tool_from_sensor, *start.alternatives[:MOST_ALTERNATIVES])
+    found = _by_likelihood(replace(problem, observations=thinned(kept)), poses)
     if not found:
         return start
-    found.sort(key=lambda one: -one[0])
-    likely, best, end = found[0]
-    for other, _, other_end in found[1:]:
-        apart_deg = np.degrees(turn_between_rad(end, other_end))
-        if likely - other < LIKELIER and apart_deg > APART_DEG:
-            shift_mm = float(np.linalg.norm(end.translation_mm - other_end.translation_mm))
-            return FitFailure(
-                f"{len(problem.observations.used_postures)} postures leave different hand-eyes "
-                f"that explain the stripes equally well, {apart_deg:.1f} deg and {shift_mm:.1f} mm "
-                f"apart{cause}",
-                f"add postures: {VARY_POSTURES}",
-            )
-    return replace(start, tool_from_sensor=best)
+    close = [one.end for one in found if found[0].likelihood - one.likelihood < SURELY_LIKELIER]
+    if len(close) > 1:
+        whole = replace(problem, observations=evenly_spread(kept))
+        found = _by_likelihood(whole, close, is_all_asked=True) or found
+    best = found[0]
+    if len(found) > 1 and best.likelihood - found[1].likelihood < LIKELIER:
+        other = found[1].end
+        apart_deg = np.degrees(turn_between_rad(best.end, other))
+        shift_mm = float(np.linalg.norm(best.end.translation_mm - other.translation_mm))
+        return FitFailure(
+            f"{len(problem.observations.used_postures)} postures leave different hand-eyes "
+            f"that explain the stripes equally well, {apart_deg:.1f} deg and {shift_mm:.1f} mm "
+            f"apart{cause}",
+            f"add postures: {VARY_POSTURES}",
+        )
+    return replace(start, tool_from_sensor=best.start)
+
+
+class _Candidate(NamedTuple):
+    """A hand-eye, where the estimate from it ends, and the logarithm of its likelihood there."""
+
+    likelihood: float
+    start: Pose[Tool, Sensor]
+    end: Pose[Tool, Sensor]
+
+
+def _by_likelihood(
+    problem: Problem, poses: Sequence[Pose[Tool, Sensor]], *, is_all_asked: bool = False
+) -> list[_Candidate]:
+    """Different ends of the estimates from several hand-eyes, the likeliest first.
+
+    None of them if one finds no minimum and ``is_all_asked``.
+    """
+    fits = [(pose, estimate(problem, problem.start(pose))) for pose in poses]
+    if is_all_asked and any(fit is None for _, fit in fits):
+        return []
+    found = [
+        _Candidate(fit.linear.log_likelihood, pose, fit.state.tool_from_sensor)
+        for pose, fit in fits
+        if fit is not None
+    ]
+    kept: list[_Candidate] = []
+    for one in sorted(found, key=lambda one: -one.likelihood):
+        if all(np.degrees(turn_between_rad(one.end, other.end)) > APART_DEG for other in kept):
+            kept.append(one)
+    return kept
 
 
 def explain_misfit(problem: Problem, plate: PlateSurface, start: Start) -> FitFailure:

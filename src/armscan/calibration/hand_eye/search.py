@@ -412,13 +412,17 @@ def _from_subsets(
 
 
 def thinned(observations: CondensedObservations) -> CondensedObservations:
-    """Three observations a stripe of at most `MOST_STRIPES` exposures, evenly spread."""
-    few = three_a_stripe(observations)
-    used = np.unique(few.stripe)
+    """Three observations a stripe of `evenly_spread` exposures."""
+    return evenly_spread(three_a_stripe(observations))
+
+
+def evenly_spread(observations: CondensedObservations) -> CondensedObservations:
+    """All observations of at most `MOST_STRIPES` exposures, evenly spread."""
+    used = np.unique(observations.stripe)
     if len(used) <= MOST_STRIPES:
-        return few
+        return observations
     chosen = used[np.linspace(0, len(used) - 1, MOST_STRIPES).round().astype(np.int64)]
-    return few.select(np.isin(few.stripe, chosen))
+    return observations.select(np.isin(observations.stripe, chosen))
 
 
 def three_a_stripe(observations: CondensedObservations) -> CondensedObservations:

@@ -164,7 +164,7 @@ def find_alternatives(fit: HandEyeSolution) -> tuple[Alternative, ...]:
 def _all_unknowns(fit: HandEyeSolution) -> Iterator[_Unknowns]:
     problem, placed = fit.problem, fit.placed
     observations = problem.observations
-    yield _Unknowns("scale", placed.jacobian[:, -1:])
+    yield _Unknowns("scale", fit.by_scale)
     if not problem.options.solve_plate:
         yield _Unknowns("plate", placed.by_surface)
         yield _Unknowns("offset", placed.by_surface[:, 2:])

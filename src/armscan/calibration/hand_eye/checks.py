@@ -322,7 +322,7 @@ def _by_likelihood(
     if is_all_asked and any(fit is None for _, fit in fits):
         return []
     found = [
-        _Candidate(fit.linear.log_likelihood, pose, fit.state.tool_from_sensor)
+        _Candidate(fit.log_likelihood, pose, fit.state.tool_from_sensor)
         for pose, fit in fits
         if fit is not None
     ]

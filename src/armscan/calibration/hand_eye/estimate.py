@@ -173,6 +173,30 @@ class HandEyeSolution:
         return np.asarray(self.placed.jacobian[:, self.problem.columns])
 
     @property
+    def log_likelihood(self) -> float:
+        """Restricted log-likelihood of the measured points, by which hand-eyes are compared.
+
+        That of their distances from the surface, and how distances follow what each point errs by:
+        a hand-eye that turns the errors into the surface explains distances of any points.
+        """
+        own = next(one for one in self.components if one.name == "stripe")
+        return self.linear.log_likelihood + 0.5 * float(np.log(np.diag(own.covariance)).sum())
+
+    @property
+    def by_scale(self) -> FloatArray:
+        """(M, 1) derivative of the residuals by the scale of the sensor's points less their errors.
+
+        A scale shrinks the points' errors as well as the points. With errors of covariance V in
+        residuals e and derivative alike, their product is ``tr(P V)`` on average and pulls the
+        scale down by so many times its variance: by half a sigma and more. They are predicted to be
+        ``V P e``, and ``e' P V P e`` is the same on average.
+        """
+        rows = np.arange(len(self.placed.residual_mm))
+        own = self.problem.sensor_covariance(self.placed)
+        own = own + self.scatter_of("stripe", rows) + self.scatter_of("sheet", rows)
+        return np.asarray(self.placed.jacobian[:, -1:] - (own @ self.explained)[:, None])
+
+    @property
     def scatter(self) -> FloatArray:
         """(M, M) covariance of the residuals by the causes of scatter."""
         return total_covariance(self.components, self.noise.sigmas)

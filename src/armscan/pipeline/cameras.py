@@ -52,8 +52,7 @@ CENTRE_ROUNDS = 5
 CENTRES_STABLE = 0.02
 """Circle centres are stable when no camera parameter moves by more than this many sigmas."""
 MODEL_ROUNDS = 3
-"""Circle centres settle for the largest model, then, if another is chosen, for that one."""
-_LARGEST: DistortionModel = "k1k2p1p2k3"
+"""Circle centres settle for a pinhole, then, if another lens is chosen, for that one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +150,7 @@ def calibrate_camera_from_views(
     """
     options = options or CameraOptions()
     total = MODEL_ROUNDS if any(view.edges is not None for view in views) else 1
-    model = _LARGEST if options.distortion == "auto" else options.distortion
+    model = options.distortion
     done = 0
     while True:
         done += 1
@@ -163,7 +162,7 @@ def calibrate_camera_from_views(
                 if settled is not None:
                     views = _views_numbered_alike(views, settled, target)
             except InputError:
-                # the largest model may fold over where the one that is chosen does not
+                # a pinhole may fold over where the lens that is chosen does not
                 if done > 1 or options.distortion != "auto":
                     raise
         fit = calibrate_camera(views, options)

@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.cameras import calibrate
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import (
     CameraFit,
@@ -15,7 +14,6 @@ from armscan.calibration.cameras.result import (
 from armscan.calibration.cameras.robust import excess_variance_px2
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.estimate import Estimate
-from armscan.models.camera import PARAMETER_NAMES
 from armscan.report.camera import camera_quantities
 from armscan.vision.targets.target import TargetView
 from rigs.camera_scene import CAMERA, Scene, make_views, normalised_error
@@ -36,7 +34,7 @@ STRONG = replace(CAMERA, distortion=np.array([-0.12, 0.1, 6e-4, -4e-4, 0.4]))
 def test_good_coverage_frees_all_five() -> None:
     fit = solved(make_views(Scene(camera=STRONG, n_views=20, reach=0.28), 1)[0])
     assert fit.free_parameters[4:] == ("k1", "k2", "p1", "p2", "k3")
-    assert "all five" in fit.model_reason
+    assert fit.model_reason == "all five coefficients: the views tell k1 k2 p1 p2 k3"
     held_out = fit.cross_validation
     assert held_out is not None
     assert held_out.n_folds == 5
@@ -46,24 +44,9 @@ def test_good_coverage_frees_all_five() -> None:
     assert held_out.sources == tuple(view.source for view in fit.used_views)
 
 
-def test_few_central_views_free_fewer_and_the_covariance_counts_the_rest() -> None:
-    scene = Scene(n_views=4, noise_px=0.3, distance_mm=900.0, reach=0.05, max_tilt_deg=50.0)
-    for seed in range(6):
-        views = make_views(scene, seed)[0]
-        fit = solved(views)
-        assert "k3" not in fit.free_parameters
-        assert "not told from zero" in fit.model_reason or "no better" in fit.model_reason
-        assert fit.camera.distortion[4] == 0.0
-        held = set(PARAMETER_NAMES[4:]) - set(fit.free_parameters)
-        assert all(fit.sigma[PARAMETER_NAMES.index(name)] > 0.0 for name in held)
-        asked = solved(views, CameraOptions(distortion="k1"))
-        assert (asked.sigma[5:] == 0.0).all()
-        assert (fit.sigma[:4] >= 0.9 * asked.sigma[:4]).all()
-
-
 def test_three_views_have_no_hold_out_test() -> None:
     fit = solved(make_views(Scene(n_views=3), 2)[0])
-    assert "k3" not in fit.free_parameters
+    assert "all five" in fit.model_reason
     assert fit.cross_validation is None
     assert any("only 3 views" in warning for warning in fit.warnings)
 
@@ -110,27 +93,16 @@ def test_a_small_bow_is_solved_without_a_warning(share: float, is_warned_of: boo
 
 
 def test_a_bow_hides_no_coefficient_of_the_lens() -> None:
-    """Models are chosen anew with the bow free: it passes for p1 and p2, and for their absence."""
+    """A bow passes for p1 and p2, and for their absence."""
     distortion = np.array([-0.12, 0.1, 1.2e-3, 1e-3, 0.0])
     camera, errors = replace(CAMERA, distortion=distortion), []
     for seed, bow_mm in enumerate([(0.15, -0.1), (0.5, 0.4), (1.5, -1.0)]):
         scene = Scene(camera=camera, noise_px=0.1, bow_mm=bow_mm)
         fit = solved(make_views(scene, seed)[0])
-        assert {"p1", "p2"} <= set(fit.free_parameters)
+        assert "p1 p2" in fit.model_reason.split(";")[0]
         truth, found = camera.parameters[:4], fit.camera.parameters[:4]
         errors.append(normalised_error(truth, found, fit.covariance[:4, :4]))
     assert np.mean(errors) < 4.0 + 4.0 * np.sqrt(8.0 / len(errors))
-
-
-def test_what_unseen_views_ask_for_is_not_given_up_for_a_bow(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The choice made on a flat board stands where, the bow being free, it predicts better."""
-    camera = replace(CAMERA, distortion=np.array([-0.12, 0.1, 1.2e-3, 1e-3, 0.0]))
-    views = make_views(Scene(camera=camera, noise_px=0.1, bow_mm=(0.5, 0.4)), 1)[0]
-    assert {"p1", "p2"} <= set(solved(views).free_parameters)
-    monkeypatch.setattr(calibrate, "predicts_better", lambda *_: True)
-    assert "p1" not in solved(views).free_parameters
 
 
 def test_bowed_boards_do_not_spoil_the_camera_unasked() -> None:
@@ -228,13 +200,14 @@ def test_views_of_one_place_are_told_in_one_sentence() -> None:
     assert told[0].startswith("5 views")
 
 
-def test_folding_model_yields_to_one_that_does_not_fold() -> None:
-    # Strong barrel distortion seen only in the middle: k3 runs away at the corners.
+def test_a_lens_seen_in_its_middle_folds_over_seldom_and_says_so() -> None:
+    """Strong barrel distortion. With k1 alone, as the views ask for, seven of eight fold over."""
     lens = plain_camera(520.0, (319.5, 239.5), (640, 480), [-0.3, 0.11, 0, 0, 0])
     scene = Scene(camera=lens, n_views=8, noise_px=0.2, distance_mm=450.0, reach=0.1)
-    for seed in range(4):
+    folded = 0
+    for seed in range(8):
         fit = solved(make_views(scene, seed)[0])
         if len(fit.camera.folded_border()):
+            folded += 1
             assert any("no inverse" in warning for warning in fit.warnings)
-        elif "folds over" in fit.model_reason:
-            assert "k3" not in fit.free_parameters
+    assert folded <= 4

@@ -1,159 +1,99 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rule that chooses the distortion model, on solutions that are only names, and what it leaves
-unsaid about the coefficients that it drops, on random lenses.
+"""All coefficients beside the size that they have in usual lenses: what is solved, what is said of
+it, and how far it errs on random lenses.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from armscan.calibration.cameras.calibrate import calibrate_camera
-from armscan.calibration.cameras.distortion import (
-    MODELS,
-    ChosenModel,
-    choose_model,
-    predicts_better,
+from armscan.calibration.cameras.adjustment import (
+    Observations,
+    State,
+    adjust,
+    basis_of,
+    gather,
+    joint_covariance,
+    linearise,
 )
-from armscan.calibration.cameras.result import CameraFit, CrossValidation, DistortionModel
-from armscan.calibration.cameras.robust import Solution
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.distortion import typical_coefficients
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.geometry.estimate import FitFailure
-from armscan.models.camera import CameraModel
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.vision.targets.target import Chessboard, TargetView
-from rigs.camera_scene import Scene, make_views, normalised_error
+from rigs.camera_scene import CAMERA, Scene, make_views, normalised_error
 from rigs.plain_scanner import plain_camera
 
-VIEWS = 8
-RIPPLE = np.array([0.98, 1.01, 1.0, 1.02, 0.99, 1.0, 1.01, 0.99])
-"""How the held-out rms differs from view to view."""
+FREE = PARAMETER_NAMES
 
 
-def name_of(solution: Solution) -> DistortionModel:
-    return cast(SimpleNamespace, solution).model
+def solved_beside(known: np.ndarray) -> tuple[Observations, State, np.ndarray]:
+    """Observations with what is known, their minimum, and its basis."""
+    views, poses = make_views(Scene(n_views=5, noise_px=0.3, reach=0.1), 3)
+    seen = replace(gather(views, "pinhole"), known=known)
+    start = State.from_poses(np.r_[CAMERA.parameters, 0.0, 0.0], poses)
+    basis = basis_of(FREE, is_aspect_fixed=False)
+    found = adjust(seen, start, basis)
+    assert not isinstance(found, FitFailure)
+    return seen, found.state, basis
 
 
-def chosen(
-    held_out_px: Mapping[DistortionModel, float],
-    chances: Mapping[DistortionModel, float] | None = None,
-    folding: tuple[DistortionModel, ...] = (),
-    unsettled: tuple[DistortionModel, ...] = (),
-    alike: tuple[DistortionModel, ...] = (),
-) -> ChosenModel | FitFailure:
-    """The choice when models have these hold-out errors; those not named have no solution.
-
-    ``chances`` of a larger model's further coefficients; significant where not named. ``alike``:
-    models that leave residuals which are alike within a view.
-    """
-
-    def solve(model: DistortionModel) -> Solution | FitFailure:
-        if model in held_out_px:
-            named = SimpleNamespace(model=model, is_converged=model not in unsettled)
-            return cast(Solution, named)
-        return FitFailure(f"{model} is not determined")
-
-    def validate(solution: Solution, _reference: Solution) -> CrossValidation | None:
-        rms = held_out_px[name_of(solution)]
-        return CrossValidation(5, rms, 0.1, (), tuple(rms * RIPPLE)) if rms > 0.0 else None
-
-    return choose_model(
-        solve,
-        validate,
-        lambda solution: name_of(solution) in folding,
-        lambda _smaller, larger, _names: (chances or {}).get(name_of(larger), 0.0),
-        lambda solution: name_of(solution) in alike,
-    )
+def test_what_is_known_pulls_as_the_points_do_at_the_minimum() -> None:
+    """The gradient of chi2 + sum of known value^2 vanishes, and its curvature is in the inverse."""
+    known = np.zeros(11)
+    known[5:9] = 1.0 / typical_coefficients(CAMERA, PARAMETER_NAMES[5:]) ** 2
+    seen, state, basis = solved_beside(known)
+    points = linearise(replace(seen, known=0.0 * known), state, basis, np.ones(len(seen.points_px)))
+    both = linearise(seen, state, basis, np.ones(len(seen.points_px)))
+    assert points is not None
+    assert both is not None
+    pull = basis.T @ (known * state.shared)
+    assert np.abs(pull[5:]).max() > 0.0
+    off = (points.shared_gradient - pull) / np.sqrt(np.diag(points.shared))
+    assert np.abs(off).max() < 1e-3
+    np.testing.assert_allclose(both.chi2, points.chi2 + known @ state.shared**2)
+    alone, beside = (joint_covariance(each, basis) for each in (points, both))
+    assert not isinstance(alone, FitFailure)
+    assert not isinstance(beside, FitFailure)
+    smaller = np.diag(alone[0])[:9] - np.diag(beside[0])[:9]
+    assert (smaller > 0.0).all()
+    assert (np.diag(beside[0])[5:9] * known[5:9] < 1.0).all()
 
 
-BETTER: dict[DistortionModel, float] = dict(zip(MODELS, (0.4, 0.3, 0.25, 0.2), strict=True))
-ALIKE: dict[DistortionModel, float] = dict.fromkeys(MODELS, 0.2)
+def test_a_usual_coefficient_moves_the_corner_by_a_part_of_the_one_before_it() -> None:
+    for f, first in ((20000.0, 0.0041), (1500.0, 0.3)):
+        camera = plain_camera((f, f), (1023.5, 767.5), (2048, 1536), [0, 0, 0, 0, 0])
+        square = 0.25 * (2048**2 + 1536**2) / f**2
+        k1, k2, p1, p2, k3 = typical_coefficients(camera, PARAMETER_NAMES[4:])
+        assert k1 == np.inf
+        assert k2 * square**2 == pytest.approx(0.3 * first, rel=0.02)
+        assert k3 * square**3 == pytest.approx(0.09 * first, rel=0.02)
+        assert p1 == p2 == 1e-3
 
 
-@pytest.mark.parametrize(
-    ("found", "model", "reason"),
-    [
-        (chosen(BETTER), "k1k2p1p2k3", "all five"),
-        (chosen(BETTER, {"k1k2p1p2k3": 0.02}), "k1k2p1p2", "k3 not told from zero"),
-        (chosen(BETTER, {"k1k2p1p2k3": 0.02, "k1k2p1p2": 0.5}), "k1k2", "p1 p2 not told"),
-        (chosen(BETTER, {"k1k2": 0.5}), "k1k2p1p2k3", "all five"),
-        (chosen(ALIKE), "k1", "predicted no better with k2"),
-        (chosen({**BETTER, "k1k2p1p2k3": 0.26}), "k1k2p1p2", "predicted no better with k3"),
-        (chosen(BETTER, unsettled=("k1k2p1p2k3",)), "k1k2p1p2", "k3 not told"),
-        (chosen({"k1": 0.4, "k1k2": 0.3}), "k1k2", "no larger model has a solution"),
-        (chosen({**ALIKE, "k1": 0.3}, folding=("k1k2",)), "k1k2p1p2", "k1k2 folds over"),
-        (chosen({**BETTER}, folding=("k1k2p1p2k3",)), "k1k2p1p2k3", "all five"),
-        (chosen(ALIKE, folding=MODELS), "k1", "predicted no better"),
-        (chosen(BETTER, {"k1k2p1p2k3": 0.5}, alike=MODELS), "k1k2p1p2k3", "all five"),
-        (chosen(ALIKE, dict.fromkeys(MODELS, 0.5), alike=MODELS), "k1", "not told"),
-        (chosen(BETTER, {"k1k2p1p2k3": 0.5}, (), ("k1k2p1p2k3",), MODELS), "k1k2p1p2", "k3 not"),
-        (chosen(dict.fromkeys(MODELS, 0.0)), "k1k2p1p2k3", "all five"),
-        (chosen(dict.fromkeys(MODELS, 0.0), dict.fromkeys(MODELS, 0.3)), "k1", "not told"),
-    ],
-)
-def test_the_smallest_model_beyond_which_the_views_show_nothing(
-    found: ChosenModel | FitFailure, model: DistortionModel, reason: str
-) -> None:
-    assert isinstance(found, ChosenModel)
-    assert found.model == model
-    assert reason in found.reason
-
-
-@pytest.mark.parametrize(
-    ("larger_px", "is_asked_for"), [(0.19, True), (0.1998, False), (0.21, False)]
-)
-def test_coefficients_are_given_up_with_a_bow_free_only_if_unseen_views_do(
-    larger_px: float, is_asked_for: bool
-) -> None:
-    """A gain of 0.2 per cent is less than what held-out views scatter by."""
-    noise = np.array([0.004, -0.003, 0.002, -0.004, 0.003, -0.002, 0.001, -0.001])
-    held_out = {4: 0.2 + np.zeros(VIEWS), 6: larger_px + noise}
-
-    def solution(n_free: int, *, is_converged: bool = True) -> Solution:
-        basis = np.eye(9)[:, :n_free]
-        return cast(Solution, SimpleNamespace(basis=basis, is_converged=is_converged))
-
-    def validate(each: Solution, _reference: Solution) -> CrossValidation:
-        rms = held_out[each.basis.shape[1]]
-        return CrossValidation(5, float(np.sqrt(np.mean(rms**2))), 0.1, (), tuple(rms))
-
-    smaller = ChosenModel("k1", solution(4), None, "")
-    assert predicts_better(solution(6), smaller, validate) == is_asked_for
-    larger = ChosenModel("k1k2", solution(6), None, "")
-    assert not predicts_better(solution(6), larger, validate)
-    assert not predicts_better(FitFailure("none"), smaller, validate)
-    assert not predicts_better(solution(6, is_converged=False), smaller, validate)
-
-
-def test_without_any_solution_the_first_failure_is_told() -> None:
-    found = chosen({})
-    assert isinstance(found, FitFailure)
-    assert found.reason == "k1 is not determined"
-
-
-def test_a_gain_that_scatters_more_than_it_is_does_not_count() -> None:
-    """One view of eight gains much, the others lose a little: its mean is under its own error."""
-    per_view = {"k1": np.full(VIEWS, 0.2), "k1k2": np.array([0.1, *[0.203] * 7])}
-
-    def validate(solution: Solution, _reference: Solution) -> CrossValidation:
-        rms = per_view[name_of(solution)]
-        return CrossValidation(5, float(np.sqrt(np.mean(rms**2))), 0.1, (), tuple(rms))
-
-    found = choose_model(
-        lambda model: (
-            cast(Solution, SimpleNamespace(model=model, is_converged=True))
-            if model in per_view
-            else FitFailure("not asked")
-        ),
-        validate,
-        lambda _solution: False,
-        lambda _smaller, _larger, _names: 0.0,
-        lambda _solution: False,
-    )
-    assert isinstance(found, ChosenModel)
-    assert found.model == "k1"
+def test_few_central_views_do_not_let_coefficients_run_and_say_what_they_rest_on() -> None:
+    scene = Scene(n_views=4, noise_px=0.3, distance_mm=900.0, reach=0.05, max_tilt_deg=50.0)
+    run = []
+    for seed in range(6):
+        views = make_views(scene, seed)[0]
+        fit = calibrate_camera(views)
+        free = calibrate_camera(views, CameraOptions(distortion="k1k2p1p2k3"))
+        asked = calibrate_camera(views, CameraOptions(distortion="k1"))
+        assert isinstance(fit, CameraFit)
+        assert isinstance(free, CameraFit)
+        assert isinstance(asked, CameraFit)
+        usual = typical_coefficients(fit.camera, PARAMETER_NAMES[5:])
+        assert (np.abs(fit.camera.parameters[5:]) < 3.0 * usual).all()
+        assert (fit.sigma[5:] <= 1.1 * usual).all()
+        assert "rest" in fit.model_reason
+        assert "k3" in fit.model_reason.split(";")[1]
+        assert (asked.sigma[5:] == 0.0).all()
+        assert (fit.sigma[:4] >= 0.9 * asked.sigma[:4]).all()
+        run.append(np.abs(free.camera.parameters[5:] / usual).max())
+    assert np.median(run) > 3.0
 
 
 def lens(rng: np.random.Generator) -> CameraModel:
@@ -181,8 +121,8 @@ def bent(view: TargetView, rng: np.random.Generator, size_px: float) -> TargetVi
 def test_errors_stay_within_sigma_where_the_board_covers_little_or_views_are_bent(
     *, reach: float, share: float, is_bent: bool
 ) -> None:
-    """Fixed draws; mean of e' C^-1 e over 4 for fx, fy, cx, cy. Without the coefficients left at
-    zero it is 40 in the first case, without the design effect 9 in the second.
+    """Fixed draws; mean of e' C^-1 e over 4 for fx, fy, cx, cy. With coefficients left at zero
+    as if known it is 40 in the first case, without the design effect 9 in the second.
     """
     squares = []
     for seed in range(10):

@@ -6,7 +6,7 @@ normal equations with the views eliminated, and the covariance of what comes out
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -48,6 +48,9 @@ class Observations:
         (N, 2) height of the board per unit of the two bow parameters.
     starts
         (V + 1,) first row of each view, and N.
+    known
+        (11,) what is known beforehand of each shared unknown that is near zero: 1 / size^2 times
+        the variance of a point of unit weight; 0 where nothing is.
     """
 
     points_px: FloatArray
@@ -58,6 +61,7 @@ class Observations:
     width_px: int
     height_px: int
     lens: Lens
+    known: FloatArray = field(default_factory=lambda: np.zeros(len(SHARED_NAMES)))
 
     def camera(self, parameters: FloatArray) -> CameraModel:
         """The camera of (9,) parameters."""
@@ -233,7 +237,8 @@ def linearise(
 ) -> NormalEquations | None:
     """Form the normal equations at ``state``; ``weights`` (N,) multiply each point's chi2.
 
-    Those of `normal_equations` of what `predict` says, in one pass over the points.
+    Those of `normal_equations` of what `predict` says, in one pass over the points, and what is
+    known beforehand.
     """
     if not np.isfinite(state.shared).all() or min(state.shared[:2]) <= 0.0:
         return None
@@ -258,13 +263,28 @@ def linearise(
     blocks = sums.reshape(n, size, size)
     total = blocks.sum(axis=0)
     shared, pose = np.triu(total[:f, :f]), np.triu(blocks[:, f:-1, f:-1])
-    return NormalEquations(
+    of_points = NormalEquations(
         float(total[-1, -1]),
         shared + np.triu(shared, 1).T,
         blocks[:, :f, f:-1],
         pose + np.triu(pose, 1).transpose(0, 2, 1),
         total[:f, -1],
         blocks[:, f:-1, -1],
+    )
+    return with_known(of_points, observations.known, state, basis)
+
+
+def with_known(
+    equations: NormalEquations, known: FloatArray, state: State, basis: FloatArray
+) -> NormalEquations:
+    """The normal equations with what is known beforehand (see `Observations`)."""
+    if not (known @ basis**2).any():
+        return equations
+    return replace(
+        equations,
+        chi2=equations.chi2 + float(known @ state.shared**2),
+        shared=equations.shared + basis.T @ (known[:, None] * basis),
+        shared_gradient=equations.shared_gradient - basis.T @ (known * state.shared),
     )
 
 

@@ -5,7 +5,7 @@ evidence for what comes out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, reduce
 
@@ -20,19 +20,18 @@ from armscan.calibration.cameras.adjustment import (
 )
 from armscan.calibration.cameras.distortion import (
     ChosenModel,
-    chance_of_coefficients,
     choose_lens,
-    choose_model,
     coefficients_left_at_zero,
     cross_validate,
     design_effect,
-    predicts_better,
+    known_of_usual_lenses,
     print_stretch,
+    resting_on_usual,
     rms,
     sigma_of_axis,
 )
 from armscan.calibration.cameras.result import (
-    ALIKE,
+    DISTORTION_PARAMETERS,
     MIN_VIEWS,
     CameraFit,
     CameraOptions,
@@ -62,7 +61,6 @@ from armscan.calibration.cameras.robust import (
     excess_variance_px2,
     residuals_px,
     solve_robustly,
-    with_board_warp,
     with_excess,
     with_significant_bow,
 )
@@ -513,7 +511,7 @@ def _without(bad: BoolArray, prepared: PreparedViews, solution: Solution) -> Pre
 def _solve_model(
     views: Sequence[TargetView], prepared: PreparedViews, options: CameraOptions
 ) -> ChosenModel | FitFailure:
-    """Solve with the wanted model, or with the one that the rule chooses."""
+    """Solve with the wanted model; or all coefficients, and the kind of lens that is chosen."""
     used = [views[index] for index in prepared.used]
     observations = gather(used, "pinhole")
     sources = tuple(view.source for view in used)
@@ -523,55 +521,56 @@ def _solve_model(
         seen = replace(observations, lens="fisheye") if model == "fisheye" else observations
         return _solve(used, seen, prepared, model, options)
 
-    @cache
-    def bowed(model: DistortionModel) -> Solution | FitFailure:
-        flat = solve(model)
-        return flat if isinstance(flat, FitFailure) else with_board_warp(flat, options.max_steps)
-
     def validate(solution: Solution, reference: Solution) -> CrossValidation | None:
         on_points = replace(solution, weights=reference.weights)
         return cross_validate(on_points, sources, options.n_folds)
 
-    def folds(solution: Solution) -> bool:
-        camera = solution.observations.camera(solution.state.shared[:N_CAMERA])
-        return len(camera.folded_border()) > 0
-
-    def alike(solution: Solution) -> bool:
-        return design_effect(solution).widening >= ALIKE
-
-    def choose(
-        solving: Callable[[DistortionModel], Solution | FitFailure],
-    ) -> ChosenModel | FitFailure:
-        return choose_model(solving, validate, folds, chance_of_coefficients, alike)
-
-    def choose_pinhole() -> ChosenModel | FitFailure:
-        chosen = choose(solve)
-        if isinstance(chosen, FitFailure) or not _is_bowed(chosen.solution, options):
-            return chosen
-        # what a bow does to the residuals hides coefficients, and passes for others
-        again = choose(bowed)
-        flat = again if isinstance(again, FitFailure) else solve(again.model)
-        if isinstance(again, FitFailure) or isinstance(flat, FitFailure):
-            return chosen
-        if predicts_better(bowed(chosen.model), again, validate):
-            return chosen
-        return replace(again, solution=flat) if _is_bowed(flat, options) else chosen
-
-    if options.distortion == "auto" and options.n_folds:
-        return choose_lens(choose_pinhole(), solve, validate)
-    model: DistortionModel = options.distortion
-    reason = f"{model} was asked for"
-    if model == "auto":
-        model, reason = "k1k2p1p2k3", "all five coefficients, no hold-out test was wanted"
+    if options.distortion == "auto":
+        solution = _beside_usual_sizes(used, observations, prepared, options)
+        if isinstance(solution, FitFailure):
+            pinhole: ChosenModel | FitFailure = solution
+        else:
+            reason = _reason_of_sizes(solution)
+            pinhole = ChosenModel(_ALL, solution, validate(solution, solution), reason)
+        return choose_lens(pinhole, solve, validate) if options.n_folds else pinhole
+    model = options.distortion
     solution = solve(model)
     if isinstance(solution, FitFailure):
         return solution
-    return ChosenModel(model, solution, validate(solution, solution), reason)
+    return ChosenModel(model, solution, validate(solution, solution), f"{model} was asked for")
 
 
-def _is_bowed(solution: Solution, options: CameraOptions) -> bool:
-    bow = with_significant_bow(solution, options.max_steps, is_wanted=options.solve_warp)
-    return not isinstance(bow, FitFailure) and bow[1] is not None
+_ALL: DistortionModel = "k1k2p1p2k3"
+SIZE_ROUNDS = 3
+"""Solutions with what is known of usual lenses: its weight beside the points is that of the level
+of their residuals, which the first one does not know well."""
+
+
+def _beside_usual_sizes(
+    used: Sequence[TargetView],
+    observations: Observations,
+    prepared: PreparedViews,
+    options: CameraOptions,
+) -> Solution | FitFailure:
+    """All five coefficients, each beside the size that it has in usual lenses."""
+    solution = _solve(used, observations, prepared, "k1", options)
+    if isinstance(solution, FitFailure):
+        solution = _solve(used, observations, prepared, _ALL, options)
+    for _ in range(SIZE_ROUNDS):
+        if isinstance(solution, FitFailure):
+            break
+        bow = with_significant_bow(solution, options.max_steps, is_wanted=options.solve_warp)
+        level_of = solution if isinstance(bow, FitFailure) else bow[0]
+        known = replace(observations, known=known_of_usual_lenses(level_of))
+        solution = _solve(used, known, prepared, _ALL, options)
+    return solution
+
+
+def _reason_of_sizes(solution: Solution) -> str:
+    resting = resting_on_usual(solution)
+    told = [name for name in DISTORTION_PARAMETERS[_ALL] if name not in resting]
+    rest = f"{' '.join(resting)} rest more on what is usual of lenses" if resting else ""
+    return "all five coefficients: " + f"the views tell {' '.join(told)}; {rest}".rstrip("; ")
 
 
 def _solve(

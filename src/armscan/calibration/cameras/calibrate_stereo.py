@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.cameras.distortion import rms, sigma_of_axis
+from armscan.calibration.cameras.distortion import rms, sigma_of_axis, typical_coefficients
 from armscan.calibration.cameras.joint import (
     N_INTRINSICS,
     N_SHARED,
@@ -178,6 +178,23 @@ def prior_of(given: tuple[CameraCalibration, CameraCalibration]) -> Prior:
         n_known += len(known)
     values = np.concatenate([calibration.camera.parameters for calibration in given])
     return Prior(values, information, n_known)
+
+
+def usual_prior(cameras: Cameras) -> Prior:
+    """Coefficients of usual lenses, of the size that `typical_coefficients` tells."""
+    information = np.zeros((2, len(PARAMETER_NAMES)))
+    for side, single in enumerate(cameras):
+        if single.camera.lens == "pinhole":
+            usual = typical_coefficients(single.camera, PARAMETER_NAMES[4:])
+            information[side, 4:] = common_design_effect(cameras) / usual**2
+    n_known = int(np.count_nonzero(information))
+    return Prior(np.zeros(N_INTRINSICS), np.diag(information.ravel()), n_known)
+
+
+def _prior(cameras: Cameras, options: StereoOptions, given: Given | None) -> Prior | None:
+    if given is None:
+        return usual_prior(cameras) if options.camera.distortion == "auto" else None
+    return prior_of(given) if options.intrinsics == "prior" else None
 
 
 def held_covariance(given: tuple[CameraCalibration, CameraCalibration]) -> FloatArray | None:
@@ -426,7 +443,7 @@ def _solve(
         observations if bow is None else on_bowed_board(observations, bow.bow_mm),
         joint_basis(cameras),
         starting_weights(boards.seen_by, cameras),
-        prior_of(given) if given is not None and options.intrinsics == "prior" else None,
+        _prior(cameras, options, given),
     )
     start = starting_state(boards, cameras, relation.right_from_left)
     return solve_both(boards.seen_by, problem, start, options.camera.max_steps)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which distortion model the views support, and what the coefficients that it leaves at zero may
-still be.
+"""What coefficients of usual lenses are beforehand, which kind of lens the views support, and how
+alike the residuals of one view are.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, stdtr
 
 from armscan.calibration.cameras.adjustment import (
     SHARED_NAMES,
@@ -25,9 +24,9 @@ from armscan.calibration.cameras.adjustment import (
     normal_equations,
     predict,
     reduced_normal_matrix,
+    with_known,
 )
 from armscan.calibration.cameras.result import (
-    DISTORTION_PARAMETERS,
     MIN_VIEWS,
     CrossValidation,
     DistortionModel,
@@ -35,13 +34,12 @@ from armscan.calibration.cameras.result import (
 from armscan.calibration.cameras.robust import (
     Solution,
     board_residuals,
-    covariance_with_target_error,
     estimate_target_error,
     residuals_px,
 )
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
-from armscan.models.camera import PARAMETER_NAMES, TANGENTIAL
+from armscan.models.camera import PARAMETER_NAMES, TANGENTIAL, CameraModel
 
 NO_SHARED = np.zeros((11, 0))
 
@@ -126,22 +124,6 @@ def of_views(state: State, views: IntArray) -> State:
     return State(state.shared, state.rotations[views], state.translations_mm[views])
 
 
-MODELS: tuple[DistortionModel, ...] = ("k1", "k1k2", "k1k2p1p2", "k1k2p1p2k3")
-"""Smallest first."""
-
-SIGNIFICANCE = 0.01
-"""Further coefficients are kept if zero ones would look so far from zero less often than this."""
-
-GAIN_SIGMAS = 1.0
-"""...and if views that took no part are predicted better, by this many standard errors of the mean
-over the views. The test above has no mercy with noise; this one notices what is not noise."""
-
-GAIN_SIGNIFICANCE = 0.001
-"""Where the residuals of one view are alike, the first test is widened for that and has little
-power. Coefficients that fail it are kept if unseen views would be predicted so much better by
-chance less often than this: less than above, for views held out together share a camera."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ChosenModel:
     """A distortion model with its solution and hold-out test.
@@ -157,8 +139,7 @@ class ChosenModel:
     reason
         Why this model, in words.
     untested
-        Names of the coefficients that the choice left at zero, for lack of evidence: nobody said
-        that they are.
+        Names of coefficients that the chosen kind of lens has not: nobody said that they are zero.
     doubt
         What speaks for another kind of lens, in words; empty for nothing.
     """
@@ -169,59 +150,6 @@ class ChosenModel:
     reason: str
     untested: tuple[str, ...] = ()
     doubt: str = ""
-
-
-def choose_model(
-    solve: Callable[[DistortionModel], Solution | FitFailure],
-    validate: Callable[[Solution, Solution], CrossValidation | None],
-    folds: Callable[[Solution], bool],
-    chance: Callable[[Solution, Solution, tuple[str, ...]], float],
-    alike: Callable[[Solution], bool],
-) -> ChosenModel | FitFailure:
-    """Choose the smallest model beyond which the views show nothing.
-
-    A larger model takes the place of a smaller one if its further coefficients are significant and
-    if it predicts unseen views better by more than that gain's own scatter over the views; or if
-    residuals of one view are alike and the gain by itself is significant.
-
-    ``validate`` tests a solution on held-out views, on the points that the second solution kept;
-    ``folds`` says whether a solution's distortion folds over inside the image; ``chance`` is the
-    probability that coefficients which in truth are zero look as they do beside a smaller model;
-    ``alike`` says whether the residuals of one view are alike, so that ``chance`` has little power.
-    """
-    solved = [(model, solve(model)) for model in MODELS]
-    tried = [(model, each) for model, each in solved if not isinstance(each, FitFailure)]
-    failures = [each for _, each in solved if isinstance(each, FitFailure)]
-    if not tried:
-        return failures[0]
-    reference = tried[-1][1]
-    tested = [ChosenModel(m, each, validate(each, reference), "") for m, each in tried]
-    chosen, said = tested[0], ""
-    for larger in tested[1:]:
-        further = _further(chosen.model, larger.model)
-        is_settled = larger.solution.is_converged or not chosen.solution.is_converged
-        probability = chance(chosen.solution, larger.solution, further) if is_settled else 1.0
-        gain = _gain_sigmas(chosen.cross_validation, larger.cross_validation)
-        names = " ".join(further)
-        is_told = probability < SIGNIFICANCE
-        if not is_told and is_settled and alike(larger.solution):
-            is_told = _chance_of_gain(gain, larger.cross_validation) < GAIN_SIGNIFICANCE
-        if not is_told:
-            said = said or f"{names} not told from zero by these views"
-        elif gain is not None and gain < GAIN_SIGMAS:
-            said = said or f"unseen views are predicted no better with {names}"
-        else:
-            chosen, said = larger, ""
-    if folds(chosen.solution):
-        chosen, said = _unfolded(chosen, tested, folds) or (chosen, said)
-    validation = chosen.cross_validation
-    if chosen.solution is not reference:
-        validation = validate(chosen.solution, chosen.solution)
-    untested = _further(chosen.model, MODELS[-1])
-    reason = f"{chosen.model}: {said}" if said else "all five coefficients show in the views"
-    if not said and untested:
-        reason = f"{chosen.model}: no larger model has a solution"
-    return ChosenModel(chosen.model, chosen.solution, validation, reason, untested)
 
 
 WIDE = 0.6
@@ -265,48 +193,6 @@ def choose_lens(
     return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, TANGENTIAL)
 
 
-def _further(model: DistortionModel, larger: DistortionModel) -> tuple[str, ...]:
-    has = DISTORTION_PARAMETERS[model]
-    return tuple(name for name in DISTORTION_PARAMETERS[larger] if name not in has)
-
-
-def _gain_sigmas(smaller: CrossValidation | None, larger: CrossValidation | None) -> float | None:
-    """Mean over views of the fall of held-out mean squares, over its standard error."""
-    if smaller is None or larger is None:
-        return None
-    gain = np.square(smaller.view_rms_px) - np.square(larger.view_rms_px)
-    error = float(np.std(gain, ddof=1)) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
-    return float(np.mean(gain)) / max(error, 1e-300)
-
-
-def _chance_of_gain(gain: float | None, validation: CrossValidation | None) -> float:
-    """Probability that unseen views seem to be predicted better by so many standard errors.
-
-    Student's t, one-sided: each view that took no part is one draw, however many points it has.
-    """
-    n_views = 0 if validation is None else len(validation.view_rms_px)
-    return 1.0 if gain is None or n_views < MIN_VIEWS else float(stdtr(n_views - 1, -gain))
-
-
-def predicts_better(
-    before: Solution | FitFailure,
-    chosen: ChosenModel,
-    validate: Callable[[Solution, Solution], CrossValidation | None],
-) -> bool:
-    """Whether unseen views ask for the coefficients of ``before`` that a later choice gave up.
-
-    Where the residuals of a view are alike, Rao's test has little power: what showed on flat
-    boards is given up with the bow free only if views that took no part do without it, too.
-    """
-    if isinstance(before, FitFailure) or not before.is_converged:
-        return False
-    if before.basis.shape[1] <= chosen.solution.basis.shape[1]:
-        return False
-    smaller = validate(chosen.solution, before)
-    gain = _gain_sigmas(smaller, validate(before, before))
-    return gain is not None and gain >= GAIN_SIGMAS
-
-
 def _is_wide(solution: Solution) -> bool:
     seen, kept = solution.observations, solution.weights > 0.0
     camera = seen.camera(solution.state.shared[: len(PARAMETER_NAMES)])
@@ -325,53 +211,6 @@ def _fall_of_residuals(
         return 0.0, np.inf
     fall = np.log(pinhole.view_rms_px) - np.log(fisheye.view_rms_px)
     return float(np.mean(fall)), float(np.std(fall, ddof=1) / np.sqrt(len(fall)))
-
-
-def _unfolded(
-    chosen: ChosenModel, tested: list[ChosenModel], folds: Callable[[Solution], bool]
-) -> tuple[ChosenModel, str] | None:
-    """The smallest model that does not fold over and predicts as well, if there is one."""
-    if chosen.cross_validation is None:
-        return None
-    for other in tested:
-        validation = other.cross_validation
-        if validation is None or validation.rms_px > chosen.cross_validation.rms_px:
-            continue
-        if not folds(other.solution):
-            said = (
-                f"{chosen.model} folds over inside the image, and it predicts unseen views as well"
-            )
-            return other, said
-    return None
-
-
-def chance_of_coefficients(smaller: Solution, larger: Solution, names: tuple[str, ...]) -> float:
-    """Probability that coefficients that are zero would look as far from it as these.
-
-    They are held in the ``smaller`` solution, free in the ``larger``. Rao's test: one step of the
-    larger model from the smaller solution, with the covariance there, the target's own errors
-    included, widened by `design_effect`. Where views tell little, the larger solution lies where
-    misprints have led it, the principal point far off and seemingly known well: with the covariance
-    found there (Wald's test) tangential coefficients of long lenses pass 15 times as often.
-    """
-    observations, basis = larger.observations, larger.basis
-    equations = linearise(observations, smaller.state, basis, larger.weights)
-    step = None if equations is None else damped_step(equations, 0.0)
-    if equations is None or step is None:
-        return 1.0
-    determined = joint_covariance(equations, basis)
-    if isinstance(determined, FitFailure):
-        return 1.0
-    error = estimate_target_error(board_residuals(larger))
-    found = board_residuals(replace(larger, state=smaller.state))
-    covariance = covariance_with_target_error(determined[0], larger.variance_factor, error, found)
-    rows = [SHARED_NAMES.index(name) for name in names]
-    value = (basis @ step[0])[rows]
-    own = covariance[np.ix_(rows, rows)] * max(design_effect(larger).value, 1.0)
-    scale = np.sqrt(np.diag(own))
-    z = value / scale
-    square = float(z @ np.linalg.solve(own / np.outer(scale, scale), z))
-    return float(chdtrc(len(rows), square))
 
 
 SIGNIFICANT_SIGMAS = 4.0
@@ -405,7 +244,8 @@ def design_effect(solution: Solution) -> DesignEffect:
     target's points, which are counted by themselves, are taken out before.
     """
     observations, basis = _without_target_error(solution), solution.basis
-    f = basis.shape[1]
+    known = observations.known
+    observations = replace(observations, known=0.0 * known)
     information, pulls, chi2 = [], [], 0.0
     for v in range(observations.n_views):
         alone, weights = subset(observations, solution.weights, np.array([v]))
@@ -417,10 +257,11 @@ def design_effect(solution: Solution) -> DesignEffect:
         pulls.append(equations.shared_gradient - carried @ equations.pose_gradient[0])
         chi2 += equations.chi2
     views = np.array(information)
-    total = views.sum(axis=0)
+    total = views.sum(axis=0) + basis.T @ (known[:, None] * basis)
     scale = 1.0 / np.sqrt(np.diag(total))
     inverse = np.linalg.inv(total * np.outer(scale, scale)) * np.outer(scale, scale)
     shares = inverse @ views
+    f = float(np.einsum("vii->", shares))
     own = float(np.einsum("vij,vji->", shares, shares))
     s = np.array(pulls) - np.mean(pulls, axis=0)
     found = float(np.einsum("vi,ij,vj->", s, inverse, s))
@@ -445,36 +286,59 @@ def _without_target_error(solution: Solution) -> Observations:
     return replace(observations, points_px=points_px)
 
 
+FIRST_TERM = 0.3
+"""A lens moves points at the image's corner by k1 r^2 of the radius: of the size r^2, for k1 is of
+the size 1, at most this..."""
 NEXT_TERM = 0.3
-"""Each radial term of a lens is about this part of the one before it, at the image's corner..."""
-LEAST_TERM = 0.003
-"""...the first one at least this part of the radius."""
+"""...and each further radial term is about this part of the one before it."""
 TYPICAL_TANGENTIAL = 1e-3
 """Tangential coefficients of lenses that are centred as usual."""
 
 
-def typical_coefficients(solution: Solution, names: tuple[str, ...]) -> FloatArray:
-    """(D,) how large coefficients of a usual lens are that the solution left at zero.
+def typical_coefficients(camera: CameraModel, names: tuple[str, ...]) -> FloatArray:
+    """(D,) how large coefficients of a usual lens are, without unit; of k1 anything is likely.
 
     Only an order of magnitude, of lenses in general: where views say more, they prevail.
     """
-    observations, shared = solution.observations, solution.state.shared
-    half = 0.5 * np.array([observations.width_px, observations.height_px])
-    square = float(np.sum((half / shared[:2]) ** 2))
-    first = max(abs(float(shared[4])) * square, LEAST_TERM)
-    second = max(abs(float(shared[5])) * square**2, NEXT_TERM * first)
+    half = 0.5 * np.array([camera.width_px, camera.height_px])
+    square = float(np.sum((half / camera.parameters[:2]) ** 2))
+    first = min(square, FIRST_TERM)
     typical = {
+        "k1": np.inf,
         "k2": NEXT_TERM * first / square**2,
         "p1": TYPICAL_TANGENTIAL,
         "p2": TYPICAL_TANGENTIAL,
-        "k3": NEXT_TERM * second / square**3,
+        "k3": NEXT_TERM**2 * first / square**3,
     }
     return np.array([typical[name] for name in names])
 
 
+def known_of_usual_lenses(solution: Solution) -> FloatArray:
+    """(11,) of `Observations`: coefficients are normal variables about zero, of usual size (Bayes).
+
+    At the level of the solution's points, widened where the residuals of one view are alike.
+    """
+    error = estimate_target_error(board_residuals(solution))
+    level = solution.variance_factor * design_effect(solution).widening * error.independent_share
+    n_camera = len(PARAMETER_NAMES)
+    camera = solution.observations.camera(solution.state.shared[:n_camera])
+    known = np.zeros(len(SHARED_NAMES))
+    known[4:n_camera] = level / typical_coefficients(camera, PARAMETER_NAMES[4:]) ** 2
+    return known
+
+
+def resting_on_usual(solution: Solution) -> tuple[str, ...]:
+    """Names of coefficients of which the views say less than what is usual of lenses does."""
+    determined = joint_covariance(solution.equations, solution.basis)
+    if isinstance(determined, FitFailure):
+        return ()
+    shares = solution.observations.known * np.diag(determined[0])[: len(SHARED_NAMES)]
+    return tuple(name for name, share in zip(SHARED_NAMES, shares, strict=True) if share > 0.5)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LeftAtZero:
-    """What coefficients that were left at zero, and may not be, do to everything else.
+    """What coefficients that a kind of lens has not, and that may not be zero, do to all else.
 
     ``unit_covariance`` (S + 6 V, S + 6 V) is as from `joint_covariance`, with these coefficients
     unknown as well, but of a usual lens; ``shift`` (S + 6 V,) by what all would move if they were
@@ -488,11 +352,11 @@ class LeftAtZero:
 def coefficients_left_at_zero(
     solution: Solution, names: tuple[str, ...], sigma0_squared: float
 ) -> LeftAtZero | FitFailure:
-    """Joint covariance with coefficients that the choice left at zero as further unknowns.
+    """Joint covariance with coefficients that a kind of lens has not as further unknowns.
 
-    A coefficient that does not show in the views is not zero for that: it is what lenses usually
-    have, or less, and it moves the focal length and the principal point. Taken as a normal variable
-    about zero with `typical_coefficients`, the views' own information added (Bayes).
+    They are not zero for that: they are what lenses usually have, or less, and move the focal
+    length and the principal point. Taken as normal variables about zero with
+    `typical_coefficients`, the views' own information added (Bayes).
 
     ``sigma0_squared`` is the variance of a point of unit weight that the covariance will be scaled
     with.
@@ -503,7 +367,8 @@ def coefficients_left_at_zero(
     if equations is None:
         return FitFailure("the solution puts the board behind the camera")
     known = np.zeros(basis.shape[1])
-    known[-len(names) :] = sigma0_squared / typical_coefficients(solution, names) ** 2
+    camera = solution.observations.camera(solution.state.shared[: len(PARAMETER_NAMES)])
+    known[-len(names) :] = sigma0_squared / typical_coefficients(camera, names) ** 2
     equations = replace(equations, shared=equations.shared + np.diag(known))
     determined = joint_covariance(equations, basis)
     if isinstance(determined, FitFailure):
@@ -547,6 +412,8 @@ def _stretch_step(solution: Solution) -> tuple[float, float]:
     by_stretch = by_pose[:, :, 3:] @ (observations.board_mm[:, 1:2] * ahead)[:, :, None]
     free = np.concatenate([by_shared @ solution.basis, by_stretch], axis=2)
     equations = normal_equations(observations, predicted, free, by_pose, solution.weights)
+    wide = np.column_stack([solution.basis, np.zeros(len(SHARED_NAMES))])
+    equations = with_known(equations, observations.known, solution.state, wide)
     step, reduced = damped_step(equations, 0.0), reduced_normal_matrix(equations)
     if step is None or not condition_number(reduced) < SINGULAR_CONDITION:
         return 0.0, np.inf

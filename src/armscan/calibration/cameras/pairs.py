@@ -13,7 +13,6 @@ from armscan.calibration.cameras.adjustment import basis_of
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.distortion import rms
 from armscan.calibration.cameras.result import (
-    DISTORTION_PARAMETERS,
     MIN_VIEW_POINTS,
     CameraFit,
     CameraOptions,
@@ -283,10 +282,8 @@ def _solved(fit: CameraFit, options: StereoOptions) -> SingleCamera:
     left_out |= {view.source: view.reason for view in fit.refused_views}
     free, reason = fit.free_parameters, fit.model_reason
     if options.camera.distortion == "auto":
-        # A coefficient held at zero because one camera says little of it would bend the pair.
+        # which of them each camera tells by itself is not what the pairs tell
         is_fisheye = fit.camera.lens == "fisheye"
-        coefficients = DISTORTION_PARAMETERS["fisheye" if is_fisheye else "k1k2p1p2k3"]
-        free = (*(name for name in free if name not in coefficients), *coefficients)
         named = "all three of a fisheye" if is_fisheye else "all five coefficients"
         reason = f"{named}: what the pairs say little of, the sigmas tell"
     basis = basis_of(free, is_aspect_fixed=options.camera.is_aspect_fixed)

@@ -53,8 +53,8 @@ class CameraOptions:
     Parameters
     ----------
     distortion
-        Which coefficients are free; ``auto`` decides by the rule of
-        `armscan.calibration.cameras.distortion`.
+        Which coefficients are free; ``auto`` solves all five, each beside the size that it has in
+        usual lenses, or takes a fisheye (`armscan.calibration.cameras.distortion`).
     is_aspect_fixed
         Hold ``fy = fx`` (square pixels).
     is_principal_point_fixed
@@ -254,9 +254,9 @@ class CameraFit(ArrayRecord):
         The solution.
     covariance
         (9, 9) in the order of `armscan.models.camera.PARAMETER_NAMES`; rows of parameters that
-        were held by request are zero. Coefficients that ``auto`` left at zero count as unknown, of
-        the size that lenses usually have, where the views do not say more; and all is widened if
-        residuals of one view are alike (see `armscan.calibration.cameras.distortion`).
+        were held by request are zero. Of coefficients that ``auto`` solves it is the posterior's,
+        beside the size that they usually have; and all is widened if residuals of one view are
+        alike (see `armscan.calibration.cameras.distortion`).
     free_parameters
         Names of the parameters that were solved.
     joint_covariance
@@ -290,7 +290,7 @@ class CameraFit(ArrayRecord):
     warp
         Bow of the board, if it was solved: asked for, or significant.
     model_reason
-        Why these parameters were free.
+        Why these parameters were free, and which of them the views tell little of.
     design_effect
         Factor that variances were given because residuals of one view are alike; 1 where they
         are not.

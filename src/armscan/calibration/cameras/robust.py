@@ -120,10 +120,11 @@ class Solution:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Coordinates used minus unknowns."""
+        """Coordinates used, and what is known beforehand, minus unknowns."""
         n_views = len(self.state.rotations)
+        n_known = int(np.count_nonzero(self.observations.known @ self.basis**2))
         n_coordinates = 2 * int(self.weights.sum())
-        return n_coordinates - int(self.basis.shape[1]) - 6 * n_views
+        return n_coordinates + n_known - int(self.basis.shape[1]) - 6 * n_views
 
     @property
     def variance_factor(self) -> float:

@@ -36,7 +36,7 @@ from armscan.pipeline.progress import (
     silent,
     worker_threads,
 )
-from armscan.reconstruction.label_cross import CrossLabeller, stripes_apart
+from armscan.reconstruction.label_cross import MOST_BY_PAST, CrossLabeller, stripes_apart
 from armscan.reconstruction.label_stereo import StereoLabeller
 from armscan.reconstruction.labels import (
     LabelledProfile,
@@ -67,9 +67,6 @@ from armscan.vision.stripe.image import StripeOptions
 STAGE = "reconstruct"
 EXTRACTION, NAMING, PLACING = "extraction", "naming", "placing"
 """Stages whose processor time is told."""
-MOST_ALIKE = 2
-"""Lines that run alike and are told by a scan's past; of five and more some scans name one in five
-wrongly (docs/explanations/random-instruments.md)."""
 TRIMMED_AFTER = 100
 """Instants after which the cache is kept small."""
 LOOKED_AT, LEAST_LINE = 10, 30
@@ -648,7 +645,7 @@ def laser_warnings(
 ) -> tuple[str, ...]:
     """Warn of exposures that name other lasers than the calibrated ones, or than the one chosen,
     or that name none where one camera's stripe may be of a laser that has no sheet; and of many
-    lines that one camera cannot tell.
+    lines before one camera that are never alone.
 
     Parameters
     ----------
@@ -689,12 +686,13 @@ def laser_warnings(
             "the calibration has no sheet: where it was on, its points may be given to another "
             "sheet"
         )
-    n_lit = [len(sheets_of(sensor, on) if on else sensor.sheets) for on in named]
-    lit = max(n_lit, default=0)
-    if isinstance(labeller, CrossLabeller) and lit > MOST_ALIKE and not stripes_apart(sensor).any():
+    sets = [sheets_of(sensor, on or [one.name for one in sensor.sheets]) for on in named]
+    lit = max(map(len, sets), default=0)
+    never = [one.name for k, one in enumerate(sensor.sheets) if (k,) not in sets]
+    if isinstance(labeller, CrossLabeller) and lit > MOST_BY_PAST and never:
         warnings.append(
-            f"{lit} lines that run alike were on at once before one camera: nothing but the scan's "
-            "past tells them, and names may be wrong; light one or two at a time, or use two "
-            "cameras"
+            f"{lit} lines were on at once before one camera, and {', '.join(never)} never alone: "
+            "what may as well be another line's is left out; light each alone now and then, one or "
+            "two at a time, or use two cameras"
         )
     return tuple(warnings)

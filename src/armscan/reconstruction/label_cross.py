@@ -22,7 +22,15 @@ from armscan.reconstruction.labels import (
     sheets_of,
     without_sheet,
 )
-from armscan.reconstruction.segments import Pieces, cut_pieces
+from armscan.reconstruction.segments import (
+    SHARPNESS,
+    STUDENT,
+    ImageMemory,
+    Pieces,
+    cut_pieces,
+    smoothed_posterior,
+    switch_probability,
+)
 from armscan.reconstruction.triangulate import (
     LABEL_DEPTHS,
     MOST_MARGIN,
@@ -50,8 +58,9 @@ EDGE_ON = 0.05
 """Least cosine between a surface's normal and the camera's axis."""
 SHARP_MM = 0.3
 """Vaguer predictions err by the same all along a segment; the change is steep (fourth power)."""
-STUDENT = 3.0
-"""Degrees of freedom of the error's distribution: edges and sharp bends have long tails."""
+AMID_MM, MOST_PULL, LEAST_AMID = 2.0, 0.5, 3
+"""A place is seen again if so many known points lie within this of it, and not on one side: the
+mean of the unit vectors to them is shorter than this (of a half disc it is 0.64)."""
 
 
 @dataclass(slots=True, eq=False)
@@ -113,26 +122,49 @@ class SurfaceMemory:
         """
         n = len(points_sensor_mm)
         gain, sharpness = np.zeros(n), np.zeros(n)
-        if self._tree is None and len(self):
-            self._tree = cKDTree(np.concatenate(self._kept))
-        if self._tree is None or not n:
+        if not n or not len(self):
             return gain, sharpness
-        in_sensor: Points[Sensor] = Points(points_sensor_mm)
-        places = (base_from_sensor @ in_sensor).xyz_mm / self.scale
-        found = self._tree.query(places, k=N_NEAR, distance_upper_bound=REACH_MM)
-        distance, index = np.asarray(found[0]), np.asarray(found[1])
+        near, distance = self._neighbours(points_sensor_mm, base_from_sensor, REACH_MM)
         known = np.flatnonzero(np.isfinite(distance[:, 0]))
         if not len(known):
             return gain, sharpness
-        distance = distance[known]
-        is_near = np.isfinite(distance)
-        near = self._tree.data[np.where(is_near, index[known], 0)] - places[known, None]
-        offset, sigma = _continued(near @ base_from_sensor.rotation, distance, is_near)
+        near, distance = near[known], distance[known]
+        offset, sigma = _continued(
+            near @ base_from_sensor.rotation, distance, np.isfinite(distance)
+        )
         share = 1.0 + (offset / sigma) ** 2 / STUDENT
         peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / sigma
         gain[known] = np.log1p(self.depth_span_mm / self.scale * peak / share**2)
         sharpness[known] = 1.0 / (1.0 + (sigma / SHARP_MM) ** 4)
         return gain, sharpness
+
+    def sees_again(
+        self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor]
+    ) -> BoolArray:
+        """(S,) True for points (S, 3) amid known ones: not beyond the edge of what is known."""
+        if not len(self):
+            return np.zeros(len(points_sensor_mm), dtype=np.bool_)
+        near, distance = self._neighbours(points_sensor_mm, base_from_sensor, AMID_MM)
+        is_near = np.isfinite(distance)
+        towards = near / np.where(is_near & (distance > 0.0), distance, np.inf)[..., None]
+        n_near = is_near.sum(axis=1)
+        pull = np.linalg.norm(towards.sum(axis=1), axis=1) / np.maximum(n_near, 1)
+        return np.asarray((n_near >= LEAST_AMID) & (pull < MOST_PULL))
+
+    def _neighbours(
+        self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor], reach_mm: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """From each place to known points around it: (S, K, 3) in Base, and distances (S, K),
+        infinite where there are no more.
+        """
+        if self._tree is None:
+            self._tree = cKDTree(np.concatenate(self._kept))
+        in_sensor: Points[Sensor] = Points(points_sensor_mm)
+        places = (base_from_sensor @ in_sensor).xyz_mm / self.scale
+        found = self._tree.query(places, k=N_NEAR, distance_upper_bound=reach_mm)
+        distance, index = np.asarray(found[0]), np.asarray(found[1])
+        near = self._tree.data[np.where(np.isfinite(distance), index, 0)] - places[:, None]
+        return near, distance
 
 
 def _continued(
@@ -159,82 +191,6 @@ def _continued(
     variance = NOISE_MM**2 + 1.0 / total + (along[:, 1:] ** 2 / spread).sum(axis=1)
     facing = np.maximum(np.abs(normal[:, 2]), EDGE_ON)
     return along[:, 0] / facing, np.sqrt(variance) / facing
-
-
-REACH_PX = 60.0
-"""A stripe is not looked for further from where it is expected."""
-SIGMA_PX = 5.0
-"""Of the expected place across the stripe; a hand's acceleration and the surface's shape."""
-WINDOW_PX = 600.0
-"""A stripe of which nothing is known may be anywhere over about this width."""
-SHARPNESS = 0.15
-"""What the prediction errs by is nearly the same all along a stripe."""
-STIFFNESS = 20.0
-"""Points' worth of belief that a stripe stands still, so that its motion is always determined."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Stripe:
-    points_px: FloatArray
-    normals_px: FloatArray
-    motion_px: FloatArray
-
-
-@dataclass(slots=True, eq=False)
-class ImageMemory:
-    """The last stripe of each sheet with its motion from the one before."""
-
-    _last: dict[int, _Stripe] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        """Count of sheets whose stripe was seen."""
-        return len(self._last)
-
-    def forget(self) -> None:
-        """Begin anew."""
-        self._last.clear()
-
-    def remember(self, points_px: FloatArray, normals_px: FloatArray, sheet: IntArray) -> None:
-        """Take in the named points (N, 2) of an exposure, their normals and sheets (N,)."""
-        for k in np.unique(sheet).tolist():
-            points, normals = points_px[sheet == k], normals_px[sheet == k]
-            self._last[k] = _Stripe(points, normals, self._motion(k, points, normals))
-
-    def log_gain(self, points_px: FloatArray, sheet: int) -> FloatArray:
-        """How well new points (S, 2) continue a sheet's stripe.
-
-        The logarithm (S,) of the density of their place, if they are of the sheet, over that of
-        something new, which may be anywhere: 0 where nothing is expected.
-        """
-        gain = np.zeros(len(points_px))
-        if sheet not in self._last or not len(points_px):
-            return gain
-        last = self._last[sheet]
-        distance, index = _nearest(last, points_px)
-        known = np.flatnonzero(distance < REACH_PX)
-        place = last.points_px[index[known]] + last.motion_px
-        across = np.einsum("ni,ni->n", points_px[known] - place, last.normals_px[index[known]])
-        share = 1.0 + (across / SIGMA_PX) ** 2 / STUDENT
-        peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / SIGMA_PX
-        gain[known] = np.log1p(WINDOW_PX * peak / share**2)
-        return gain
-
-    def _motion(self, sheet: int, points: FloatArray, normals: FloatArray) -> FloatArray:
-        """(2,) motion since the last image: only its part across the stripe can be seen."""
-        if sheet not in self._last:
-            return np.zeros(2)
-        last = self._last[sheet]
-        distance, index = _nearest(last, points)
-        near = distance < REACH_PX
-        n = normals[near]
-        step = np.einsum("ni,ni->n", points[near] - last.points_px[index[near]], n)
-        return np.asarray(np.linalg.solve(n.T @ n + STIFFNESS * np.eye(2), n.T @ step))
-
-
-def _nearest(last: _Stripe, points_px: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Distance (N,) to the nearest point of a stripe that moved on, and its index."""
-    found = cKDTree(last.points_px + last.motion_px).query(points_px)
-    return np.asarray(found[0]), np.asarray(found[1])
 
 
 OUTSIDE = -4.0
@@ -419,47 +375,92 @@ def _most_of_others(table: FloatArray) -> FloatArray:
     return np.asarray(np.where(is_most, order[-2], order[-1]))
 
 
-SWITCH, SWITCH_AT_KINK = 1e-3, 0.02
-"""Probabilities that the sheet changes unnoticed between two pieces: of a segment, and of a chain
-that has a kink or a gap between them. It mostly is an edge of the surface; two lines that end at
-one another are rare."""
+MOST_BY_PAST = 2
+"""Lines that the past alone tells. Of more, all may seem to lie one name further where a thing is
+as high as two lines lie apart: a surface that continues the known one, at another depth."""
+ROW_PX = 32.0
+"""What lies within this along the stripes is beside each other. Light of a laser moves across its
+stripes where the depth changes, so that it stays there."""
+SEEN_AGAIN = 0.7
+"""A piece of which a larger share was seen before is where the past says."""
 
 
-def switch_probability(pieces: Pieces, n_sheets: int) -> FloatArray:
-    """(P,) probability that a piece is of another sheet than the one before it."""
-    is_same = np.diff(pieces.segment, prepend=-1) == 0
-    joined = np.where(is_same, SWITCH, SWITCH_AT_KINK)
-    return np.asarray(np.where(pieces.is_joined, joined, 1.0 - 1.0 / n_sheets))
-
-
-def smoothed_posterior(log_likelihood: FloatArray, switch: FloatArray) -> FloatArray:
-    """Posterior log-probability of each hypothesis for each piece, by forward and backward passes.
+def held_beside(
+    pieces: Pieces, hypotheses: Hypotheses, named: IntArray, sensor: SensorCalibration
+) -> FloatArray:
+    """(P, H) share of a piece beside which, across the stripes, another segment has the name.
 
     Parameters
     ----------
-    log_likelihood
-        (P, H) of each piece under each hypothesis.
-    switch
-        (P,) from `switch_probability`; ``1 - 1 / H`` where the piece before tells nothing.
-
-    Returns
-    -------
-    FloatArray
-        (P, H) logarithms of the posterior probabilities.
+    pieces, hypotheses
+        Of the profile.
+    named
+        (P,) likely hypothesis of each piece; -1 for none.
+    sensor
+        Camera and sheets.
     """
-    n, h = log_likelihood.shape
-    if h == 1 or not n:
-        return np.zeros((n, h))
-    stay, change = np.log1p(-switch), np.log(switch / (h - 1))
-    step = np.where(np.eye(h, dtype=np.bool_), stay[:, None, None], change[:, None, None])
-    ahead, behind = log_likelihood.copy(), np.zeros((n, h))
-    for p in range(1, n):
-        ahead[p] += np.logaddexp.reduce(ahead[p - 1][:, None] + step[p], axis=0)
-    for p in range(n - 2, -1, -1):
-        onward = (behind[p + 1] + log_likelihood[p + 1])[:, None] + step[p + 1]
-        behind[p] = np.logaddexp.reduce(onward, axis=0)
-    total = ahead + behind
-    return np.asarray(total - np.logaddexp.reduce(total, axis=1, keepdims=True))
+    held = np.zeros((len(pieces), len(hypotheses.sheets)))
+    segment = pieces.segment[pieces.of_sample]
+    width = ROW_PX / sensor.camera.camera.fx_px
+    for h, k in enumerate(hypotheses.sheets):
+        met, is_met = hypotheses.points_mm[h], hypotheses.is_near[:, h]
+        depth = np.where(is_met, met[:, 2], np.inf)
+        along = met @ sensor.sheets[k].sheet.axes[0] / depth
+        row = np.unique(np.floor(along / width), return_inverse=True)[1]
+        has = (named == h)[pieces.of_sample] & is_met
+        table = np.zeros((int(segment.max(initial=0)) + 1, int(row.max(initial=0)) + 1))
+        table[segment[has], row[has]] = 1.0
+        others = table.sum(axis=0)[row] - table[segment, row]
+        held[:, h] = pieces.mean((is_met & (others > 0.0)).astype(np.float64))
+    return held
+
+
+def _order_beside(
+    along: FloatArray, sheets: tuple[int, ...], sensor: SensorCalibration
+) -> IntArray | None:
+    """(H,) hypotheses in the order of their stripes across a wall; None where stripes cross."""
+    camera = sensor.camera.camera
+    depth = float(np.mean([sensor.sheets[k].depth_range_mm for k in sheets]))
+    far = max(camera.width_px, camera.height_px) / camera.fx_px
+    orders = []
+    for end in (-0.5 * far, 0.5 * far):
+        place = []
+        for k in sheets:
+            sheet = sensor.sheets[k].sheet
+            n = sheet.axes[2]
+            down = n @ sheet.origin_mm / depth - n[2] - end * (n[:2] @ along)
+            place.append(down / (n[:2] @ [-along[1], along[0]]))
+        orders.append(np.argsort(place))
+    return orders[0] if (orders[0] == orders[1]).all() else None
+
+
+def in_order_beside(
+    samples_px: FloatArray,
+    pieces: Pieces,
+    sheets: tuple[int, ...],
+    named: IntArray,
+    sensor: SensorCalibration,
+) -> BoolArray:
+    """(S,) True where as many stripes as sheets lie side by side, and no name is out of order."""
+    along = np.array([frontal_direction(sensor, k) for k in sheets])
+    along *= np.sign(along @ along[0])[:, None]
+    u = along.sum(axis=0) / np.linalg.norm(along.sum(axis=0))
+    order = _order_beside(u, sheets, sensor)
+    if order is None:
+        return np.zeros(len(samples_px), dtype=np.bool_)
+    segment = pieces.segment[pieces.of_sample]
+    row = np.unique(np.floor(samples_px @ u / ROW_PX), return_inverse=True)[1]
+    shape = (int(segment.max(initial=0)) + 1, int(row.max(initial=0)) + 1)
+    total, count = np.zeros(shape), np.zeros(shape)
+    np.add.at(total, (segment, row), samples_px @ [-u[1], u[0]])
+    np.add.at(count, (segment, row), 1.0)
+    across = np.where(count > 0.0, total / np.maximum(count, 1.0), np.inf)
+    rank = across.argsort(axis=0).argsort(axis=0)[segment, row]
+    name = named[pieces.of_sample]
+    is_odd = (name >= 0) & (order[np.minimum(rank, len(sheets) - 1)] != name)
+    n_odd = np.bincount(row, is_odd, minlength=shape[1])
+    is_whole = (count > 0.0).sum(axis=0) == len(sheets)
+    return np.asarray((is_whole & (n_odd == 0))[row])
 
 
 MARGIN = 5.0
@@ -519,6 +520,7 @@ class CrossLabeller:
         self._last_ns: int | None = None
         self._next = self._sources[:1]
         self._since_single = 0
+        self._shown: set[int] = set()
 
     def next_lasers(self) -> tuple[str, ...]:
         """One laser alone at the start of a pass and when labels are in doubt, else all."""
@@ -575,7 +577,11 @@ class CrossLabeller:
             np.take_along_axis(pieces.mean(flag.astype(np.float64)), best[:, None], 1)[:, 0] > 0.5
             for flag in (hypotheses.is_near, hypotheses.is_inside)
         )
-        of_piece = np.where(margin >= MARGIN, PointStatus.MEASURED, PointStatus.AMBIGUOUS)
+        is_told = margin >= MARGIN
+        if len(possible) > MOST_BY_PAST and (pose is not None or len(self._image)):
+            named = np.where(is_told & is_explained, best, -1)
+            is_told &= (named < 0) | ~self._is_open(samples, pieces, hypotheses, named, pose)
+        of_piece = np.where(is_told, PointStatus.MEASURED, PointStatus.AMBIGUOUS)
         beyond = np.where(is_near, PointStatus.OUT_OF_DEPTH, PointStatus.STRAY)
         of_piece[~is_explained] = beyond[~is_explained]
         accepted = pieces.of_point >= 0
@@ -616,6 +622,35 @@ class CrossLabeller:
             posterior = smoothed_posterior(evidence + taken, switch)
         return posterior
 
+    def _is_open(
+        self,
+        samples_px: FloatArray,
+        pieces: Pieces,
+        hypotheses: Hypotheses,
+        named: IntArray,
+        pose: Pose[Base, Sensor] | None,
+    ) -> BoolArray:
+        """(P,) True where many lines are on and another may as well have drawn the piece.
+
+        Not open is what was seen before at the same place; what lies in order where all lines that
+        are on lie beside each other; and what no other sheet may have drawn, because the piece is
+        out of its depths, or because its stripe is beside the piece, of one that was on alone.
+        """
+        is_inside = pieces.mean(hypotheses.is_inside.astype(np.float64)) > 0.0
+        held = held_beside(pieces, hypotheses, named, self._sensor)
+        is_free = (held < 1.0) | [k not in self._shown for k in hypotheses.sheets]
+        others = np.arange(len(hypotheses.sheets)) != named[:, None]
+        is_open = np.asarray((is_inside & is_free & others).any(axis=1))
+        in_order = in_order_beside(samples_px, pieces, hypotheses.sheets, named, self._sensor)
+        is_open &= pieces.mean(in_order.astype(np.float64)) < 1.0
+        if pose is not None:
+            name = named[pieces.of_sample]
+            points = hypotheses.points_mm[name, np.arange(len(name))]
+            again = self._surface.sees_again(points, pose)
+            is_open &= pieces.mean(again.astype(np.float64)) < SEEN_AGAIN
+        is_twice = np.take_along_axis(held, named[:, None], axis=1)[:, 0] > 0.5
+        return is_open | is_twice
+
     def _learn(self, profile: Profile, found: _Assignment, pose: Pose[Base, Sensor] | None) -> None:
         known = found.sheet >= 0
         sheet, pixels = found.sheet[known], profile.points_px[known]
@@ -629,6 +664,8 @@ class CrossLabeller:
         """Choose the lasers of the next exposure: all, or the one that most undecided are of."""
         on = {self._source_of[k] for k in possible}
         self._since_single = 0 if len(on) == 1 else self._since_single + 1
+        if len(possible) == 1:
+            self._shown.update(possible)
         expected = dict.fromkeys(self._sources, 0.0)
         for source, points in zip(self._source_of, found.undecided.tolist(), strict=True):
             expected[source] += points
@@ -638,6 +675,9 @@ class CrossLabeller:
         is_in_doubt = n_undecided > UNDECIDED_SHARE * n_asked
         most = max(self._sources, key=lambda source: expected[source])
         self._next = (most,) if is_in_doubt and is_due else self._sources
+        unseen = [k for k in range(len(self._source_of)) if k not in self._shown]
+        if unseen and len(self._sources) > MOST_BY_PAST:
+            self._next = (self._source_of[unseen[0]],)
 
     def _reason(self, possible: tuple[int, ...], has_pose: bool) -> str:
         if len(possible) == 1:

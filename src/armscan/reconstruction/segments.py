@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unbroken segments of stripes: within one, neighbouring points lie on one line of light."""
+"""Unbroken segments of stripes: within one, neighbouring points lie on one line of light. How names
+go on along them, and from image to image.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
@@ -215,3 +218,124 @@ def _directions(points: FloatArray, piece: IntArray) -> FloatArray:
     xx, xy, yy = (np.bincount(piece, v, minlength=n) for v in (x * x, x * y, y * y))
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+SWITCH, SWITCH_AT_KINK = 1e-3, 0.02
+"""Probabilities that the sheet changes unnoticed between two pieces: of a segment, and of a chain
+that has a kink or a gap between them. It mostly is an edge of the surface; two lines that end at
+one another are rare."""
+
+
+def switch_probability(pieces: Pieces, n_sheets: int) -> FloatArray:
+    """(P,) probability that a piece is of another sheet than the one before it."""
+    is_same = np.diff(pieces.segment, prepend=-1) == 0
+    joined = np.where(is_same, SWITCH, SWITCH_AT_KINK)
+    return np.asarray(np.where(pieces.is_joined, joined, 1.0 - 1.0 / n_sheets))
+
+
+def smoothed_posterior(log_likelihood: FloatArray, switch: FloatArray) -> FloatArray:
+    """Posterior log-probability of each hypothesis for each piece, by forward and backward passes.
+
+    Parameters
+    ----------
+    log_likelihood
+        (P, H) of each piece under each hypothesis.
+    switch
+        (P,) from `switch_probability`; ``1 - 1 / H`` where the piece before tells nothing.
+
+    Returns
+    -------
+    FloatArray
+        (P, H) logarithms of the posterior probabilities.
+    """
+    n, h = log_likelihood.shape
+    if h == 1 or not n:
+        return np.zeros((n, h))
+    stay, change = np.log1p(-switch), np.log(switch / (h - 1))
+    step = np.where(np.eye(h, dtype=np.bool_), stay[:, None, None], change[:, None, None])
+    ahead, behind = log_likelihood.copy(), np.zeros((n, h))
+    for p in range(1, n):
+        ahead[p] += np.logaddexp.reduce(ahead[p - 1][:, None] + step[p], axis=0)
+    for p in range(n - 2, -1, -1):
+        onward = (behind[p + 1] + log_likelihood[p + 1])[:, None] + step[p + 1]
+        behind[p] = np.logaddexp.reduce(onward, axis=0)
+    total = ahead + behind
+    return np.asarray(total - np.logaddexp.reduce(total, axis=1, keepdims=True))
+
+
+STUDENT = 3.0
+"""Degrees of freedom of the error's distribution: edges and sharp bends have long tails."""
+REACH_PX = 60.0
+"""A stripe is not looked for further from where it is expected."""
+SIGMA_PX = 5.0
+"""Of the expected place across the stripe; a hand's acceleration and the surface's shape."""
+WINDOW_PX = 600.0
+"""A stripe of which nothing is known may be anywhere over about this width."""
+SHARPNESS = 0.15
+"""What the prediction errs by is nearly the same all along a stripe."""
+STIFFNESS = 20.0
+"""Points' worth of belief that a stripe stands still, so that its motion is always determined."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stripe:
+    points_px: FloatArray
+    normals_px: FloatArray
+    motion_px: FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class ImageMemory:
+    """The last stripe of each sheet with its motion from the one before."""
+
+    _last: dict[int, _Stripe] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Count of sheets whose stripe was seen."""
+        return len(self._last)
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._last.clear()
+
+    def remember(self, points_px: FloatArray, normals_px: FloatArray, sheet: IntArray) -> None:
+        """Take in the named points (N, 2) of an exposure, their normals and sheets (N,)."""
+        for k in np.unique(sheet).tolist():
+            points, normals = points_px[sheet == k], normals_px[sheet == k]
+            self._last[k] = _Stripe(points, normals, self._motion(k, points, normals))
+
+    def log_gain(self, points_px: FloatArray, sheet: int) -> FloatArray:
+        """How well new points (S, 2) continue a sheet's stripe.
+
+        The logarithm (S,) of the density of their place, if they are of the sheet, over that of
+        something new, which may be anywhere: 0 where nothing is expected.
+        """
+        gain = np.zeros(len(points_px))
+        if sheet not in self._last or not len(points_px):
+            return gain
+        last = self._last[sheet]
+        distance, index = _nearest(last, points_px)
+        known = np.flatnonzero(distance < REACH_PX)
+        place = last.points_px[index[known]] + last.motion_px
+        across = np.einsum("ni,ni->n", points_px[known] - place, last.normals_px[index[known]])
+        share = 1.0 + (across / SIGMA_PX) ** 2 / STUDENT
+        peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / SIGMA_PX
+        gain[known] = np.log1p(WINDOW_PX * peak / share**2)
+        return gain
+
+    def _motion(self, sheet: int, points: FloatArray, normals: FloatArray) -> FloatArray:
+        """(2,) motion since the last image: only its part across the stripe can be seen."""
+        if sheet not in self._last:
+            return np.zeros(2)
+        last = self._last[sheet]
+        distance, index = _nearest(last, points)
+        near = distance < REACH_PX
+        n = normals[near]
+        step = np.einsum("ni,ni->n", points[near] - last.points_px[index[near]], n)
+        return np.asarray(np.linalg.solve(n.T @ n + STIFFNESS * np.eye(2), n.T @ step))
+
+
+def _nearest(last: _Stripe, points_px: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Distance (N,) to the nearest point of a stripe that moved on, and its index."""
+    found = cKDTree(last.points_px + last.motion_px).query(points_px)
+    return np.asarray(found[0]), np.asarray(found[1])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.label_cross import REACH_PX, SIGMA_PX, WINDOW_PX, ImageMemory
+from armscan.reconstruction.segments import REACH_PX, SIGMA_PX, WINDOW_PX, ImageMemory
 
 NORMAL = np.array([0.6, 0.8])
 ALONG = np.array([0.8, -0.6])

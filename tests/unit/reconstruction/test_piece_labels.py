@@ -3,19 +3,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.label_cross import (
+from armscan.geometry.poses import Base, Pose, Sensor
+from armscan.models.calibration import SensorCalibration
+from armscan.models.light_sheet import LightSheet
+from armscan.reconstruction.label_cross import CrossLabeller
+from armscan.reconstruction.segments import (
     SWITCH,
     SWITCH_AT_KINK,
+    Pieces,
     smoothed_posterior,
     switch_probability,
 )
-from armscan.reconstruction.segments import Pieces
+from rigs.cross_rig import sensor
+from rigs.sheet_rig import make_profile
 
 
 def by_enumeration(log_likelihood: FloatArray, switch: FloatArray) -> FloatArray:
@@ -62,3 +69,63 @@ def test_a_kink_tells_less_than_a_smooth_course_and_another_chain_nothing() -> N
 
 def test_one_hypothesis_is_certain() -> None:
     assert smoothed_posterior(np.array([[-3.0], [-8.0]]), np.full(2, SWITCH)).max() == 0.0
+
+
+SOURCE_MM, FLOOR_MM, PITCH_MM, STEP_MM = np.array([0.0, -80.0, 10.0]), 140.0, 6.0, 0.6
+LIKE_THE_NEXT_MM = 9.07
+"""Height at which a line shows where the next one would on the floor, to 0.05 mm of depth."""
+
+
+def five_lines() -> SensorCalibration:
+    """Sheets through one source whose lines run along x, 6 mm apart on the floor."""
+    crossed, sheets = sensor(), []
+    for k in range(5):
+        foot = np.array([0.0, PITCH_MM * (k - 2), FLOOR_MM])
+        down = (foot - SOURCE_MM) / np.linalg.norm(foot - SOURCE_MM)
+        axes = np.stack([[1.0, 0.0, 0.0], down, np.cross([1.0, 0.0, 0.0], down)])
+        sheet = LightSheet(origin_mm=foot, axes=axes, scale_mm=20.0, bow_mm=np.zeros(5))
+        sheets.append(replace(crossed.sheets[0], name=f"L{k}", sheet=sheet))
+    return replace(crossed, sheets=tuple(sheets), covariance=np.zeros((49, 49)))
+
+
+def lit(head: SensorCalibration, k: int, x_mm: float) -> list[FloatArray]:
+    """Points (N, 3) of a line, in the sensor at x, on the floor and on a block that begins at x = 0
+    and is as high as to pass for the next line's floor.
+    """
+    sheet = head.sheets[k].sheet
+    rays = np.array([0.0, *sheet.axes[1, 1:]]) + np.linspace(-0.15, 0.15, 450)[:, None] * [1, 0, 0]
+    top, floor = (
+        SOURCE_MM + (depth - SOURCE_MM[2]) / rays[:, 2:] * rays
+        for depth in (FLOOR_MM - LIKE_THE_NEXT_MM, FLOOR_MM)
+    )
+    on_top, over = (points[:, 0] + x_mm > 0.0 for points in (top, floor))
+    return [points for points in (floor[~on_top & ~over], top[on_top]) if len(points)]
+
+
+@pytest.mark.parametrize("is_asked", [True, False])
+def test_many_lines_are_not_named_one_further_where_a_block_is_as_high(is_asked: bool) -> None:
+    """To the past alone the floor goes on below the block: 5 and 7 % of the names were wrong, with
+    each line alone where it is asked for, and each once at first.
+    """
+    head, rng = five_lines(), np.random.default_rng(4)
+    labeller, names = CrossLabeller(head), [sheet.name for sheet in head.sheets]
+    n_wrong = n_named = n_points = 0
+    for t in range(36):
+        x_mm = STEP_MM * (t - 45)
+        on = labeller.next_lasers() if is_asked else tuple(names[t : t + 1])
+        lines = [(k, q) for k in range(5) if names[k] in (on or names) for q in lit(head, k, x_mm)]
+        pixels = [head.camera.camera.project(points) for _, points in lines]
+        drawn = [
+            (q + 0.05 * rng.standard_normal(q.shape), np.tile([0.0, 1.0], (len(q), 1)))
+            for q in pixels
+        ]
+        pose: Pose[Base, Sensor] = Pose(np.eye(3), np.array([x_mm, 0.0, 0.0]))
+        profile = make_profile(f"{t}", drawn, 0.05)
+        (found,) = labeller.label([profile], on, pose, 1 + 12_500_000 * t).profiles
+        truth = np.concatenate(
+            [np.full(len(q), k) for (k, _), q in zip(lines, pixels, strict=True)]
+        )
+        n_wrong += int(((found.sheet >= 0) & (found.sheet != truth)).sum())
+        n_named, n_points = n_named + int((found.sheet >= 0).sum()), n_points + len(truth)
+    assert n_wrong == 0
+    assert n_named > 0.8 * n_points

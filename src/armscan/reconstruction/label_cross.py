@@ -523,7 +523,7 @@ class CrossLabeller:
         self._shown: set[int] = set()
 
     def next_lasers(self) -> tuple[str, ...]:
-        """One laser alone, of many each, as a pass starts; one when labels are in doubt; else all."""
+        """One laser alone as a pass starts (of many each) or if labels are in doubt, else all."""
         return self._next
 
     def left_out(self, lasers: tuple[str, ...]) -> str:

@@ -586,14 +586,18 @@ def _assign_both(
     pairs: _Pairs, sides: tuple[_Side, _Side], n_sheets: int
 ) -> tuple[SheetAssignment, SheetAssignment]:
     """Sheets of both cameras that agree with each other."""
-    match = pairs.is_match.view(np.uint8)
-    alive_left = alive_right = match
-    for _ in range(EXCHANGES):
-        left = _assign_left(pairs, alive_left, sides[0], n_sheets)
-        right = _assign_right(pairs, alive_right, sides[1], n_sheets)
+    alive_left = alive_right = pairs.is_match.view(np.uint8)
+    left = _assign_left(pairs, alive_left, sides[0], n_sheets)
+    right = _assign_right(pairs, alive_right, sides[1], n_sheets)
+    for exchange in range(EXCHANGES):
+        before_left, before_right = alive_left, alive_right
         alive_left = _alive(pairs, pairs.right, right)
         alive_right = _alive(pairs, pairs.left, left)
-    left = _assign_left(pairs, alive_left, sides[0], n_sheets)
+        # where nothing more was ruled out the sheets are those found before
+        if not np.array_equal(alive_left, before_left):
+            left = _assign_left(pairs, alive_left, sides[0], n_sheets)
+        if exchange + 1 < EXCHANGES and not np.array_equal(alive_right, before_right):
+            right = _assign_right(pairs, alive_right, sides[1], n_sheets)
     agreed = alive_left & _alive(pairs, pairs.left, left, is_strict=True)
     return left, _assign_right(pairs, agreed, sides[1], n_sheets)
 

@@ -351,6 +351,7 @@ PADDED = [
     ("x\ty\tz\t", "{1}\t\t{2}\t{3}"),
     ("\tx\ty\tz", "\t{1}\t{2}\t{3}"),
     ("x\ty\tz", "\t{1}\t{2}\t{3}"),
+    ("Name\tx\ty\tz", "N\u00ba {0}\t\t{1}\u00a0\t{2}\t\u00a0{3}"),
 ]
 
 
@@ -358,7 +359,7 @@ PADDED = [
 def test_tabs_that_pad_move_no_column(tmp_path: Path, heading: str, row: str) -> None:
     """Each was taken for a separator: x was 1 or 7, without a word, or the table was refused."""
     path = tmp_path / "c.txt"
-    path.write_text("\n".join([heading, *(row.format(*point) for point in NUMBERED), ""]))
+    path.write_text("\n".join([heading, *(row.format(*point) for point in NUMBERED), ""]), "utf-8")
     assert read_cloud_file(path).cloud.points_mm.tolist() == POINTS
 
 

@@ -71,6 +71,7 @@ COMMENT_MARKS = ("#", "//")
 SEPARATORS = (",", ";", "\t")
 PADDED = "\t\t"
 """Separator of rows in which one tab or several stand between two fields."""
+PADS, MARKS = re.compile(r"\t[ \t]*"), re.compile(r"[,;\t]")
 QUOTED = re.compile(r'(^|[,;\t]) *"(?! *[,;\t])((?:[^"]|"")*)"(?= *(?:[,;\t]|$))')
 """A field between quotation marks, of which ditto marks are none: ``P1;";";1.5``."""
 COLUMNS_ARE = re.compile(r"^(columns?|fields?|format|header)\s*[:=\s]\s*", re.IGNORECASE)
@@ -569,7 +570,7 @@ def _tabs(named: NamedColumns, rows: Sequence[str], path: Path) -> str:
     wide = [row for row in wide if not all(map(str.strip, row.split("\t")[: last + 1]))]
     if not wide:
         return "\t"
-    n_fields = {len(_fields(row, PADDED)) for row in rows}
+    n_fields = {len(PADS.findall(row.strip())) + 1 for row in rows}
     if n_fields == {n_names} or (len(n_fields) == 1 and last == 2 < max(n_fields)):
         return PADDED
     is_as_ever = last == 2 and named.mark != "\t"
@@ -583,7 +584,7 @@ def _unquoted(line: str) -> str:
     """A line without the quotation marks around fields, in which no mark separates any more."""
     if '"' not in line:
         return line
-    return QUOTED.sub(lambda found: found[1] + re.sub(r"[,;\t]", "\u201a", found[2]), line)
+    return QUOTED.sub(lambda found: found[1] + MARKS.sub("\u201a", found[2]), line)
 
 
 def _fields(row: str, separator: str) -> list[str]:
@@ -591,7 +592,7 @@ def _fields(row: str, separator: str) -> list[str]:
     if not separator:
         return words_of(row)
     if separator == PADDED:
-        row = re.sub(r"\t[ \t]*", "\t", row.strip())
+        row = PADS.sub("\t", row.strip())
     fields = [field.strip() for field in row.split(separator[0])]
     while fields and not fields[-1]:
         fields.pop()
@@ -622,7 +623,9 @@ def _values(
 ) -> FloatArray:
     """(N, C) numbers of some columns of lines that are numbered from ``first``."""
     if separator == PADDED:
-        body = "\n".join("\t".join(_fields(line, PADDED)) for line in body.split("\n"))
+        body = PADS.sub("\t", "\n".join(map(str.strip, body.split("\n"))))
+        if not body.isascii():
+            body = "\n".join("\t".join(_fields(line, "\t")) for line in body.split("\n"))
         separator = "\t"
     elif separator != "\t":
         body = body.replace("\t", " ")

@@ -474,8 +474,8 @@ def sum_views(
     ``points``: (N, 2) px. ``whitening``: (N, 4) rows of the inverse of their sigmas' root.
     ``board``, ``bow``: (N, 3), (N, 2), and ``poses``: (V, 12), as for `board_rows`. ``starts``:
     (V + 1,) first point of each view. ``shared``: (11,). ``basis``: (11, F) directions that are
-    solved. ``weights``: (N,). ``sums``: (V, S S), S = F + 7, zeros; output: the upper halves of
-    products of the free unknowns', the pose's and the residual's columns.
+    solved. ``weights``: (N,). ``sums``: (V, S S), S = F + 7, zeros; output: products of the free
+    unknowns', the pose's and the residual's columns.
     """
     n_free = basis.shape[1]
     size = n_free + POSE + 1
@@ -505,4 +505,7 @@ def sum_views(
                 first, second = white[0, i], white[1, i]
                 for j in range(i, size):
                     sums[v, i * size + j] += first * white[0, j] + second * white[1, j]
+        for i in range(size):
+            for j in range(i):
+                sums[v, i * size + j] = sums[v, j * size + i]
     return True

@@ -18,6 +18,7 @@ from armscan.calibration.cameras.adjustment import (
     moved,
     normal_equations,
     predict,
+    predict_px,
 )
 from armscan.calibration.cameras.result import CameraOptions
 from armscan.geometry.estimate import FitFailure
@@ -94,6 +95,19 @@ def test_step_and_covariance_are_those_of_the_dense_system() -> None:
     assert not isinstance(joint, FitFailure)
     scaled = joint[0] * np.outer(scale, scale) / np.outer(sigma, sigma)
     assert np.abs(scaled - dense_covariance / np.outer(sigma, sigma)).max() < 1e-3
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_points_alone_are_to_the_bit_those_that_come_with_derivatives(lens: Lens) -> None:
+    observations, state = problem(3)
+    if lens == "fisheye":
+        state.shared[6:8] = 0.0
+    observations = replace(observations, lens=lens)
+    both = predict(observations, state)
+    assert both is not None
+    assert np.array_equal(both[0], predict_px(observations, state))
+    behind = replace(state, translations_mm=-state.translations_mm)
+    assert predict_px(observations, behind) is None
 
 
 def test_weights_leave_points_out_exactly() -> None:

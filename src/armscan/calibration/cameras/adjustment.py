@@ -211,18 +211,12 @@ def predict(
     rotation-vector increment (rad, Sensor frame, on the left) and translation (mm). Impossible is a
     point behind the camera, or a focal length not positive.
     """
-    if not np.isfinite(state.shared).all() or min(state.shared[:2]) <= 0.0:
+    placed = _placed(observations, state)
+    if placed is None:
         return None
-    camera = observations.camera(state.shared[:9])
-    board = observations.board_mm.copy()
-    board[:, 2] += observations.board_warp_shape @ state.shared[9:]
-    turned = np.concatenate(
-        [board[observations.rows(v)] @ state.rotations[v].T for v in range(observations.n_views)]
-    )
+    turned, points = placed
     counts = np.diff(observations.starts)
-    points = turned + np.repeat(state.translations_mm, counts, axis=0)
-    if not points[:, 2].min() > 0.0:
-        return None
+    camera = observations.camera(state.shared[:9])
     predicted, by_point, by_camera = camera.project_with_jacobian(points)
     normal = np.repeat(state.rotations[:, :, 2], counts, axis=0)
     by_height = (by_point @ normal[:, :, None])[:, :, 0]
@@ -230,6 +224,25 @@ def predict(
     by_shared = np.concatenate([by_camera, by_bow], axis=2)
     by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=2)
     return predicted, by_shared, by_pose
+
+
+def predict_px(observations: Observations, state: State) -> FloatArray | None:
+    """The image points (N, 2) of `predict` alone."""
+    placed = _placed(observations, state)
+    return None if placed is None else observations.camera(state.shared[:9]).project(placed[1])
+
+
+def _placed(observations: Observations, state: State) -> tuple[FloatArray, FloatArray] | None:
+    """Target points (N, 3) turned into Sensor, and in their places there; None as of `predict`."""
+    if not np.isfinite(state.shared).all() or min(state.shared[:2]) <= 0.0:
+        return None
+    board = observations.board_mm.copy()
+    board[:, 2] += observations.board_warp_shape @ state.shared[9:]
+    turned = np.concatenate(
+        [board[observations.rows(v)] @ state.rotations[v].T for v in range(observations.n_views)]
+    )
+    points = turned + np.repeat(state.translations_mm, np.diff(observations.starts), axis=0)
+    return (turned, points) if points[:, 2].min() > 0.0 else None
 
 
 def linearise(
@@ -262,12 +275,11 @@ def linearise(
         return None
     blocks = sums.reshape(n, size, size)
     total = blocks.sum(axis=0)
-    shared, pose = np.triu(total[:f, :f]), np.triu(blocks[:, f:-1, f:-1])
     of_points = NormalEquations(
         float(total[-1, -1]),
-        shared + np.triu(shared, 1).T,
+        total[:f, :f],
         blocks[:, :f, f:-1],
-        pose + np.triu(pose, 1).transpose(0, 2, 1),
+        blocks[:, f:-1, f:-1],
         total[:f, -1],
         blocks[:, f:-1, -1],
     )

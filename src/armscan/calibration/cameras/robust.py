@@ -20,6 +20,7 @@ from armscan.calibration.cameras.adjustment import (
     State,
     adjust,
     predict,
+    predict_px,
 )
 from armscan.calibration.cameras.result import BOW_P, BoardWarp
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -134,10 +135,10 @@ class Solution:
 
 def residuals_px(observations: Observations, state: State) -> FloatArray:
     """(N, 2) observed minus predicted; infinite for an impossible state."""
-    prediction = predict(observations, state)
-    if prediction is None:
+    predicted = predict_px(observations, state)
+    if predicted is None:
         return np.full_like(observations.points_px, np.inf)
-    return observations.points_px - prediction[0]
+    return observations.points_px - predicted
 
 
 def chi2_of_points(observations: Observations, state: State) -> FloatArray:

@@ -675,9 +675,10 @@ class CrossLabeller:
         is_in_doubt = n_undecided > UNDECIDED_SHARE * n_asked
         most = max(self._sources, key=lambda source: expected[source])
         self._next = (most,) if is_in_doubt and is_due else self._sources
-        unseen = [k for k in range(len(self._source_of)) if k not in self._shown]
+        alone = [s for s in self._sources if self._source_of.count(s) == 1]
+        unseen = [s for s in alone if self._source_of.index(s) not in self._shown]
         if unseen and len(self._sources) > MOST_BY_PAST:
-            self._next = (self._source_of[unseen[0]],)
+            self._next = (unseen[0],)
 
     def _reason(self, possible: tuple[int, ...], has_pose: bool) -> str:
         if len(possible) == 1:

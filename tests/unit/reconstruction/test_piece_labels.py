@@ -102,6 +102,23 @@ def lit(head: SensorCalibration, k: int, x_mm: float) -> list[FloatArray]:
     return [points for points in (floor[~on_top & ~over], top[on_top]) if len(points)]
 
 
+def test_a_source_of_several_lines_is_not_waited_for_until_one_is_alone() -> None:
+    """None of its lines ever is: it was asked for alone to the end of the pass."""
+    head = five_lines()
+    names = ("L0", "L1", "fan.1", "fan.2", "fan.3")
+    sheets = [replace(sheet, name=name) for sheet, name in zip(head.sheets, names, strict=True)]
+    labeller = CrossLabeller(replace(head, sheets=tuple(sheets)))
+    asked = []
+    for t in range(3):
+        on = labeller.next_lasers()
+        asked.append(on)
+        pixels = head.camera.camera.project(lit(head, ("L0", "L1", "fan").index(on[0]), -30.0)[0])
+        profile = make_profile(f"{t}", [(pixels, np.tile([0.0, 1.0], (len(pixels), 1)))], 0.05)
+        pose: Pose[Base, Sensor] = Pose(np.eye(3), np.array([STEP_MM * t, 0.0, 0.0]))
+        labeller.label([profile], on, pose, 1 + 12_500_000 * t)
+    assert asked == [("L0",), ("L1",), ("L0", "L1", "fan")]
+
+
 @pytest.mark.parametrize("is_asked", [True, False])
 def test_many_lines_are_not_named_one_further_where_a_block_is_as_high(is_asked: bool) -> None:
     """To the past alone the floor goes on below the block: 5 and 7 % of the names were wrong, with

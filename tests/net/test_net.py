@@ -23,7 +23,7 @@ model a bow of 2e-5 mm differs by 4.5 % of itself."""
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]?\d+)?")
 # The noise's rounds of a hand-eye end where no scatter changes by 2 %: on another machine than that
 # of golden/ values moved by up to 6e-5 of themselves.
-# Those of cameras and pairs were written on a processor of another maker (k1 of 0.004 by 3e-6 of it).
+# Those of cameras and pairs were written on another maker's processor (k1 of 0.004 by 3e-6 of it).
 LIMITS = {name: Limits(1e-4, 1e-2) for name in ("hand-eye", "camera", "stereo")}
 # Its second recording repeats the first, so that the scatter is hardly determined: two ways of
 # running it on one machine moved its sigmas by 5 %. Why is not known.

@@ -17,12 +17,10 @@ from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
 from armscan.calibration.cameras.pairs import MIN_PAIRS, SIDES, StereoOptions, StereoPair
 from armscan.calibration.cameras.result import (
-    DISTORTION_PARAMETERS,
     MIN_VIEWS,
     BoardWarp,
     CameraFit,
     CameraOptions,
-    DistortionModel,
 )
 from armscan.calibration.cameras.robust import agreeing_numberings, missed_places_mm
 from armscan.calibration.cameras.stereo_result import SideFit, StereoFit
@@ -173,7 +171,7 @@ def calibrate_camera_from_views(
             progress(ProgressEvent("solve", total, total))
             return CameraRun(numbered_alike(views, fit, target), (), rounds)
         progress(ProgressEvent("solve", done, total))
-        model = _model_of(fit)
+        model = "fisheye" if fit.camera.lens == "fisheye" else options.distortion
 
 
 def _with_settled_centres(
@@ -250,17 +248,6 @@ def _numbering_of(seen: Sequence[_Seen], known: Sequence[Numbering]) -> dict[str
     if chosen is None:
         return {}
     return {one.view.source: known[k] for one, k in zip(seen, chosen, strict=True)}
-
-
-def _model_of(fit: CameraFit) -> DistortionModel:
-    """The distortion model whose coefficients were free."""
-    if fit.camera.lens == "fisheye":
-        return "fisheye"
-    free = set(fit.free_parameters)
-    return max(
-        (name for name, terms in DISTORTION_PARAMETERS.items() if free.issuperset(terms)),
-        key=lambda name: len(DISTORTION_PARAMETERS[name]),
-    )
 
 
 def _corrected(view: TargetView, fit: CameraFit) -> TargetView:

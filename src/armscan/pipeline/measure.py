@@ -36,7 +36,7 @@ from armscan.pipeline.progress import (
     silent,
     worker_threads,
 )
-from armscan.reconstruction.label_cross import MOST_BY_PAST, CrossLabeller, stripes_apart
+from armscan.reconstruction.label_cross import CrossLabeller, stripes_apart
 from armscan.reconstruction.label_stereo import StereoLabeller
 from armscan.reconstruction.labels import (
     LabelledProfile,
@@ -44,7 +44,6 @@ from armscan.reconstruction.labels import (
     SingleLabeller,
     StripeCounts,
     StripeLabeller,
-    sheets_of,
     without_sheet,
 )
 from armscan.reconstruction.place import merge_clouds
@@ -80,6 +79,8 @@ MOST_THREADS = 8
 """Instants whose stripes are extracted at the same time, if there are as many cores."""
 CLEAN_SHARE = 0.5
 """An image of which less than this share of the stripe points is measured is pointed out."""
+OPEN_SHARE = 0.25
+"""If a larger share of the points may be of several sheets, the way of lighting does not suit."""
 LISTED = 4
 NOTHING_MEASURED_REMEDY = (
     "check that the images show a laser line, that camera and sheet are the right ones, and give a "
@@ -619,6 +620,14 @@ def measurement_warnings(
             f"{n_outside} points were left out: too far outside the calibrated depths; "
             "`reconstruct --depth-margin`, in widths of these depths, takes more"
         )
+    n_open = sum(image.count(PointStatus.AMBIGUOUS) for image in images)
+    share = n_open / max(n_open + sum(n_measured), 1)
+    if share > OPEN_SHARE:
+        warnings.append(
+            f"{n_open} points, {100.0 * share:.0f} % of what the stripes showed, were left out: "
+            "more than one light sheet may have drawn them; light fewer lasers at once, each alone "
+            "now and then, or use two cameras"
+        )
     if not sensor.has_camera_covariance:
         warnings.append(without_covariance("the points' sigmas"))
     for sheet, depth in zip(sensor.sheets, depths, strict=True):
@@ -644,8 +653,7 @@ def laser_warnings(
     options: MeasureOptions,
 ) -> tuple[str, ...]:
     """Warn of exposures that name other lasers than the calibrated ones, or than the one chosen,
-    or that name none where one camera's stripe may be of a laser that has no sheet; and of many
-    lines before one camera that are never alone.
+    or that name none where one camera's stripe may be of a laser that has no sheet.
 
     Parameters
     ----------
@@ -685,14 +693,5 @@ def laser_warnings(
             f"{unnamed} exposures do not name their lasers, and of the laser {', '.join(unseen)} "
             "the calibration has no sheet: where it was on, its points may be given to another "
             "sheet"
-        )
-    sets = [sheets_of(sensor, on or [one.name for one in sensor.sheets]) for on in named]
-    lit = max(map(len, sets), default=0)
-    never = [one.name for k, one in enumerate(sensor.sheets) if (k,) not in sets]
-    if isinstance(labeller, CrossLabeller) and lit > MOST_BY_PAST and never:
-        warnings.append(
-            f"{lit} lines were on at once before one camera, and {', '.join(never)} never alone: "
-            "what may as well be another line's is left out; light each alone now and then, one or "
-            "two at a time, or use two cameras"
         )
     return tuple(warnings)

@@ -26,8 +26,10 @@ from armscan.reconstruction.segments import (
     SHARPNESS,
     STUDENT,
     ImageMemory,
+    LoneLines,
     Pieces,
     cut_pieces,
+    likeliest,
     smoothed_posterior,
     switch_probability,
 )
@@ -440,14 +442,19 @@ def in_order_beside(
     sheets: tuple[int, ...],
     named: IntArray,
     sensor: SensorCalibration,
+    *,
+    absent: set[int],
 ) -> BoolArray:
-    """(S,) True where as many stripes as sheets lie side by side, and no name is out of order."""
+    """(S,) True where as many stripes lie side by side as sheets are not ``absent``, and no name is
+    out of order.
+    """
     along = np.array([frontal_direction(sensor, k) for k in sheets])
     along *= np.sign(along @ along[0])[:, None]
     u = along.sum(axis=0) / np.linalg.norm(along.sum(axis=0))
     order = _order_beside(u, sheets, sensor)
-    if order is None:
+    if order is None or absent.issuperset(sheets):
         return np.zeros(len(samples_px), dtype=np.bool_)
+    order = order[[sheets[h] not in absent for h in order]]
     segment = pieces.segment[pieces.of_sample]
     row = np.unique(np.floor(samples_px @ u / ROW_PX), return_inverse=True)[1]
     shape = (int(segment.max(initial=0)) + 1, int(row.max(initial=0)) + 1)
@@ -457,9 +464,9 @@ def in_order_beside(
     across = np.where(count > 0.0, total / np.maximum(count, 1.0), np.inf)
     rank = across.argsort(axis=0).argsort(axis=0)[segment, row]
     name = named[pieces.of_sample]
-    is_odd = (name >= 0) & (order[np.minimum(rank, len(sheets) - 1)] != name)
+    is_odd = (name >= 0) & (order[np.minimum(rank, len(order) - 1)] != name)
     n_odd = np.bincount(row, is_odd, minlength=shape[1])
-    is_whole = (count > 0.0).sum(axis=0) == len(sheets)
+    is_whole = (count > 0.0).sum(axis=0) == len(order)
     return np.asarray((is_whole & (n_odd == 0))[row])
 
 
@@ -506,6 +513,7 @@ class CrossLabeller:
         self._sensor, self._depths = sensor, depths
         self._source_of = tuple(sheet.name.partition(".")[0] for sheet in sensor.sheets)
         self._sources = tuple(dict.fromkeys(self._source_of))
+        self._lone = LoneLines(self._source_of)
         limits = [depths.limits_mm(sheet) for sheet in sensor.sheets]
         self._scale = max(1.0, field_mm(sensor) / FIELD_MM)
         span = max(high - low for low, high in limits)
@@ -520,7 +528,7 @@ class CrossLabeller:
         self._last_ns: int | None = None
         self._next = self._sources[:1]
         self._since_single = 0
-        self._shown: set[int] = set()
+        self._lone.reset()
 
     def next_lasers(self) -> tuple[str, ...]:
         """One laser alone as a pass starts (of many each) or if labels are in doubt, else all."""
@@ -572,7 +580,7 @@ class CrossLabeller:
         samples = profile.points_px[pieces.sample]
         hypotheses = hypothesise(samples, possible, self._sensor, self._depths)
         posterior = self._posterior(samples, pieces, hypotheses, pose)
-        best, margin = _best(posterior)
+        best, margin = likeliest(posterior)
         is_near, is_explained = (
             np.take_along_axis(pieces.mean(flag.astype(np.float64)), best[:, None], 1)[:, 0] > 0.5
             for flag in (hypotheses.is_near, hypotheses.is_inside)
@@ -634,14 +642,18 @@ class CrossLabeller:
 
         Not open is what was seen before at the same place; what lies in order where all lines that
         are on lie beside each other; and what no other sheet may have drawn, because the piece is
-        out of its depths, or because its stripe is beside the piece, of one that was on alone.
+        out of its depths, or showed nothing when it was on alone, or because its stripe is beside
+        the piece, of one that was on alone.
         """
         is_inside = pieces.mean(hypotheses.is_inside.astype(np.float64)) > 0.0
         held = held_beside(pieces, hypotheses, named, self._sensor)
-        is_free = (held < 1.0) | [k not in self._shown for k in hypotheses.sheets]
+        is_free = (held < 1.0) | [k not in self._lone.shown for k in hypotheses.sheets]
+        is_free &= [k not in self._lone.absent for k in hypotheses.sheets]
         others = np.arange(len(hypotheses.sheets)) != named[:, None]
         is_open = np.asarray((is_inside & is_free & others).any(axis=1))
-        in_order = in_order_beside(samples_px, pieces, hypotheses.sheets, named, self._sensor)
+        in_order = in_order_beside(
+            samples_px, pieces, hypotheses.sheets, named, self._sensor, absent=self._lone.absent
+        )
         is_open &= pieces.mean(in_order.astype(np.float64)) < 1.0
         if pose is not None:
             name = named[pieces.of_sample]
@@ -664,8 +676,7 @@ class CrossLabeller:
         """Choose the lasers of the next exposure: all, or the one that most undecided are of."""
         on = {self._source_of[k] for k in possible}
         self._since_single = 0 if len(on) == 1 else self._since_single + 1
-        if len(possible) == 1:
-            self._shown.update(possible)
+        self._lone.learn(possible, found.sheet)
         expected = dict.fromkeys(self._sources, 0.0)
         for source, points in zip(self._source_of, found.undecided.tolist(), strict=True):
             expected[source] += points
@@ -675,10 +686,8 @@ class CrossLabeller:
         is_in_doubt = n_undecided > UNDECIDED_SHARE * n_asked
         most = max(self._sources, key=lambda source: expected[source])
         self._next = (most,) if is_in_doubt and is_due else self._sources
-        alone = [s for s in self._sources if self._source_of.count(s) == 1]
-        unseen = [s for s in alone if self._source_of.index(s) not in self._shown]
-        if unseen and len(self._sources) > MOST_BY_PAST:
-            self._next = (unseen[0],)
+        if self._lone.due and len(self._sources) > MOST_BY_PAST:
+            self._next = self._lone.due[:1]
 
     def _reason(self, possible: tuple[int, ...], has_pose: bool) -> str:
         if len(possible) == 1:
@@ -686,14 +695,3 @@ class CrossLabeller:
         if has_pose:
             return "the sheet that continues the surface of the exposures before"
         return "the sheet whose stripe was last seen near, without the arm's pose"
-
-
-def _best(posterior: FloatArray) -> tuple[IntArray, FloatArray]:
-    """(P,) likeliest hypothesis and its log-odds over all others together; infinite if alone."""
-    best = posterior.argmax(axis=1)
-    if posterior.shape[1] == 1:
-        return best, np.full(len(best), np.inf)
-    top = np.take_along_axis(posterior, best[:, None], axis=1)[:, 0]
-    rest = posterior.copy()
-    np.put_along_axis(rest, best[:, None], -np.inf, axis=1)
-    return best, np.asarray(top - np.logaddexp.reduce(rest, axis=1))

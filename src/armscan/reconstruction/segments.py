@@ -263,6 +263,17 @@ def smoothed_posterior(log_likelihood: FloatArray, switch: FloatArray) -> FloatA
     return np.asarray(total - np.logaddexp.reduce(total, axis=1, keepdims=True))
 
 
+def likeliest(posterior: FloatArray) -> tuple[IntArray, FloatArray]:
+    """(P,) likeliest hypothesis and its log-odds over all others together; infinite if alone."""
+    best = posterior.argmax(axis=1)
+    if posterior.shape[1] == 1:
+        return best, np.full(len(best), np.inf)
+    top = np.take_along_axis(posterior, best[:, None], axis=1)[:, 0]
+    rest = posterior.copy()
+    np.put_along_axis(rest, best[:, None], -np.inf, axis=1)
+    return best, np.asarray(top - np.logaddexp.reduce(rest, axis=1))
+
+
 STUDENT = 3.0
 """Degrees of freedom of the error's distribution: edges and sharp bends have long tails."""
 REACH_PX = 60.0
@@ -339,3 +350,60 @@ def _nearest(last: _Stripe, points_px: FloatArray) -> tuple[FloatArray, IntArray
     """Distance (N,) to the nearest point of a stripe that moved on, and its index."""
     found = cKDTree(last.points_px + last.motion_px).query(points_px)
     return np.asarray(found[0]), np.asarray(found[1])
+
+
+LEAST_SEEN = 30
+"""Points of a laser that is on alone; with fewer its line is not on the part."""
+
+
+class LoneLines:
+    """Lasers of one line each that a pass lit alone, and what they showed.
+
+    Parameters
+    ----------
+    source_of
+        Source of each sheet; of one that draws several lines none is ever alone.
+
+    Attributes
+    ----------
+    shown, absent
+        Sheets whose line was seen when it was on alone, and those whose line was not, nor since.
+    """
+
+    def __init__(self, source_of: tuple[str, ...]) -> None:
+        self._sheet_of = {s: k for k, s in enumerate(source_of) if source_of.count(s) == 1}
+        self._asked: set[int] = set()
+        self.shown: set[int] = set()
+        self.absent: set[int] = set()
+
+    def reset(self) -> None:
+        """Begin a new pass; a round that was not finished goes on, for where exposures are seconds
+        apart each is a pass by itself.
+        """
+        self.shown.clear()
+        self.absent.clear()
+        if not self.due:
+            self._asked.clear()
+
+    @property
+    def due(self) -> tuple[str, ...]:
+        """Sources that are still to be lit alone."""
+        return tuple(s for s, k in self._sheet_of.items() if k not in self._asked)
+
+    def learn(self, possible: tuple[int, ...], sheet: IntArray) -> None:
+        """Take in an exposure in which the sheets ``possible`` were on, by its names (N,).
+
+        While nothing at all was seen, the head is in the air: that tells of no line.
+        """
+        self.absent -= set(sheet.tolist())
+        if len(possible) != 1:
+            return
+        is_seen = int((sheet >= 0).sum()) >= LEAST_SEEN
+        if is_seen and not self.shown:
+            self._asked -= self.absent
+            self.absent.clear()
+        (self.shown if is_seen else self.absent).update(possible)
+        self._asked.update(possible)
+        if not self.due and not self.shown:
+            self._asked.clear()
+            self.absent.clear()

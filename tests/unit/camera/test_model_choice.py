@@ -140,3 +140,34 @@ def test_errors_stay_within_sigma_where_the_board_covers_little_or_views_are_ben
         squares.append(normalised_error(truth, value, fit.covariance[:4, :4]))
     low, high = stats.chi2.ppf([0.001, 0.999], 4 * len(squares)) / 4 / len(squares)
     assert low < np.mean(squares) / 4 < high, np.round(squares, 2)
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "distortion"),
+    [
+        (520.0, [-0.2, 0.1, 0.01, 0.005, 0.0]),
+        (333.0, [-0.4, 0.25, 0.0, 0.0, 0.0]),
+        (450.0, [-0.35, 0.15, 0.0, 0.0, -0.03]),
+    ],
+    ids=["decentred", "wide", "barrel"],
+)
+def test_lenses_beyond_the_usual_are_not_held_to_it(
+    focal_px: float, distortion: list[float]
+) -> None:
+    """What a size took away made residuals large and alike, and these its weight: focal lengths
+    were off by up to 160 px of 333.
+    """
+    lens = plain_camera((focal_px,) * 2, (325.0, 236.0), (640, 480), distortion)
+    errors = []
+    for n_views in (12, 5):
+        scene = Scene(
+            lens, n_views=n_views, noise_px=0.15, distance_mm=330.0 * focal_px / 520.0, reach=0.4
+        )
+        for seed in range(4):
+            fit = calibrate_camera(make_views(scene, seed)[0], CameraOptions(n_folds=0))
+            assert isinstance(fit, CameraFit)
+            assert fit.camera.lens == "pinhole"
+            error = (lens.parameters[:4], fit.camera.parameters[:4], fit.covariance[:4, :4])
+            errors.append(normalised_error(*error))
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 4 * len(errors)) / len(errors)
+    assert low < np.mean(errors) < high

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -63,6 +65,17 @@ def test_what_lies_beyond_the_margin_is_out_of_depth_and_the_margin_is_hinted_at
     assert len(found.points) == 0
     told = measurement_warnings([found.labelled.counts], SheetDepths.of(SENSOR), SENSOR)
     assert any("--depth-margin" in text for text in told)
+
+
+def test_points_that_several_sheets_may_have_drawn_are_told_of_where_they_are_many() -> None:
+    """A user who never lights a laser alone otherwise sees a thin cloud and no reason."""
+    counts = measured(0.2, DepthRange(1.0)).labelled.counts
+    for share, is_told in ((0.2, False), (0.3, True)):
+        n = round(share * len(counts))
+        of_status = {PointStatus.MEASURED: len(counts) - n, PointStatus.AMBIGUOUS: n}
+        some = replace(counts, by_status=tuple(of_status.get(one, 0) for one in PointStatus))
+        told = measurement_warnings([some], SheetDepths.of(SENSOR), SENSOR)
+        assert any(text.startswith(f"{n} points, 30 %") for text in told) == is_told
 
 
 def test_without_a_margin_labels_look_further_than_points_are_kept() -> None:

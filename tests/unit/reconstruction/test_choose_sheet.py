@@ -130,26 +130,6 @@ def test_a_scan_that_names_no_laser_is_told_of_those_without_sheet() -> None:
     assert not laser_warnings([()], labeller, sensor, MeasureOptions(sheet="left"))
 
 
-def test_many_lines_before_one_camera_that_are_never_alone_are_warned_of_in_a_scan() -> None:
-    """What nothing excludes is left out: of four lines that are always on everything."""
-    few, options = two_sheets(), MeasureOptions()
-    more = tuple(replace(sheet, name=f"far {sheet.name}") for sheet in few.sheets)
-    many = replace(few, sheets=(*few.sheets, *more), covariance=np.zeros((41, 41)))
-    names = [sheet.name for sheet in many.sheets]
-
-    def told(sensor: SensorCalibration, *lasers: tuple[str, ...], is_scan: bool = True) -> str:
-        labeller = labeller_for(sensor, options, is_scan=is_scan)
-        return " ".join(laser_warnings(lasers, labeller, sensor, options))
-
-    assert told(many, ("left",), tuple(names[:3])).startswith(
-        "3 lines were on at once before one camera, and right, far left, far right never alone"
-    )
-    assert told(many, ()).startswith("4 lines")
-    assert told(many, (), *((name,) for name in names)) == ""
-    assert told(many, ("left",), ("left", "right")) == told(few, ()) == ""
-    assert told(many, (), is_scan=False) == ""
-
-
 def test_a_laser_without_sheet_beside_a_calibrated_one_is_not_taken_for_it() -> None:
     choice = labelled(stripes(0.13), two_sheets(), DepthRange(1.0), lasers=("left", "C"))
     assert choice.reason == "of C, which was on, too, the calibration has no sheet"

@@ -19,12 +19,15 @@ from armscan.calibration.cameras.adjustment import (
     joint_covariance,
 )
 from armscan.calibration.cameras.distortion import (
+    MOST_COST,
     ChosenModel,
     choose_lens,
     coefficients_left_at_zero,
+    contradicted_size,
     cross_validate,
     design_effect,
     known_of_usual_lenses,
+    level_of_points,
     print_stretch,
     resting_on_usual,
     rms,
@@ -541,9 +544,6 @@ def _solve_model(
 
 
 _ALL: DistortionModel = "k1k2p1p2k3"
-SIZE_ROUNDS = 3
-"""Solutions with what is known of usual lenses: its weight beside the points is that of the level
-of their residuals, which the first one does not know well."""
 
 
 def _beside_usual_sizes(
@@ -552,18 +552,29 @@ def _beside_usual_sizes(
     prepared: PreparedViews,
     options: CameraOptions,
 ) -> Solution | FitFailure:
-    """All five coefficients, each beside the size that it has in usual lenses."""
-    solution = _solve(used, observations, prepared, "k1", options)
-    if isinstance(solution, FitFailure):
-        solution = _solve(used, observations, prepared, _ALL, options)
-    for _ in range(SIZE_ROUNDS):
+    """All five coefficients, each beside the size that it has in usual lenses, unless the views
+    contradict that.
+
+    What the sizes weigh beside the points is told by the residuals of the free solution: where too
+    much of a lens is held at zero, they are large and alike, and would hold it there.
+    """
+    first = _solve(used, observations, prepared, _ALL, options)
+    if isinstance(first, FitFailure):
+        first = _solve(used, observations, prepared, "k1", options)
+    if isinstance(first, FitFailure):
+        return first
+    bow = with_significant_bow(first, options.max_steps, is_wanted=options.solve_warp)
+    flat = first if isinstance(bow, FitFailure) else bow[0]
+    level = level_of_points(flat)
+    known = known_of_usual_lenses(flat, level)
+    while True:
+        solution = _solve(used, replace(observations, known=known), prepared, _ALL, options)
         if isinstance(solution, FitFailure):
-            break
-        bow = with_significant_bow(solution, options.max_steps, is_wanted=options.solve_warp)
-        level_of = solution if isinstance(bow, FitFailure) else bow[0]
-        known = replace(observations, known=known_of_usual_lenses(level_of))
-        solution = _solve(used, known, prepared, _ALL, options)
-    return solution
+            return solution
+        row = contradicted_size(solution)
+        if row is None:
+            return first if solution.chi2 - first.chi2 > MOST_COST * level else solution
+        known = np.where(np.arange(len(known)) == row, 0.0, known)
 
 
 def _reason_of_sizes(solution: Solution) -> str:

@@ -10,7 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.cameras.distortion import rms, sigma_of_axis, typical_coefficients
+from armscan.calibration.cameras.distortion import (
+    BEYOND_USUAL,
+    rms,
+    sigma_of_axis,
+    typical_coefficients,
+)
 from armscan.calibration.cameras.joint import (
     N_INTRINSICS,
     N_SHARED,
@@ -23,6 +28,7 @@ from armscan.calibration.cameras.joint import (
     StereoState,
     adjust_both,
     hold_out_pairs,
+    independent_share,
     solve_both,
     stack_pair_observations,
     stereo_covariance,
@@ -181,12 +187,15 @@ def prior_of(given: tuple[CameraCalibration, CameraCalibration]) -> Prior:
 
 
 def usual_prior(cameras: Cameras) -> Prior:
-    """Coefficients of usual lenses, of the size that `typical_coefficients` tells."""
+    """Coefficients of usual lenses, of the size that `typical_coefficients` tells, but those that
+    a camera's own views contradicted.
+    """
     information = np.zeros((2, len(PARAMETER_NAMES)))
     for side, single in enumerate(cameras):
         if single.camera.lens == "pinhole":
             usual = typical_coefficients(single.camera, PARAMETER_NAMES[4:])
-            information[side, 4:] = common_design_effect(cameras) / usual**2
+            is_usual = np.abs(single.camera.parameters[4:]) < BEYOND_USUAL * usual
+            information[side, 4:] = is_usual * common_design_effect(cameras) / usual**2
     n_known = int(np.count_nonzero(information))
     return Prior(np.zeros(N_INTRINSICS), np.diag(information.ravel()), n_known)
 
@@ -446,7 +455,16 @@ def _solve(
         _prior(cameras, options, given),
     )
     start = starting_state(boards, cameras, relation.right_from_left)
-    return solve_both(boards.seen_by, problem, start, options.camera.max_steps)
+    solution = solve_both(boards.seen_by, problem, start, options.camera.max_steps)
+    if given is not None or problem.prior is None or isinstance(solution, FitFailure):
+        return solution
+    # what the target's points miss is no noise of the points: beside it usual sizes weigh less
+    share = independent_share(solution)
+    if share == 1.0:
+        return solution
+    usual = replace(problem.prior, information=share * problem.prior.information)
+    problem = replace(problem, prior=usual)
+    return solve_both(boards.seen_by, problem, solution.state, options.camera.max_steps)
 
 
 def on_bowed_board(observations: JointObservations, bow_mm: FloatArray) -> JointObservations:

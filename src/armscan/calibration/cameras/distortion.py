@@ -166,7 +166,8 @@ def choose_lens(
 ) -> ChosenModel | FitFailure:
     """The pinhole, or a fisheye where points reach far from the axis and it predicts them better.
 
-    ``pinhole`` is the best of its models; ``solve`` and ``validate`` are as for `choose_model`.
+    ``solve`` gives the solution of a model, ``validate`` the hold-out test of a solution with the
+    weights of another.
     """
     if not isinstance(pinhole, FitFailure) and not _is_wide(pinhole.solution):
         return pinhole
@@ -293,6 +294,14 @@ NEXT_TERM = 0.3
 """...and each further radial term is about this part of the one before it."""
 TYPICAL_TANGENTIAL = 1e-3
 """Tangential coefficients of lenses that are centred as usual."""
+MOST_COST = 25.0
+"""By so much, in units of the points' level, chi2 may rise for the four usual sizes: of usual
+lenses by 18 once in a thousand."""
+BEYOND_USUAL = 3.0
+"""Deviations by which the views contradict a usual size: the lens is none of the usual ones."""
+MOST_SHARE = 0.9
+"""Views that tell a coefficient to three times its usual size or worse contradict nothing: so large
+a one would be no lens's."""
 
 
 def typical_coefficients(camera: CameraModel, names: tuple[str, ...]) -> FloatArray:
@@ -313,13 +322,17 @@ def typical_coefficients(camera: CameraModel, names: tuple[str, ...]) -> FloatAr
     return np.array([typical[name] for name in names])
 
 
-def known_of_usual_lenses(solution: Solution) -> FloatArray:
+def level_of_points(solution: Solution) -> float:
+    """Variance of a point of unit weight, widened where the residuals of one view are alike."""
+    error = estimate_target_error(board_residuals(solution))
+    return solution.variance_factor * design_effect(solution).widening * error.independent_share
+
+
+def known_of_usual_lenses(solution: Solution, level: float) -> FloatArray:
     """(11,) of `Observations`: coefficients are normal variables about zero, of usual size (Bayes).
 
-    At the level of the solution's points, widened where the residuals of one view are alike.
+    ``level`` is that of the points; the solution's camera tells how far its image reaches.
     """
-    error = estimate_target_error(board_residuals(solution))
-    level = solution.variance_factor * design_effect(solution).widening * error.independent_share
     n_camera = len(PARAMETER_NAMES)
     camera = solution.observations.camera(solution.state.shared[:n_camera])
     known = np.zeros(len(SHARED_NAMES))
@@ -329,11 +342,34 @@ def known_of_usual_lenses(solution: Solution) -> FloatArray:
 
 def resting_on_usual(solution: Solution) -> tuple[str, ...]:
     """Names of coefficients of which the views say less than what is usual of lenses does."""
+    shares = _shares_of_usual(solution)
+    return tuple(name for name, share in zip(SHARED_NAMES, shares, strict=True) if share > 0.5)
+
+
+def contradicted_size(solution: Solution) -> int | None:
+    """Row of the coefficient whose usual size s the views contradict most; None if they do none.
+
+    Solved beside s it is m, of which s is the share w. By the views alone it would be
+    m / (1 - w), known to the variance s^2 (1 - w) / w: together they are a normal variable of
+    variance s^2 / w, which it exceeds by m / s / sqrt(1 - w) of its deviations.
+    """
+    n_camera = len(PARAMETER_NAMES)
+    shared = solution.state.shared[:n_camera]
+    shares = _shares_of_usual(solution)[4:n_camera]
+    usual = typical_coefficients(solution.observations.camera(shared), PARAMETER_NAMES[4:])
+    is_beside = (shares > 0.0) & (shares < MOST_SHARE)
+    excess = np.where(is_beside, np.abs(shared[4:]) / usual, 0.0) / np.sqrt(
+        1.0 - np.minimum(shares, MOST_SHARE)
+    )
+    return 4 + int(excess.argmax()) if excess.max() > BEYOND_USUAL else None
+
+
+def _shares_of_usual(solution: Solution) -> FloatArray:
+    """(11,) share of what is known of each shared unknown that was known beforehand."""
     determined = joint_covariance(solution.equations, solution.basis)
     if isinstance(determined, FitFailure):
-        return ()
-    shares = solution.observations.known * np.diag(determined[0])[: len(SHARED_NAMES)]
-    return tuple(name for name, share in zip(SHARED_NAMES, shares, strict=True) if share > 0.5)
+        return np.zeros(len(SHARED_NAMES))
+    return np.asarray(solution.observations.known * np.diag(determined[0])[: len(SHARED_NAMES)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -481,6 +481,11 @@ def stereo_covariance(
     return StereoCovariance(0.5 * (matrix + matrix.T), condition, error)
 
 
+def independent_share(solution: JointSolution) -> float:
+    """What part of the residuals' variance is of the images, not of the target's points."""
+    return estimate_target_error(_board_residuals(solution)).independent_share
+
+
 def _board_residuals(solution: JointSolution) -> BoardResiduals | None:
     """Kept points of both cameras; left and right see a point of one board in two views."""
     state, observations = solution.state, solution.observations

@@ -121,16 +121,20 @@ class Solution:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Coordinates used, and what is known beforehand, minus unknowns."""
+        """Coordinates used minus unknowns."""
         n_views = len(self.state.rotations)
-        n_known = int(np.count_nonzero(self.observations.known @ self.basis**2))
         n_coordinates = 2 * int(self.weights.sum())
-        return n_coordinates + n_known - int(self.basis.shape[1]) - 6 * n_views
+        return n_coordinates - int(self.basis.shape[1]) - 6 * n_views
+
+    @property
+    def chi2(self) -> float:
+        """That of the points; what is known beforehand has its own."""
+        return self.equations.chi2 - float(self.observations.known @ self.state.shared**2)
 
     @property
     def variance_factor(self) -> float:
-        """sigma0 squared: chi2 over the degrees of freedom."""
-        return self.equations.chi2 / max(self.degrees_of_freedom, 1)
+        """sigma0 squared: chi2 of the points over the degrees of freedom."""
+        return self.chi2 / max(self.degrees_of_freedom, 1)
 
 
 def residuals_px(observations: Observations, state: State) -> FloatArray:

@@ -450,8 +450,8 @@ def test_scatter_that_few_numbers_tell_contradicts_no_sensor(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [6100122, 6100165])
 def test_hand_eyes_are_compared_by_all_that_the_stripes_show(seed: int) -> None:
-    """Hardly tilted heads; another hand-eye, 49 and 18 degrees off, is 3,300 and 1,600 times less
-    likely. By three points of each stripe it was 300 and 150 times, and both were refused.
+    """Hardly tilted heads; another hand-eye, 50 and 18 degrees off, is 3,300 and 1,380 times less
+    likely. By three points of each stripe it was 360 and 170 times, and both were refused.
     """
     assert _drawn_hand_eye(seed).result == "right"
 

@@ -68,7 +68,7 @@ LIKELIER = 6.0
 """Logarithm of the likelihood ratio from which one minimum is preferred to another: 400 to 1."""
 SURELY_LIKELIER = 20.0
 """And from which three points of each stripe are enough: they hardly tell flatness and noise of the
-stripes from the arm, by which the logarithm is up to 9 off."""
+stripes from the arm, which moved the logarithm by 0.6 to 2.2 in three cases looked into."""
 MOST_ALTERNATIVES = 4
 APART_DEG = 1.0
 ALIKE_DEG, SMALL_DEG = 3.0, 8.0
@@ -282,13 +282,14 @@ def likeliest_start(problem: Problem, start: Start, cause: str) -> Start | FitFa
         return start
     kept = problem.without(start.is_wrong).observations
     poses = (start.tool_from_sensor, *start.alternatives[:MOST_ALTERNATIVES])
-    found = _by_likelihood(replace(problem, observations=thinned(kept)), poses)
+    few, whole = thinned(kept), evenly_spread(kept)
+    found = _by_likelihood(replace(problem, observations=few), poses)
     if not found:
         return start
     close = [one.end for one in found if found[0].likelihood - one.likelihood < SURELY_LIKELIER]
-    if len(close) > 1:
-        whole = replace(problem, observations=evenly_spread(kept))
-        found = _by_likelihood(whole, close, is_all_asked=True) or found
+    if len(close) > 1 and len(whole.stripe) > len(few.stripe):
+        asked = replace(problem, observations=whole)
+        found = _by_likelihood(asked, close, is_all_asked=True) or found
     best = found[0]
     if len(found) > 1 and best.likelihood - found[1].likelihood < LIKELIER:
         other = found[1].end

@@ -625,8 +625,8 @@ def measurement_warnings(
     if share > OPEN_SHARE:
         warnings.append(
             f"{n_open} points, {100.0 * share:.0f} % of what the stripes showed, were left out: "
-            "more than one light sheet may have drawn them; light fewer lasers at once, each alone "
-            "now and then, or use two cameras"
+            "more than one light sheet may have drawn them; light fewer lasers at once"
+            f"{'' if sensor.second else ', or one at a time, or use two cameras'}"
         )
     if not sensor.has_camera_covariance:
         warnings.append(without_covariance("the points' sigmas"))

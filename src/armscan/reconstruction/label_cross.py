@@ -442,19 +442,14 @@ def in_order_beside(
     sheets: tuple[int, ...],
     named: IntArray,
     sensor: SensorCalibration,
-    *,
-    absent: set[int],
 ) -> BoolArray:
-    """(S,) True where as many stripes lie side by side as sheets are not ``absent``, and no name is
-    out of order.
-    """
+    """(S,) True where as many stripes as sheets lie side by side, and no name is out of order."""
     along = np.array([frontal_direction(sensor, k) for k in sheets])
     along *= np.sign(along @ along[0])[:, None]
     u = along.sum(axis=0) / np.linalg.norm(along.sum(axis=0))
     order = _order_beside(u, sheets, sensor)
-    if order is None or absent.issuperset(sheets):
+    if order is None:
         return np.zeros(len(samples_px), dtype=np.bool_)
-    order = order[[sheets[h] not in absent for h in order]]
     segment = pieces.segment[pieces.of_sample]
     row = np.unique(np.floor(samples_px @ u / ROW_PX), return_inverse=True)[1]
     shape = (int(segment.max(initial=0)) + 1, int(row.max(initial=0)) + 1)
@@ -651,9 +646,7 @@ class CrossLabeller:
         is_free &= [k not in self._lone.absent for k in hypotheses.sheets]
         others = np.arange(len(hypotheses.sheets)) != named[:, None]
         is_open = np.asarray((is_inside & is_free & others).any(axis=1))
-        in_order = in_order_beside(
-            samples_px, pieces, hypotheses.sheets, named, self._sensor, absent=self._lone.absent
-        )
+        in_order = in_order_beside(samples_px, pieces, hypotheses.sheets, named, self._sensor)
         is_open &= pieces.mean(in_order.astype(np.float64)) < 1.0
         if pose is not None:
             name = named[pieces.of_sample]

@@ -367,7 +367,8 @@ class LoneLines:
     Attributes
     ----------
     shown, absent
-        Sheets whose line was seen when it was on alone, and those whose line was not, nor since.
+        Sheets whose line was seen when it was on alone, and those whose line was not, nor since:
+        one that was seen once may come back at any time.
     """
 
     def __init__(self, source_of: tuple[str, ...]) -> None:
@@ -403,6 +404,7 @@ class LoneLines:
             self._asked -= self.absent
             self.absent.clear()
         (self.shown if is_seen else self.absent).update(possible)
+        self.absent -= self.shown
         self._asked.update(possible)
         if not self.due and not self.shown:
             self._asked.clear()

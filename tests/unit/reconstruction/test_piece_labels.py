@@ -170,12 +170,10 @@ def test_many_lines_are_not_named_one_further_where_a_block_is_as_high(is_asked:
     assert n_named > 0.8 * n_points
 
 
-@pytest.mark.parametrize(("unseen", "in_air"), [(4, 0), (2, 0), (-1, 7)])
-def test_a_line_that_misses_the_part_takes_no_names_from_the_others(
-    unseen: int, in_air: int
-) -> None:
-    """It was held to be hidden: half of the exposures lit one laser, the others gave next to no
-    point. In the air no line shows anything, and that tells of none.
+@pytest.mark.parametrize(("unseen", "in_air", "named"), [(4, 0, 0.45), (2, 0, 0.35), (-1, 7, 0.9)])
+def test_a_line_that_misses_the_part_may_be_any(unseen: int, in_air: int, named: float) -> None:
+    """It may come into view at any time, where another goes: what single lasers do not show is
+    left out. In the air no line shows anything, and that tells of none.
     """
     head = five_lines()
     labeller = CrossLabeller(head)
@@ -193,8 +191,17 @@ def test_a_line_that_misses_the_part_takes_no_names_from_the_others(
         40,
     )
     assert n_wrong == 0
-    assert n_named > 0.9 * n_points
-    assert sum(len(on) == 1 for on in asked[in_air:]) < 15
+    assert n_named > named * n_points
+    assert sum(len(on) == 1 for on in asked[in_air:]) < (30 if unseen >= 0 else 10)
+
+
+def test_a_line_that_was_seen_once_is_never_held_to_be_absent() -> None:
+    """A laser that is asked for while its line lies in a gap comes back, and took other names."""
+    lone = LoneLines(("a", "b"))
+    for k in (0, 1):
+        lone.learn((k,), np.full(50, k))
+    lone.learn((0,), np.full(50, -1))
+    assert (lone.shown, lone.absent) == ({0, 1}, set())
 
 
 def test_exposures_seconds_apart_light_every_laser_in_its_turn() -> None:

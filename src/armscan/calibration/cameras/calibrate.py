@@ -24,6 +24,7 @@ from armscan.calibration.cameras.distortion import (
     choose_lens,
     coefficients_left_at_zero,
     contradicted_size,
+    cost_of_usual,
     cross_validate,
     design_effect,
     known_of_usual_lenses,
@@ -563,18 +564,24 @@ def _beside_usual_sizes(
         first = _solve(used, observations, prepared, "k1", options)
     if isinstance(first, FitFailure):
         return first
-    bow = with_significant_bow(first, options.max_steps, is_wanted=options.solve_warp)
-    flat = first if isinstance(bow, FitFailure) else bow[0]
-    level = level_of_points(flat)
-    known = known_of_usual_lenses(flat, level)
+    free = _with_its_bow(first, options)
+    level = level_of_points(free)
+    known = known_of_usual_lenses(free, level)
     while True:
         solution = _solve(used, replace(observations, known=known), prepared, _ALL, options)
         if isinstance(solution, FitFailure):
             return solution
-        row = contradicted_size(solution)
+        beside = _with_its_bow(solution, options)
+        row = contradicted_size(beside, level)
         if row is None:
-            return first if solution.chi2 - first.chi2 > MOST_COST * level else solution
+            return first if cost_of_usual(beside, free) > MOST_COST * level else solution
         known = np.where(np.arange(len(known)) == row, 0.0, known)
+
+
+def _with_its_bow(solution: Solution, options: CameraOptions) -> Solution:
+    """On a board that is bowed where that is significant: a bow passes for tangential terms."""
+    bow = with_significant_bow(solution, options.max_steps, is_wanted=options.solve_warp)
+    return solution if isinstance(bow, FitFailure) else bow[0]
 
 
 def _reason_of_sizes(solution: Solution) -> str:

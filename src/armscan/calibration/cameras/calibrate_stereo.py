@@ -188,7 +188,7 @@ def prior_of(given: tuple[CameraCalibration, CameraCalibration]) -> Prior:
 
 def usual_prior(cameras: Cameras) -> Prior:
     """Coefficients of usual lenses, of the size that `typical_coefficients` tells, but those that
-    a camera's own views contradicted.
+    a camera by itself has far larger.
     """
     information = np.zeros((2, len(PARAMETER_NAMES)))
     for side, single in enumerate(cameras):

@@ -34,6 +34,8 @@ from armscan.calibration.cameras.result import (
 from armscan.calibration.cameras.robust import (
     Solution,
     board_residuals,
+    chi2_of_points,
+    covariance_with_target_error,
     estimate_target_error,
     residuals_px,
 )
@@ -346,22 +348,42 @@ def resting_on_usual(solution: Solution) -> tuple[str, ...]:
     return tuple(name for name, share in zip(SHARED_NAMES, shares, strict=True) if share > 0.5)
 
 
-def contradicted_size(solution: Solution) -> int | None:
+def contradicted_size(solution: Solution, level: float) -> int | None:
     """Row of the coefficient whose usual size s the views contradict most; None if they do none.
 
-    Solved beside s it is m, of which s is the share w. By the views alone it would be
-    m / (1 - w), known to the variance s^2 (1 - w) / w: together they are a normal variable of
-    variance s^2 / w, which it exceeds by m / s / sqrt(1 - w) of its deviations.
+    ``level`` is that of the points by which the sizes were weighed (`known_of_usual_lenses`).
+
+    Solved beside s it is m, of which s is the share w. By the views alone it would be m / (1 - w),
+    known to the variance s^2 w / (1 - w). Of a usual lens m is a normal variable of the variance
+    s^2 (1 - w), and what misprints add to that.
     """
-    n_camera = len(PARAMETER_NAMES)
-    shared = solution.state.shared[:n_camera]
-    shares = _shares_of_usual(solution)[4:n_camera]
-    usual = typical_coefficients(solution.observations.camera(shared), PARAMETER_NAMES[4:])
-    is_beside = (shares > 0.0) & (shares < MOST_SHARE)
-    excess = np.where(is_beside, np.abs(shared[4:]) / usual, 0.0) / np.sqrt(
-        1.0 - np.minimum(shares, MOST_SHARE)
-    )
-    return 4 + int(excess.argmax()) if excess.max() > BEYOND_USUAL else None
+    determined = joint_covariance(solution.equations, solution.basis)
+    if isinstance(determined, FitFailure):
+        return None
+    n, unit, known = len(SHARED_NAMES), determined[0], solution.observations.known
+    found = board_residuals(solution)
+    error = estimate_target_error(found)
+    whole = covariance_with_target_error(unit, level / error.independent_share, error, found)
+    shares = known * np.diag(unit)[:n]
+    added = np.maximum(np.diag(whole)[:n] - level * np.diag(unit)[:n], 0.0)
+    is_told = (known > 0.0) & (shares < MOST_SHARE)
+    variance = np.where(is_told, level / np.where(is_told, known, 1.0) * (1.0 - shares), 1.0)
+    excess = np.where(is_told, np.abs(solution.state.shared), 0.0) / np.sqrt(variance + added)
+    return int(excess.argmax()) if excess.max() > BEYOND_USUAL else None
+
+
+def cost_of_usual(beside: Solution, free: Solution) -> float:
+    """By how much chi2 is larger beside usual sizes than free, of the points that both kept, at the
+    weights of the free solution: each solution sets points aside and levels weights for itself.
+    What the target's points miss in all views, misprints, is no cost.
+    """
+    kept = (beside.weights > 0.0) & (free.weights > 0.0)
+    chi2 = []
+    for one in (beside, free):
+        points_px = _without_target_error(one).points_px
+        seen = replace(free.observations, points_px=points_px)
+        chi2.append(float(chi2_of_points(seen, one.state)[kept].sum()))
+    return chi2[0] - chi2[1]
 
 
 def _shares_of_usual(solution: Solution) -> FloatArray:

@@ -200,8 +200,10 @@ def test_views_of_one_place_are_told_in_one_sentence() -> None:
     assert told[0].startswith("5 views")
 
 
-def test_a_lens_seen_in_its_middle_folds_over_seldom_and_says_so() -> None:
-    """Strong barrel distortion. With k1 alone, as the views ask for, seven of eight fold over."""
+def test_a_lens_seen_in_its_middle_that_folds_over_says_so() -> None:
+    """Strong barrel distortion. With k1 alone, as the views ask for, seven of eight fold over;
+    beside usual sizes four do.
+    """
     lens = plain_camera(520.0, (319.5, 239.5), (640, 480), [-0.3, 0.11, 0, 0, 0])
     scene = Scene(camera=lens, n_views=8, noise_px=0.2, distance_mm=450.0, reach=0.1)
     folded = 0

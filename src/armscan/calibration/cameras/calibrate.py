@@ -574,7 +574,8 @@ def _beside_usual_sizes(
         beside = _with_its_bow(solution, options)
         row = contradicted_size(beside, level)
         if row is None:
-            return first if cost_of_usual(beside, free) > MOST_COST * level else solution
+            is_dear = cost_of_usual(beside, free) > MOST_COST * level
+            return first if is_dear and first.basis.shape == solution.basis.shape else solution
         known = np.where(np.arange(len(known)) == row, 0.0, known)
 
 
@@ -587,7 +588,8 @@ def _with_its_bow(solution: Solution, options: CameraOptions) -> Solution:
 def _reason_of_sizes(solution: Solution) -> str:
     resting = resting_on_usual(solution)
     told = [name for name in DISTORTION_PARAMETERS[_ALL] if name not in resting]
-    rest = f"{' '.join(resting)} rest more on what is usual of lenses" if resting else ""
+    verb = "rests" if len(resting) == 1 else "rest"
+    rest = f"{' '.join(resting)} {verb} more on what is usual of lenses" if resting else ""
     return "all five coefficients: " + f"the views tell {' '.join(told)}; {rest}".rstrip("; ")
 
 

@@ -13,18 +13,22 @@ Columns: *ours* is detection, calibration with default options, pose; *OpenCV* i
 (chessboard corners refined by cornerSubPix, or findCirclesGrid), calibrateCamera with its default
 model (k1 k2 p1 p2 k3), solvePnP; *OpenCV, our points* is its calibrateCamera and solvePnP on the
 points of our detector. *bowed* judges ours and OpenCV on boards bowed as our calibration of the
-other folds finds them, in place of flat ones; OpenCV's cameras are the same.
+other folds finds them, in place of flat ones, and *printed* on such boards with their points where
+that calibration finds them printed; OpenCV's cameras are the same. *released* is OpenCV's
+calibrateCameraRO, which finds the places (x, y and z) by itself, from the other folds, too: on the
+points of its own detector and of ours, views that show all points only.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from armscan.calibration.cameras.result import CameraFit
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
@@ -88,15 +92,32 @@ def folds_of(n_views: int) -> list[tuple[list[int], list[int]]]:
 class Ours:
     flat_px: float
     bowed_px: float
+    printed_px: float
     models: str
     bows_mm: list[FloatArray]
     """(2,) a fold: zero where no bow shows."""
+    missed_mm: list[FloatArray]
+    """(P, 2) a fold: zero where no print error shows."""
 
 
-def our_holdout(views: list[TargetView]) -> Ours:
+def missed_of(fit: CameraFit, n_points: int) -> FloatArray:
+    missed = np.zeros((n_points, 2))
+    for view in fit.used_views:
+        missed[view.view.point_index] = view.missed_mm
+    return missed
+
+
+def as_printed(view: TargetView, missed_mm: FloatArray) -> TargetView:
+    places = view.points_board_mm.copy()
+    places[:, :2] += missed_mm[view.point_index]
+    return replace(view, points_board_mm=places)
+
+
+def our_holdout(views: list[TargetView], n_points: int) -> Ours:
     flat: list[FloatArray] = []
     bowed: list[FloatArray] = []
-    models, bows = [], []
+    printed: list[FloatArray] = []
+    models, bows, missed = [], [], []
     for train, test in folds_of(len(views)):
         run = calibrate_camera_from_views([views[i] for i in train])
         if not isinstance(run, CameraRun):
@@ -105,14 +126,21 @@ def our_holdout(views: list[TargetView]) -> Ours:
         models.append("".join(n for n in fit.free_parameters if n[0] in "kp"))
         shows = warp is not None and warp.is_significant
         bows.append(warp.bow_mm if warp is not None and shows else np.zeros(2))
+        missed.append(missed_of(fit, n_points))
         for i in test:
             view = correct_centres(views[i], fit.camera) if views[i].edges else views[i]
-            for residuals, bow in ((flat, np.zeros(2)), (bowed, bows[-1])):
-                pose = estimate_board_pose(view, fit.camera, bow_mm=bow, allow_ambiguous=True)
+            found = as_printed(view, missed[-1])
+            for residuals, seen, bow in (
+                (flat, view, np.zeros(2)),
+                (bowed, view, bows[-1]),
+                (printed, found, bows[-1]),
+            ):
+                pose = estimate_board_pose(seen, fit.camera, bow_mm=bow, allow_ambiguous=True)
                 if not isinstance(pose, Estimate):
                     raise SystemExit(pose.reason)
                 residuals.append(pose.residuals)
-    return Ours(rms(flat), rms(bowed), " ".join(sorted(set(models))), bows)
+    told = " ".join(sorted(set(models)))
+    return Ours(rms(flat), rms(bowed), rms(printed), told, bows, missed)
 
 
 def bent(board: FloatArray, bow_mm: FloatArray) -> FloatArray:
@@ -126,7 +154,9 @@ def opencv_holdout(
     objects: list[FloatArray],
     images: list[FloatArray],
     size: tuple[int, int],
-    bows_mm: list[FloatArray] | None = None,
+    ours: Ours | None = None,
+    *,
+    is_printed: bool = False,
 ) -> float:
     residuals = []
     for fold, (train, test) in enumerate(folds_of(len(images))):
@@ -138,11 +168,39 @@ def opencv_holdout(
             np.zeros(5),
         )
         for i in test:
-            board = objects[i] if bows_mm is None else bent(objects[i], bows_mm[fold])
-            _, turn, shift = cv2.solvePnP(board, images[i], matrix, distortion)
-            turn, shift = cv2.solvePnPRefineLM(board, images[i], matrix, distortion, turn, shift)
-            predicted = cv2.projectPoints(board, turn, shift, matrix, distortion)[0]
-            residuals.append(images[i] - predicted.reshape(-1, 2))
+            board = objects[i] if ours is None else bent(objects[i], ours.bows_mm[fold])
+            if ours is not None and is_printed:
+                board = board + np.pad(ours.missed_mm[fold], ((0, 0), (0, 1)))
+            residuals.append(posed(board, images[i], matrix, distortion))
+    return rms(residuals)
+
+
+def posed(
+    board: FloatArray, image: FloatArray, matrix: FloatArray, distortion: FloatArray
+) -> FloatArray:
+    """Residuals of a view of which the pose alone is solved."""
+    _, turn, shift = cv2.solvePnP(board, image, matrix, distortion)
+    turn, shift = cv2.solvePnPRefineLM(board, image, matrix, distortion, turn, shift)
+    predicted = cv2.projectPoints(board, turn, shift, matrix, distortion)[0]
+    return image - predicted.reshape(-1, 2)
+
+
+def released_holdout(
+    board: FloatArray, images: list[FloatArray], size: tuple[int, int], columns: int
+) -> float:
+    """OpenCV's calibration that releases the places of the target's points."""
+    residuals = []
+    for train, test in folds_of(len(images)):
+        _, matrix, distortion, _, _, found = cv2.calibrateCameraRO(
+            [board.astype(np.float32)] * len(train),
+            [images[i].astype(np.float32) for i in train],
+            size,
+            columns - 1,
+            np.eye(3),
+            np.zeros(5),
+        )
+        places = found.reshape(-1, 3).astype(np.float64)
+        residuals += [posed(places, images[i], matrix, distortion) for i in test]
     return rms(residuals)
 
 
@@ -155,19 +213,25 @@ def compare(name: str, photos: PhotoSet) -> str:
             views.append(view)
             theirs.append(points)
     size = (views[0].width_px, views[0].height_px)
-    ours = our_holdout(views)
     board = photos.target.points_board_mm
+    ours = our_holdout(views, len(board))
     full = opencv_holdout([board] * len(theirs), theirs, size)
-    bowed = opencv_holdout([board] * len(theirs), theirs, size, ours.bows_mm)
+    bowed = opencv_holdout([board] * len(theirs), theirs, size, ours)
+    printed = opencv_holdout([board] * len(theirs), theirs, size, ours, is_printed=True)
     final = calibrate_camera_from_views(views)
     shown = [view.view for view in final.fit.views] if isinstance(final, CameraRun) else views
     mixed = opencv_holdout(
         [view.points_board_mm for view in shown], [view.points_px for view in shown], size
     )
+    whole = [view.points_px for view in shown if len(view) == len(board)]
+    released = [
+        released_holdout(board, points, size, photos.target.columns) for points in (theirs, whole)
+    ]
     return (
         f"{name:24s} {len(views):5d} {ours.flat_px:9.4f} {full:9.4f} {ours.flat_px / full:7.3f} "
         f"{mixed:10.4f} {ours.flat_px / mixed:7.3f} {ours.bowed_px:9.4f} {bowed:9.4f} "
-        f"{ours.bowed_px / bowed:7.3f}  {ours.models}"
+        f"{ours.bowed_px / bowed:7.3f} {ours.printed_px:9.4f} {printed:9.4f} "
+        f"{ours.printed_px / printed:7.3f} {released[0]:9.4f} {released[1]:9.4f}  {ours.models}"
     )
 
 
@@ -176,7 +240,8 @@ def main() -> None:
     print(__doc__.split("\n")[0])
     print(
         f"{'set':24s} {'views':>5s} {'ours':>9s} {'OpenCV':>9s} {'ratio':>7s} {'our points':>10s} "
-        f"{'ratio':>7s} {'bowed':>9s} {'OpenCV':>9s} {'ratio':>7s}  model chosen (per fold)"
+        f"{'ratio':>7s} {'bowed':>9s} {'OpenCV':>9s} {'ratio':>7s} {'printed':>9s} {'OpenCV':>9s} "
+        f"{'ratio':>7s} {'released':>9s} {'our pts':>9s}  model chosen (per fold)"
     )
     for name, photos in SETS.items():
         print(compare(name, photos), flush=True)

@@ -16,14 +16,15 @@ import numpy as np
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
 from armscan.calibration.cameras.pairs import MIN_PAIRS, SIDES, StereoOptions, StereoPair
+from armscan.calibration.cameras.print_errors import agreeing_numberings, missed_places_mm
 from armscan.calibration.cameras.result import (
     MIN_VIEWS,
     BoardWarp,
     CameraFit,
     CameraOptions,
+    ViewFit,
 )
-from armscan.calibration.cameras.robust import agreeing_numberings, missed_places_mm
-from armscan.calibration.cameras.stereo_result import SideFit, StereoFit
+from armscan.calibration.cameras.stereo_result import SideFit, StereoFit, ViewResiduals
 from armscan.errors import InputError, begun
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -199,7 +200,7 @@ def _with_settled_centres(
 def numbered_alike(views: Sequence[TargetView], fit: CameraFit, target: Target | None) -> CameraFit:
     """The camera of the same views, numbered alike if the target looks alike when turned.
 
-    See `armscan.calibration.cameras.robust.agreeing_numberings`.
+    See `armscan.calibration.cameras.print_errors.agreeing_numberings`.
     """
     alike = _views_numbered_alike(views, fit, target)
     if alike is views:
@@ -215,7 +216,7 @@ def _views_numbered_alike(
     if target is None or not target.symmetric_turns:
         return views
     seen = [
-        _Seen(fit.camera, view.view, view.sensor_from_board, view.residuals_px, view.is_outlier)
+        _seen(fit.camera, view.view, view.sensor_from_board, view)
         for view in fit.used_views
         if not view.is_misfit
     ]
@@ -228,20 +229,30 @@ def _views_numbered_alike(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """A view with its camera, and its pose, residuals and outliers before that camera."""
+    """A view with its camera, and its pose, residuals and outliers before that camera, and what
+    the print was found to miss.
+    """
 
     camera: CameraModel
     view: TargetView
     pose: Pose[Any, Board]
     residuals_px: FloatArray
+    missed_mm: FloatArray
     is_outlier: BoolArray
+
+
+def _seen(
+    camera: CameraModel, view: TargetView, pose: Pose[Any, Board], fit: ViewFit | ViewResiduals
+) -> _Seen:
+    return _Seen(camera, view, pose, fit.residuals_px, fit.missed_mm, fit.is_outlier)
 
 
 def _numbering_of(seen: Sequence[_Seen], known: Sequence[Numbering]) -> dict[str, Numbering]:
     """Numbering of each view, by source, in which all agree; empty if none changes."""
     places = [one.view.points_board_mm[~one.is_outlier] for one in seen]
     missed = [
-        missed_places_mm(one.camera, one.pose, board_mm, one.residuals_px[~one.is_outlier])
+        one.missed_mm[~one.is_outlier]
+        + missed_places_mm(one.camera, one.pose, board_mm, one.residuals_px[~one.is_outlier])
         for board_mm, one in zip(places, seen, strict=True)
     ]
     chosen = agreeing_numberings(places, missed, known)
@@ -463,12 +474,10 @@ def _pairs_numbered_alike(
             continue
         if pair.left is not None and left is not None:
             where = left.sensor_from_board
-            seen.append(_Seen(fit.views.left, pair.left, where, left.residuals_px, left.is_outlier))
+            seen.append(_seen(fit.views.left, pair.left, where, left))
         elif pair.right is not None and right is not None:
             before = fit.views.right_from_left @ right.sensor_from_board
-            seen.append(
-                _Seen(fit.views.right, pair.right, before, right.residuals_px, right.is_outlier)
-            )
+            seen.append(_seen(fit.views.right, pair.right, before, right))
     turn = _numbering_of(seen, numberings(target))
     if not turn:
         return None

@@ -103,6 +103,7 @@ def camera_quantities(fit: CameraFit, n_images: int) -> tuple[Quantity, ...]:
         *lens_quantities(fit.camera.lens),
         *parameter_quantities(fit),
         *(bow_quantities(fit.warp.bow_mm) if fit.warp is not None else ()),
+        *print_quantities(fit.target_error_mm),
     )
 
 
@@ -132,6 +133,15 @@ def bow_quantities(bow_mm: Sequence[float] | FloatArray) -> tuple[Quantity, ...]
     shown = f"{x} along x, {y} along y"
     value, words = [float(each) for each in bow_mm], "solved along"
     return (Quantity("board.bow_mm", "Bow of the board", value, shown=shown, meaning=words),)
+
+
+def print_quantities(error_mm: float) -> tuple[Quantity, ...]:
+    """What the target's points miss their places by; nothing where the views show none."""
+    if error_mm == 0.0:
+        return ()
+    shown = f"{significant(error_mm, 'mm')} rms an axis"
+    words = "where each point is printed is solved along"
+    return (Quantity("board.print_error_mm", "Misprints", error_mm, shown=shown, meaning=words),)
 
 
 def meaning_of(name: str, lens: Lens) -> str:
@@ -177,7 +187,7 @@ def camera_page(
     words = (
         f"{sentence(fit.model_reason)} Pixel (0, 0) is the centre of the top-left pixel. "
         + noise_text(f"{fit.noise_scale:.2g} times")
-        + target_text(fit.target_error_mm, "views")
+        + target_text(fit.target_error_mm)
     )
     table = quantity_table(PARAMETER_HEADS, parameter_quantities(fit))
     charts = (_camera_residuals(fit), _residual_histogram(fit))
@@ -254,14 +264,15 @@ def noise_text(times: str) -> str:
     )
 
 
-def target_text(target_error_mm: float, what: str) -> str:
-    """How far target points miss their places, which more of ``what`` do not average."""
+def target_text(target_error_mm: float) -> str:
+    """How far target points miss their places, and what is done about it."""
     if target_error_mm == 0.0:
         return ""
     return (
-        " Residuals of a target point repeat from view to view: the points miss their places by "
-        f"{significant(target_error_mm)} mm (one standard deviation an axis). More {what} do "
-        "not average that; the standard deviations hold it."
+        " Residuals of a target point repeat from view to view: the points are printed beside "
+        f"their places by {significant(target_error_mm)} mm (rms an axis). "
+        "Where each lies is solved along, so that the residuals and what is solved do not follow "
+        "the print; how well that is known is in the standard deviations."
     )
 
 

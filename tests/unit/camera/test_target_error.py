@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.print_errors import agreeing_numberings
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
-from armscan.calibration.cameras.robust import agreeing_numberings
 from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_views
 from armscan.vision.targets.detect import numberings, renumbered
 from armscan.vision.targets.target import CircleGrid, TargetView

@@ -18,7 +18,7 @@ from armscan.calibration.cameras.result import (
     DistortionModel,
 )
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import Minimum, minimise
 from armscan.geometry.poses import Board, Pose, Sensor
@@ -43,7 +43,13 @@ class Observations:
     whitening
         (N, 2, 2) matrices L with ``L' L`` the inverse of each point's covariance.
     board_mm
-        (N, 3) points of the flat board.
+        (N, 3) points of the flat board, where they should be.
+    target_mm
+        (P, 2) places of the target's points on the flat board.
+    point
+        (N,) number of the target's point: equal places are one point.
+    missed_mm
+        (N, 2) what the print misses these places by, along the board's axes, as far as solved.
     board_warp_shape
         (N, 2) height of the board per unit of the two bow parameters.
     starts
@@ -56,6 +62,9 @@ class Observations:
     points_px: FloatArray
     whitening: FloatArray
     board_mm: FloatArray
+    target_mm: FloatArray
+    point: IntArray
+    missed_mm: FloatArray
     board_warp_shape: FloatArray
     starts: tuple[int, ...]
     width_px: int
@@ -66,6 +75,13 @@ class Observations:
     def camera(self, parameters: FloatArray) -> CameraModel:
         """The camera of (9,) parameters."""
         return CameraModel.from_parameters(parameters, self.width_px, self.height_px, self.lens)
+
+    @property
+    def printed_mm(self) -> FloatArray:
+        """(N, 3) points of the flat board, where the print has them."""
+        return np.asarray(
+            np.column_stack([self.board_mm[:, :2] + self.missed_mm, self.board_mm[:, 2]])
+        )
 
     @property
     def n_views(self) -> int:
@@ -138,12 +154,24 @@ def gather(views: Sequence[TargetView], lens: Lens) -> Observations:
         np.concatenate([view.points_px for view in views]),
         np.asarray(whitening, dtype=np.float64),
         board,
+        *target_points(board),
+        np.zeros((len(board), 2)),
         board_warp_shape(board),
         tuple(int(n) for n in np.cumsum([0] + [len(view) for view in views])),
         views[0].width_px,
         views[0].height_px,
         lens,
     )
+
+
+SAME_POINT_MM = 1e-6
+
+
+def target_points(board_mm: FloatArray) -> tuple[FloatArray, IntArray]:
+    """The P places (P, 2) among (N, 3), and which of them each is (N,)."""
+    rounded = np.rint(board_mm[:, :2] / SAME_POINT_MM).astype(np.int64)
+    _, first, number = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    return board_mm[first, :2], number.reshape(-1).astype(np.int64)
 
 
 def board_warp_shape(board_mm: FloatArray) -> FloatArray:
@@ -236,7 +264,7 @@ def _placed(observations: Observations, state: State) -> tuple[FloatArray, Float
     """Target points (N, 3) turned into Sensor, and in their places there; None as of `predict`."""
     if not np.isfinite(state.shared).all() or min(state.shared[:2]) <= 0.0:
         return None
-    board = observations.board_mm.copy()
+    board = observations.printed_mm
     board[:, 2] += observations.board_warp_shape @ state.shared[9:]
     turned = np.concatenate(
         [board[observations.rows(v)] @ state.rotations[v].T for v in range(observations.n_views)]
@@ -261,7 +289,7 @@ def linearise(
     is_possible = sum_views(
         observations.points_px,
         observations.whitening.reshape(-1, 4),
-        observations.board_mm,
+        observations.printed_mm,
         observations.board_warp_shape,
         np.array(observations.starts),
         np.concatenate([state.rotations.reshape(n, 9), state.translations_mm], axis=1),

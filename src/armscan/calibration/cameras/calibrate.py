@@ -16,7 +16,6 @@ from armscan.calibration.cameras.adjustment import (
     State,
     free_basis,
     gather,
-    joint_covariance,
 )
 from armscan.calibration.cameras.distortion import (
     MOST_COST,
@@ -26,13 +25,13 @@ from armscan.calibration.cameras.distortion import (
     contradicted_size,
     cost_of_usual,
     cross_validate,
-    design_effect,
     known_of_usual_lenses,
     level_of_points,
     print_stretch,
     resting_on_usual,
     rms,
     sigma_of_axis,
+    widening_of,
 )
 from armscan.calibration.cameras.result import (
     DISTORTION_PARAMETERS,
@@ -49,23 +48,20 @@ from armscan.calibration.cameras.result import (
     rms_reasons,
 )
 from armscan.calibration.cameras.robust import (
+    EXCESS_ROUNDS,
     MISFIT_LEVEL,
     MISFIT_OUTLIERS,
     SUSPECT_LEVEL,
     WRONG_LEVEL,
-    BoardResiduals,
     Solution,
     better_fit,
-    board_residuals,
     board_warp,
     chi2_of_points,
-    claimed_covariances,
-    covariance_with_target_error,
-    estimate_target_error,
-    excess_variance_px2,
+    covariance_of_all,
+    levelled,
     residuals_px,
     solve_robustly,
-    with_excess,
+    with_print_errors,
     with_significant_bow,
 )
 from armscan.calibration.cameras.start import (
@@ -211,22 +207,16 @@ def assemble(
         sources = tuple(view.source for view in used)
         validation = cross_validate(solution, sources, options.n_folds)
     observations = solution.observations
-    determined = joint_covariance(solution.equations, solution.basis)
-    if isinstance(determined, FitFailure):
-        return determined
-    unit, condition = determined
-    found = board_residuals(solution)
-    target_error = estimate_target_error(found)
-    design = design_effect(solution)
+    widening = widening_of(solution)
     # with fy held to fx, pixels that are not square would pass for the print's stretch
     is_told = not options.is_aspect_fixed
     stretch = print_stretch(solution, options.max_steps) if is_told else (0.0, np.inf)
-    sigma0_squared = solution.variance_factor * design.widening
-    covariance = _stated_covariance(unit, solution, chosen.untested, sigma0_squared, found)
-    if isinstance(covariance, FitFailure):
-        return covariance
+    stated = _stated_covariance(solution, chosen.untested, widening)
+    if isinstance(stated, FitFailure):
+        return stated
+    covariance, condition = stated
     # a bent or stretched target is told by its residuals, not by the sigma that they widen
-    refusal = _focal_refusal(solution, covariance / design.widening)
+    refusal = _focal_refusal(solution, covariance / widening)
     if refusal is not None:
         return refusal
     warp = None if bow_test is None else board_warp(solution, bow_test, covariance)
@@ -253,14 +243,14 @@ def assemble(
         rms_px=rms(misses_px),
         sigma_point_px=sigma_of_axis(misses_px, solution.degrees_of_freedom),
         noise_scale=_noise_scale(used, solution),
-        target_error_mm=target_error.sigma_mm,
+        target_error_mm=solution.print_error.rms_mm(observations.target_mm),
         degrees_of_freedom=solution.degrees_of_freedom,
         condition=condition,
         coverage=coverage,
         cross_validation=validation,
         warp=warp,
         model_reason=chosen.reason,
-        design_effect=design.widening,
+        design_effect=widening,
         stretch=stretch[0],
         stretch_sigma=stretch[1],
         warnings=(),
@@ -272,28 +262,25 @@ def assemble(
 
 
 def _stated_covariance(
-    unit: FloatArray,
-    solution: Solution,
-    untested: tuple[str, ...],
-    sigma0_squared: float,
-    found: BoardResiduals | None,
-) -> FloatArray | FitFailure:
-    """Joint covariance with what the target's points miss and what was left at zero may be."""
-    target_error = estimate_target_error(found)
+    solution: Solution, untested: tuple[str, ...], widening: float
+) -> tuple[FloatArray, float] | FitFailure:
+    """Joint covariance with what was left at zero may be, and its condition."""
+    determined = covariance_of_all(solution, widening)
+    if isinstance(determined, FitFailure):
+        return determined
+    unit, condition = determined
     shift = np.zeros(len(unit))
     if untested:
-        level = target_error.independent_share * sigma0_squared
-        left = coefficients_left_at_zero(solution, untested, level)
+        left = coefficients_left_at_zero(solution, untested, widening)
         if isinstance(left, FitFailure):
             return left
         unit, shift = left.unit_covariance, left.shift
-    covariance = covariance_with_target_error(unit, sigma0_squared, target_error, found)
-    covariance = covariance + np.outer(shift, shift)
+    covariance = solution.variance_factor * unit + np.outer(shift, shift)
     if solution.observations.lens == "fisheye":
         # what its decentring may be widens the others; it has no such parameters itself
         absent = [PARAMETER_NAMES.index(name) for name in TANGENTIAL]
         covariance[absent] = covariance[:, absent] = 0.0
-    return covariance
+    return covariance, condition
 
 
 def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | None:
@@ -309,7 +296,8 @@ def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | N
 
 def _noise_scale(used: Sequence[TargetView], solution: Solution) -> float:
     kept = solution.weights > 0.0
-    claimed = gather(used, solution.observations.lens)
+    missed_mm = solution.observations.missed_mm
+    claimed = replace(gather(used, solution.observations.lens), missed_mm=missed_mm)
     chi2 = float(chi2_of_points(claimed, solution.state)[kept].sum())
     return float(np.sqrt(chi2 / max(solution.degrees_of_freedom, 1)))
 
@@ -336,6 +324,7 @@ def _view_fits(
             solution.state.pose(position),
             covariance=covariance[block, block],
             residuals=residuals[rows],
+            missed_mm=observations.missed_mm[rows],
             is_outlier=solution.weights[rows] == 0.0,
             level=float(solution.view_levels[position]),
             is_misfit=bool(is_misfit[position]),
@@ -355,6 +344,7 @@ def _view_fit(
     *,
     covariance: FloatArray,
     residuals: FloatArray,
+    missed_mm: FloatArray,
     is_outlier: BoolArray,
     level: float,
     is_misfit: bool,
@@ -370,6 +360,7 @@ def _view_fit(
         sensor_from_board=pose,
         pose_covariance=covariance,
         residuals_px=residuals,
+        missed_mm=missed_mm,
         is_outlier=is_outlier,
         chi2_per_point=level,
         tilt_deg=tilt,
@@ -399,14 +390,13 @@ def _left_out_fit(
         pose.value,
         covariance=pose.covariance,
         residuals=pose.residuals,
+        missed_mm=np.zeros((len(view), 2)),
         is_outlier=np.zeros(len(view), dtype=np.bool_),
         level=level,
         is_misfit=False,
         left_out=note,
     )
 
-
-EXCESS_ROUNDS = 2
 
 MIN_ANGLE_DEG = 5.0
 """Boards that differ in tilt by less than this are parallel: the focal length is not determined."""
@@ -428,11 +418,13 @@ def calibrate_camera(
     point weighted by its covariance (see `armscan.calibration.cameras.robust` for what is added to
     the detector's). The covariance is that of the normal equations, scaled by sigma0 squared =
     chi2 / degrees of freedom: the point covariances give the weights, the residuals the level.
+    Where the views show that the print misses its places, these are solved along (see
+    `armscan.calibration.cameras.print_errors`).
 
     A target of wrong size in mm cannot be noticed here: it scales the poses and leaves the camera
     as it is. A numbering that starts at the opposite corner of a symmetric target leaves it, too,
     but its sigmas are right only where all views are numbered alike; see
-    `armscan.calibration.cameras.robust.agreeing_numberings`.
+    `armscan.calibration.cameras.print_errors.agreeing_numberings`.
 
     Raises
     ------
@@ -613,11 +605,13 @@ def _solve(
     for _ in range(EXCESS_ROUNDS):
         if isinstance(solution, FitFailure):
             return solution
-        excess = _excess_variance_px2(observations, solution)
-        if excess <= 0.0:
+        noisier = levelled(observations, solution)
+        if noisier is observations:
             break
-        noisier = with_excess(observations, excess)
         solution = solve_robustly(noisier, solution.state, basis, trusted, options.max_steps)
+    if isinstance(solution, FitFailure):
+        return solution
+    solution = with_print_errors(observations, solution, trusted, options.max_steps, widening_of)
     if isinstance(solution, FitFailure):
         return solution
     if largest_angle_deg(solution.state.rotations[:, :, 2]) < MIN_ANGLE_DEG:
@@ -685,14 +679,3 @@ def _mirrored(solution: Solution, views: IntArray) -> State:
     for v in views:
         poses[v] = mirrored_pose(poses[v], seen.board_mm[seen.rows(v)].mean(axis=0))
     return State.from_poses(state.shared, poses)
-
-
-def _excess_variance_px2(observations: Observations, solution: Solution) -> float:
-    """Variance to add to the detector's covariances, by the rule of `calibration.camera.noise`."""
-    kept = solution.weights > 0.0
-    return excess_variance_px2(
-        residuals_px(observations, solution.state)[kept],
-        claimed_covariances(observations)[kept],
-        float(chi2_of_points(observations, solution.state)[kept].sum()),
-        solution.degrees_of_freedom,
-    )

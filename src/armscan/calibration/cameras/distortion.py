@@ -18,25 +18,28 @@ from armscan.calibration.cameras.adjustment import (
     adjust,
     basis_of,
     condition_number,
-    damped_step,
-    joint_covariance,
     linearise,
     normal_equations,
     predict,
     reduced_normal_matrix,
     with_known,
 )
+from armscan.calibration.cameras.print_errors import (
+    eliminate_print,
+    pull_of_places,
+    settle_print,
+)
 from armscan.calibration.cameras.result import (
+    MAX_STEPS,
     MIN_VIEWS,
     CrossValidation,
     DistortionModel,
 )
 from armscan.calibration.cameras.robust import (
     Solution,
-    board_residuals,
     chi2_of_points,
-    covariance_with_target_error,
-    estimate_target_error,
+    cost_of_print,
+    covariance_of_all,
     residuals_px,
 )
 from armscan.geometry.arrays import FloatArray, IntArray
@@ -67,19 +70,11 @@ def cross_validate(
     fold_of_view = np.arange(n_views) % folds
     held_out = np.zeros_like(observations.points_px)
     for fold in range(folds):
-        train, test = np.flatnonzero(fold_of_view != fold), np.flatnonzero(fold_of_view == fold)
-        part, weights = subset(observations, solution.weights, train)
-        trained = adjust(part, of_views(solution.state, train), solution.basis, weights)
-        if isinstance(trained, FitFailure):
+        is_test = fold_of_view == fold
+        residuals = _held_out(solution, np.flatnonzero(~is_test), np.flatnonzero(is_test))
+        if residuals is None:
             return None
-        part, weights = subset(observations, solution.weights, test)
-        start = of_views(solution.state, test)
-        start = State(trained.state.shared, start.rotations, start.translations_mm)
-        posed = adjust(part, start, NO_SHARED, weights)
-        if isinstance(posed, FitFailure):
-            return None
-        rows = np.isin(observations.view_of_point, test)
-        held_out[rows] = residuals_px(part, posed.state)
+        held_out[is_test[observations.view_of_point]] = residuals
     in_sample = residuals_px(observations, solution.state)
     kept = solution.weights > 0.0
     per_view = []
@@ -89,6 +84,33 @@ def cross_validate(
     return CrossValidation(
         folds, rms(held_out[kept]), rms(in_sample[kept]), sources, tuple(per_view)
     )
+
+
+def _held_out(solution: Solution, train: IntArray, test: IntArray) -> FloatArray | None:
+    """(M, 2) residuals of the views ``test``, whose poses alone are solved; the rest by ``train``.
+
+    Where the print's points lie, too, is told by the views that are not held out.
+    """
+    observations = solution.observations
+    seen, weights = subset(observations, solution.weights, train)
+    first = adjust(seen, of_views(solution.state, train), solution.basis, weights)
+    if isinstance(first, FitFailure):
+        return None
+    begun = replace(
+        solution, observations=seen, state=first.state, equations=first.system, weights=weights
+    )
+    trained = settle_print(begun, MAX_STEPS, is_held=True)
+    if isinstance(trained, FitFailure):
+        return None
+    numbers, of_test = observations.point, np.isin(observations.view_of_point, test)
+    missed_mm = np.zeros_like(observations.target_mm)
+    missed_mm[numbers[~of_test]] = trained.observations.missed_mm
+    part, weights = subset(observations, solution.weights, test)
+    part = replace(part, missed_mm=missed_mm[numbers[of_test]])
+    start = of_views(solution.state, test)
+    start = State(trained.state.shared, start.rotations, start.translations_mm)
+    posed = adjust(part, start, NO_SHARED, weights)
+    return None if isinstance(posed, FitFailure) else residuals_px(part, posed.state)
 
 
 def rms(residuals: FloatArray) -> float:
@@ -115,6 +137,8 @@ def subset(
         points_px=observations.points_px[rows],
         whitening=observations.whitening[rows],
         board_mm=observations.board_mm[rows],
+        point=observations.point[rows],
+        missed_mm=observations.missed_mm[rows],
         board_warp_shape=observations.board_warp_shape[rows],
         starts=(0, *(int(n) for n in np.cumsum(counts))),
     )
@@ -243,10 +267,10 @@ def design_effect(solution: Solution) -> DesignEffect:
     on the shared unknowns, poses eliminated, sum to zero. With R_v the information of view v and R
     their sum, independent points give
     ``E sum s_v' R^-1 s_v = sigma0^2 (F - sum tr((R^-1 R_v)^2))``; the design
-    effect (Kish; views are the clusters) is what is found over this. Errors of the
-    target's points, which are counted by themselves, are taken out before.
+    effect (Kish; views are the clusters) is what is found over this. What the print misses is
+    solved, and is in no residual.
     """
-    observations, basis = _without_target_error(solution), solution.basis
+    observations, basis = solution.observations, solution.basis
     known = observations.known
     observations = replace(observations, known=0.0 * known)
     information, pulls, chi2 = [], [], 0.0
@@ -275,18 +299,9 @@ def design_effect(solution: Solution) -> DesignEffect:
     )
 
 
-def _without_target_error(solution: Solution) -> Observations:
-    """The observations less what each point of the target misses in the mean of all views."""
-    observations, found = solution.observations, board_residuals(solution)
-    if found is None or estimate_target_error(found).sigma_mm == 0.0:
-        return observations
-    missed = np.linalg.solve(found.by_board, found.residuals_px[:, :, None])[:, :, 0]
-    point = found.point
-    total = np.stack([np.bincount(point, missed[:, k]) for k in range(2)], axis=1)
-    mean = total / np.bincount(point)[:, None]
-    points_px = observations.points_px.copy()
-    points_px[solution.weights > 0.0] -= (found.by_board @ mean[point][:, :, None])[:, :, 0]
-    return replace(observations, points_px=points_px)
+def widening_of(solution: Solution) -> float:
+    """Factor for variances by the `design_effect`."""
+    return design_effect(solution).widening
 
 
 FIRST_TERM = 0.3
@@ -326,8 +341,7 @@ def typical_coefficients(camera: CameraModel, names: tuple[str, ...]) -> FloatAr
 
 def level_of_points(solution: Solution) -> float:
     """Variance of a point of unit weight, widened where the residuals of one view are alike."""
-    error = estimate_target_error(board_residuals(solution))
-    return solution.variance_factor * design_effect(solution).widening * error.independent_share
+    return solution.variance_factor * widening_of(solution)
 
 
 def known_of_usual_lenses(solution: Solution, level: float) -> FloatArray:
@@ -355,42 +369,34 @@ def contradicted_size(solution: Solution, level: float) -> int | None:
 
     Solved beside s it is m, of which s is the share w. By the views alone it would be m / (1 - w),
     known to the variance s^2 w / (1 - w). Of a usual lens m is a normal variable of the variance
-    s^2 (1 - w), and what misprints add to that.
+    s^2 (1 - w).
     """
-    determined = joint_covariance(solution.equations, solution.basis)
-    if isinstance(determined, FitFailure):
-        return None
-    n, unit, known = len(SHARED_NAMES), determined[0], solution.observations.known
-    found = board_residuals(solution)
-    error = estimate_target_error(found)
-    whole = covariance_with_target_error(unit, level / error.independent_share, error, found)
-    shares = known * np.diag(unit)[:n]
-    added = np.maximum(np.diag(whole)[:n] - level * np.diag(unit)[:n], 0.0)
+    known, shares = solution.observations.known, _shares_of_usual(solution)
     is_told = (known > 0.0) & (shares < MOST_SHARE)
     variance = np.where(is_told, level / np.where(is_told, known, 1.0) * (1.0 - shares), 1.0)
-    excess = np.where(is_told, np.abs(solution.state.shared), 0.0) / np.sqrt(variance + added)
+    excess = np.where(is_told, np.abs(solution.state.shared), 0.0) / np.sqrt(variance)
     return int(excess.argmax()) if excess.max() > BEYOND_USUAL else None
 
 
 def cost_of_usual(beside: Solution, free: Solution) -> float:
     """By how much chi2 is larger beside usual sizes than free, of the points that both kept, at the
     weights of the free solution: each solution sets points aside and levels weights for itself.
-    What the target's points miss in all views, misprints, is no cost.
+    What each has the print miss costs what it does in the free one.
     """
     kept = (beside.weights > 0.0) & (free.weights > 0.0)
-    chi2 = []
+    costs = []
     for one in (beside, free):
-        points_px = _without_target_error(one).points_px
-        seen = replace(free.observations, points_px=points_px)
-        chi2.append(float(chi2_of_points(seen, one.state)[kept].sum()))
-    return chi2[0] - chi2[1]
+        seen = replace(free.observations, missed_mm=one.observations.missed_mm)
+        chi2 = float(chi2_of_points(seen, one.state)[kept].sum())
+        costs.append(chi2 + cost_of_print(seen, free.print_error))
+    return costs[0] - costs[1]
 
 
 def _shares_of_usual(solution: Solution) -> FloatArray:
-    """(11,) share of what is known of each shared unknown that was known beforehand."""
-    determined = joint_covariance(solution.equations, solution.basis)
+    """(11,) share of what is known of each shared unknown that was so beforehand; NaN if open."""
+    determined = covariance_of_all(solution)
     if isinstance(determined, FitFailure):
-        return np.zeros(len(SHARED_NAMES))
+        return np.full(len(SHARED_NAMES), np.nan)
     return np.asarray(solution.observations.known * np.diag(determined[0])[: len(SHARED_NAMES)])
 
 
@@ -398,7 +404,7 @@ def _shares_of_usual(solution: Solution) -> FloatArray:
 class LeftAtZero:
     """What coefficients that a kind of lens has not, and that may not be zero, do to all else.
 
-    ``unit_covariance`` (S + 6 V, S + 6 V) is as from `joint_covariance`, with these coefficients
+    ``unit_covariance`` (S + 6 V, S + 6 V) is as from `covariance_of_all`, with these coefficients
     unknown as well, but of a usual lens; ``shift`` (S + 6 V,) by what all would move if they were
     solved so.
     """
@@ -408,7 +414,7 @@ class LeftAtZero:
 
 
 def coefficients_left_at_zero(
-    solution: Solution, names: tuple[str, ...], sigma0_squared: float
+    solution: Solution, names: tuple[str, ...], widening: float
 ) -> LeftAtZero | FitFailure:
     """Joint covariance with coefficients that a kind of lens has not as further unknowns.
 
@@ -416,8 +422,7 @@ def coefficients_left_at_zero(
     length and the principal point. Taken as normal variables about zero with
     `typical_coefficients`, the views' own information added (Bayes).
 
-    ``sigma0_squared`` is the variance of a point of unit weight that the covariance will be scaled
-    with.
+    ``widening`` is that of the points' variance where residuals of one view are alike.
     """
     added = basis_of(names, is_aspect_fixed=False)
     basis = np.concatenate([solution.basis, added], axis=1)
@@ -426,14 +431,18 @@ def coefficients_left_at_zero(
         return FitFailure("the solution puts the board behind the camera")
     known = np.zeros(basis.shape[1])
     camera = solution.observations.camera(solution.state.shared[: len(PARAMETER_NAMES)])
-    known[-len(names) :] = sigma0_squared / typical_coefficients(camera, names) ** 2
+    level = solution.variance_factor * widening
+    known[-len(names) :] = level / typical_coefficients(camera, names) ** 2
     equations = replace(equations, shared=equations.shared + np.diag(known))
-    determined = joint_covariance(equations, basis)
-    if isinstance(determined, FitFailure):
-        return determined
+    wide = replace(solution, equations=equations, basis=basis)
+    unit, widened = covariance_of_all(wide), covariance_of_all(wide, widening)
+    if isinstance(unit, FitFailure):
+        return unit
+    if isinstance(widened, FitFailure):
+        return widened
     rows = [SHARED_NAMES.index(name) for name in names]
     pull = equations.shared_gradient[-len(names) :]
-    return LeftAtZero(determined[0], np.asarray(determined[0][:, rows] @ pull))
+    return LeftAtZero(widened[0], np.asarray(unit[0][:, rows] @ pull))
 
 
 def print_stretch(solution: Solution, max_steps: int) -> tuple[float, float]:
@@ -453,17 +462,20 @@ def print_stretch(solution: Solution, max_steps: int) -> tuple[float, float]:
     found = adjust(stretched, solution.state, solution.basis, solution.weights, max_steps)
     if isinstance(found, FitFailure):
         return first
-    again = replace(solution, observations=stretched, state=found.state, equations=found.system)
+    begun = replace(solution, observations=stretched, state=found.state, equations=found.system)
+    again = settle_print(begun, max_steps, is_held=True)
+    if isinstance(again, FitFailure):
+        return first
     rest, sigma = _stretch_step(again)
-    widening = float(np.sqrt(design_effect(again).widening))
+    widening = float(np.sqrt(widening_of(again)))
     return (1.0 + first[0]) * (1.0 + rest) - 1.0, sigma * widening
 
 
 def _stretch_step(solution: Solution) -> tuple[float, float]:
     """Change of the stretch in one step, and its sigma for points that err on their own."""
-    observations = solution.observations
-    prediction = predict(observations, solution.state)
-    if prediction is None:
+    observations, n_free = solution.observations, solution.basis.shape[1]
+    prediction, found = predict(observations, solution.state), solution.board_residuals()
+    if prediction is None or found is None:
         return 0.0, np.inf
     predicted, by_shared, by_pose = prediction
     ahead = solution.state.rotations[observations.view_of_point, :, 1]
@@ -472,8 +484,13 @@ def _stretch_step(solution: Solution) -> tuple[float, float]:
     equations = normal_equations(observations, predicted, free, by_pose, solution.weights)
     wide = np.column_stack([solution.basis, np.zeros(len(SHARED_NAMES))])
     equations = with_known(equations, observations.known, solution.state, wide)
-    step, reduced = damped_step(equations, 0.0), reduced_normal_matrix(equations)
-    if step is None or not condition_number(reduced) < SINGULAR_CONDITION:
+    if not condition_number(reduced_normal_matrix(equations)) < SINGULAR_CONDITION:
         return 0.0, np.inf
-    variance = float(np.linalg.inv(reduced)[-1, -1]) * solution.variance_factor
-    return float(step[0][-1]), float(np.sqrt(variance))
+    # the smooth miss that is a stretch is what is asked for
+    rest = found.fields[:, :, 1:]
+    found = replace(found, by_shared=free[solution.weights > 0.0], fields=rest)
+    eliminated = eliminate_print(equations, np.eye(n_free + 1), found, solution.print_error)
+    gradient = np.concatenate([equations.shared_gradient, equations.pose_gradient.ravel()])
+    step, _ = eliminated.steps(gradient, pull_of_places(found, solution.print_error))
+    variance = float(eliminated.inverse()[n_free, n_free]) * solution.variance_factor
+    return float(step[n_free]), float(np.sqrt(variance))

@@ -108,6 +108,9 @@ class ViewFit(ArrayRecord):
         left; translation in mm), the camera's uncertainty included for views that were used.
     residuals_px
         (M, 2) observed minus predicted.
+    missed_mm
+        (M, 2) what the print misses each point's place by, along the board's axes, as solved along;
+        0 where none is seen.
     is_outlier
         (M,) True for points that were left out of the solution as outliers.
     chi2_per_point
@@ -127,6 +130,7 @@ class ViewFit(ArrayRecord):
     sensor_from_board: Pose[Sensor, Board]
     pose_covariance: FloatArray = floats(6, 6)
     residuals_px: FloatArray = floats("M", 2)
+    missed_mm: FloatArray = floats("M", 2)
     is_outlier: BoolArray = bools("M")
     chi2_per_point: float
     tilt_deg: float
@@ -275,9 +279,9 @@ class CameraFit(ArrayRecord):
         over the degrees of freedom with these covariances alone. What is done about it:
         `armscan.calibration.cameras.robust`.
     target_error_mm
-        Standard deviation, along each axis of the board, by which the target's points miss their
-        places, as found from residuals that repeat from view to view; 0 where none do. The
-        covariance holds its effect.
+        Root mean square, along an axis of the board, by which the target's points miss their
+        places, as told by residuals that repeat from view to view; 0 where none do. Each place is
+        solved along (see `armscan.calibration.cameras.print_errors`), and is in the covariance.
     degrees_of_freedom
         Count of observed coordinates minus count of unknowns.
     condition
@@ -296,7 +300,7 @@ class CameraFit(ArrayRecord):
         are not.
     stretch, stretch_sigma
         Part by which the print seems longer from row to row than is said of it, with the lengths
-        from column to column taken for right, and its standard deviation; it is not solved along.
+        from column to column taken for right, and its standard deviation.
     warnings
         Plain sentences that a person should read.
     options

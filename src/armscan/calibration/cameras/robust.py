@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What disturbs a bundle adjustment: the noise of the target's points, outliers, errors of the
-target itself and the bend of the board.
+"""What disturbs a bundle adjustment: the noise of the target's points, outliers, what the print
+misses and the bend of the board.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import fdtrc
@@ -19,17 +18,24 @@ from armscan.calibration.cameras.adjustment import (
     Observations,
     State,
     adjust,
+    joint_covariance,
+    moved,
     predict,
     predict_px,
 )
+from armscan.calibration.cameras.print_errors import (
+    NO_ERROR,
+    SIGNIFICANT_SIGMAS,
+    BoardResiduals,
+    PrintError,
+    begin_print,
+    eliminate_print,
+    settle_print,
+    smooth_fields,
+)
 from armscan.calibration.cameras.result import BOW_P, BoardWarp
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.poses import Board, Pose
-from armscan.models.camera import CameraModel
-from armscan.vision.targets.detect import Numbering
-
-SIGNIFICANT_SIGMAS = 4.0
 
 
 def excess_variance_px2(
@@ -118,13 +124,13 @@ class Solution:
     view_levels: FloatArray
     outlier_shares: FloatArray
     is_converged: bool
+    print_error: PrintError = NO_ERROR
 
     @property
     def degrees_of_freedom(self) -> int:
         """Coordinates used minus unknowns."""
-        n_views = len(self.state.rotations)
-        n_coordinates = 2 * int(self.weights.sum())
-        return n_coordinates - int(self.basis.shape[1]) - 6 * n_views
+        n_unknown = int(self.basis.shape[1]) + 6 * len(self.state.rotations)
+        return 2 * int(self.weights.sum()) - n_unknown - round(self.print_error.n_told)
 
     @property
     def chi2(self) -> float:
@@ -135,6 +141,57 @@ class Solution:
     def variance_factor(self) -> float:
         """sigma0 squared: chi2 of the points over the degrees of freedom."""
         return self.chi2 / max(self.degrees_of_freedom, 1)
+
+    @property
+    def cost(self) -> float:
+        """What is least at the minimum: chi2, what is known beforehand, and the print's misses."""
+        return self.equations.chi2 + cost_of_print(self.observations, self.print_error)
+
+    def board_residuals(self) -> BoardResiduals | None:
+        """The points kept; None if the state is impossible."""
+        observations, state = self.observations, self.state
+        prediction = predict(observations, state)
+        if prediction is None:
+            return None
+        predicted, by_shared, by_pose = prediction
+        kept = np.flatnonzero(self.weights > 0.0)
+        view = np.asarray(observations.view_of_point)[kept]
+        whitening = observations.whitening[kept]
+        return BoardResiduals(
+            observations.point[kept],
+            observations.missed_mm[kept],
+            (observations.points_px - predicted)[kept],
+            by_pose[kept][:, :, 3:] @ state.rotations[view][:, :, :2],
+            by_shared[kept],
+            by_pose[kept],
+            whitening.transpose(0, 2, 1) @ whitening,
+            view,
+            view,
+            observations.target_mm,
+            smooth_fields(observations.target_mm),
+        )
+
+    def with_places(
+        self, missed_mm: FloatArray, step: FloatArray, max_steps: int
+    ) -> Solution | FitFailure:
+        """The minimum for points that miss their places by (P, 2), about a step (F + 6 V,) away."""
+        seen = replace(self.observations, missed_mm=missed_mm[self.observations.point])
+        shared, poses = np.split(step, [self.basis.shape[1]])
+        start = moved(self.state, self.basis, shared, poses.reshape(-1, 6))
+        found = adjust(seen, start, self.basis, self.weights, max_steps)
+        if isinstance(found, FitFailure):
+            return found
+        return replace(
+            self,
+            observations=seen,
+            state=found.state,
+            equations=found.system,
+            is_converged=found.is_settled,
+        )
+
+    def with_print_error(self, error: PrintError) -> Solution:
+        """The same with another weight of the print's places."""
+        return replace(self, print_error=error)
 
 
 def residuals_px(observations: Observations, state: State) -> FloatArray:
@@ -280,222 +337,72 @@ def _typical(levels: FloatArray) -> float:
     return max(float(np.median(levels)), 1e-12)
 
 
-FEWEST_VIEWS = 4
-LEAST_INDEPENDENT = 0.05
-SAME_POINT_MM = 1e-6
+def cost_of_print(observations: Observations, error: PrintError) -> float:
+    """What the places of a print add to chi2."""
+    missed_mm = np.zeros_like(observations.target_mm)
+    missed_mm[observations.point] = observations.missed_mm
+    return error.cost(missed_mm, smooth_fields(observations.target_mm)) if error.is_seen else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class TargetError:
-    """How far the target's points miss their places.
+EXCESS_ROUNDS = 2
 
-    Parameters
-    ----------
-    sigma_mm
-        Standard deviation along each axis of the board; 0 where views show none.
-    independent_share
-        Part of the residuals' variance that is new in every view.
+
+def with_print_errors(
+    claimed: Observations,
+    solution: Solution,
+    trusted: BoolArray,
+    max_steps: int,
+    widening: Callable[[Solution], float],
+) -> Solution | FitFailure:
+    """Solve for the places of the print, too, where the views show that it errs (`begin_print`).
+
+    ``claimed`` are the points with the covariances of their detector. What is left of the residuals
+    tells the noise and the outliers anew.
     """
-
-    sigma_mm: float
-    independent_share: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BoardResiduals:
-    """Residuals of N points kept, and what a move of a point on its board does to them.
-
-    Parameters
-    ----------
-    board_mm
-        (N, 3) places on the board: equal places are one point of the target.
-    residuals_px
-        (N, 2) observed minus predicted.
-    by_board
-        (N, 2, 2) derivative of the prediction by the point's place along the board's axes.
-    by_shared, by_pose
-        (N, 2, S) and (N, 2, 6) derivative by the shared unknowns and by the pose of its board.
-    information
-        (N, 2, 2) inverse covariance of the points.
-    board
-        (N,) number of the pose in the order of the unknowns.
-    view
-        (N,) number of the view: two cameras have two views of one board.
-    """
-
-    board_mm: FloatArray
-    residuals_px: FloatArray
-    by_board: FloatArray
-    by_shared: FloatArray
-    by_pose: FloatArray
-    information: FloatArray
-    board: IntArray
-    view: IntArray
-
-    @property
-    def point(self) -> IntArray:
-        """(N,) number of the target's point."""
-        places = np.rint(self.board_mm[:, :2] / SAME_POINT_MM).astype(np.int64)
-        return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
-
-    @staticmethod
-    def joined(parts: Sequence[BoardResiduals]) -> BoardResiduals:
-        """All of several cameras' points."""
-        names = BoardResiduals.__slots__
-        return BoardResiduals(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
-        )
+    found = begin_print(solution, max_steps, widening)
+    for _ in range(EXCESS_ROUNDS):
+        if isinstance(found, FitFailure) or not found.print_error.is_seen:
+            return found
+        error = found.print_error
+        seen = levelled(replace(claimed, missed_mm=found.observations.missed_mm), found)
+        again = solve_robustly(seen, found.state, found.basis, trusted, max_steps)
+        if isinstance(again, FitFailure):
+            return again
+        again = again.with_print_error(error)
+        weight = again.variance_factor / error.sigma_mm**2
+        found = settle_print(again.with_print_error(replace(error, weight=weight)), max_steps)
+    return found
 
 
-def board_residuals(solution: Solution) -> BoardResiduals | None:
-    """The points kept of one camera's solution; None if that is impossible."""
-    observations, state = solution.observations, solution.state
-    prediction = predict(observations, state)
-    if prediction is None:
-        return None
-    predicted, by_shared, by_pose = prediction
-    kept = np.flatnonzero(solution.weights > 0.0)
-    view = np.asarray(observations.view_of_point)[kept]
-    whitening = observations.whitening[kept]
-    return BoardResiduals(
-        observations.board_mm[kept],
-        (observations.points_px - predicted)[kept],
-        by_pose[kept][:, :, 3:] @ state.rotations[view][:, :, :2],
-        by_shared[kept],
-        by_pose[kept],
-        whitening.transpose(0, 2, 1) @ whitening,
-        view,
-        view,
+def levelled(claimed: Observations, solution: Solution) -> Observations:
+    """The observations with what their residuals scatter more than is claimed; the same if none."""
+    kept = solution.weights > 0.0
+    excess = excess_variance_px2(
+        residuals_px(claimed, solution.state)[kept],
+        claimed_covariances(claimed)[kept],
+        float(chi2_of_points(claimed, solution.state)[kept].sum()),
+        solution.degrees_of_freedom,
     )
+    return with_excess(claimed, excess) if excess > 0.0 else claimed
 
 
-def estimate_target_error(found: BoardResiduals | None) -> TargetError:
-    """Find how far target points miss their places, from how residuals agree between views."""
-    if found is None or len(np.unique(found.view)) < FEWEST_VIEWS:
-        return TargetError(0.0, 1.0)
-    residuals, by_board, point = found.residuals_px, found.by_board, found.point
-    missed = np.linalg.solve(by_board, residuals[:, :, None])[:, :, 0]
-    count = np.bincount(point)
-    total = np.stack([np.bincount(point, missed[:, k]) for k in range(2)], axis=1)
-    squares = np.bincount(point, np.sum(missed**2, axis=1))
-    products = float(np.sum(total**2) - squares.sum())
-    pairs = float(np.sum(count * (count - 1)))
-    scatter = float(squares.sum()) / (2.0 * len(point))
-    if not products > SIGNIFICANT_SIGMAS * 2.0 * scatter * np.sqrt(pairs):
-        return TargetError(0.0, 1.0)
-    variance = products / (2.0 * pairs)
-    explained = variance * float(np.mean(np.sum(by_board**2, axis=(1, 2))))
-    share = 1.0 - explained / float(np.mean(np.sum(residuals**2, axis=1)))
-    return TargetError(float(np.sqrt(variance)), max(share, LEAST_INDEPENDENT))
+def covariance_of_all(
+    solution: Solution, widening: float = 1.0
+) -> tuple[FloatArray, float] | FitFailure:
+    """As `joint_covariance`, for a print of which the views alone tell where its points are.
 
-
-_TURNED_SIGMAS = 2.0
-"""Agreement, over the root of the count of views, that no choice of numberings makes of chance: the
-best choice makes 1.1 of it."""
-_ROUNDS_OF_TURNS = 10
-
-
-def missed_places_mm(
-    camera: CameraModel, pose: Pose[Any, Board], board_mm: FloatArray, residuals_px: FloatArray
-) -> FloatArray:
-    """(M, 2) what points (M, 3) of a board miss their places by, along its axes."""
-    _, by_point, _ = camera.project_with_jacobian(pose.apply(board_mm))
-    by_board = by_point @ pose.rotation[:, :2]
-    return np.asarray(np.linalg.solve(by_board, residuals_px[:, :, None])[:, :, 0])
-
-
-def agreeing_numberings(
-    places_mm: Sequence[FloatArray], missed_mm: Sequence[FloatArray], known: Sequence[Numbering]
-) -> IntArray | None:
-    """Which numbering each view has of a target that looks alike when turned.
-
-    Errors of its print turn with it: where views are numbered alike, points miss their places
-    alike. It is told by all views together, and must be clearer than chance can make it.
-
-    ``places_mm`` (M, 3) are the points of each of V views as found numbered, ``missed_mm`` (M, 2)
-    what each misses its place by; ``known`` are numberings that no single view can tell apart, the
-    one as found first. The numbers (V,) among these leave the first view its own. None where the
-    views tell nothing, or all are numbered alike.
+    ``widening`` is that of the points' variance where residuals of one view are alike; what the
+    print misses is not widened.
     """
-    if len(known) < 2 or len(places_mm) < FEWEST_VIEWS:
-        return None
-    turned = [
-        [numbering.new_from_found.apply(places)[:, :2] for numbering in known]
-        for places in places_mm
-    ]
-    every = np.rint(np.concatenate([p for view in turned for p in view]) / SAME_POINT_MM)
-    number = np.unique(every.astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
-    n_points = int(number.max()) + 1
-    lengths = [len(places) for places in places_mm for _ in known]
-    patterns = np.zeros((len(places_mm), len(known), n_points, 2))
-    for k, of in enumerate(np.split(number, np.cumsum(lengths)[:-1])):
-        view, turn = divmod(k, len(known))
-        rotation = known[turn].new_from_found.rotation[:2, :2]
-        patterns[view, turn, of] = missed_mm[view] @ rotation.T
-    chosen = _most_alike(patterns)
-    own = patterns[np.arange(len(chosen)), chosen]
-    total, squares = own.sum(axis=0), np.sum(own**2)
-    agreement = float(np.sum(total**2) - squares)
-    scatter = float(squares) / (2.0 * sum(len(places) for places in places_mm))
-    seen = (own**2).sum(axis=2) > 0.0
-    pairs = float(np.sum(seen.sum(axis=0) * (seen.sum(axis=0) - 1.0)))
-    least = SIGNIFICANT_SIGMAS + _TURNED_SIGMAS * np.sqrt(len(chosen))
-    if not chosen.any() or not agreement > least * 2.0 * scatter * np.sqrt(pairs):
-        return None
-    return chosen
-
-
-def _most_alike(patterns: FloatArray) -> IntArray:
-    """Choice (V,) among K patterns (V, K, P, 2) of each view such that their sum is the longest."""
-    every = np.arange(len(patterns))
-    chosen = np.zeros(len(patterns), dtype=np.int64)
-    total = patterns[0, 0].copy()
-    for view in every[1:]:
-        chosen[view] = int(np.argmax(np.sum(patterns[view] * total, axis=(1, 2))))
-        total += patterns[view, chosen[view]]
-    for _ in range(_ROUNDS_OF_TURNS):
-        before = chosen.copy()
-        for view in every[1:]:
-            total -= patterns[view, chosen[view]]
-            chosen[view] = int(np.argmax(np.sum(patterns[view] * total, axis=(1, 2))))
-            total += patterns[view, chosen[view]]
-        if np.array_equal(before, chosen):
-            break
-    return chosen
-
-
-def covariance_with_target_error(
-    unit_covariance: FloatArray,
-    variance_factor: float,
-    error: TargetError,
-    found: BoardResiduals | None,
-) -> FloatArray:
-    """Covariance (S + 6 V, S + 6 V) of shared unknowns and poses with the target's own errors.
-
-    ``unit_covariance`` is that of `armscan.calibration.cameras.adjustment.joint_covariance`,
-    ``variance_factor`` the solution's sigma0 squared.
-    """
-    covariance = error.independent_share * variance_factor * unit_covariance
-    if error.sigma_mm == 0.0 or found is None:
-        return covariance
-    pull = _pull_of_points(found, len(unit_covariance))
-    moved = np.tensordot(unit_covariance, pull, axes=(1, 1))
-    return np.asarray(covariance + error.sigma_mm**2 * np.einsum("ipk,jpk->ij", moved, moved))
-
-
-def _pull_of_points(found: BoardResiduals, size: int) -> FloatArray:
-    """(P, S + 6 V, 2) right-hand side that a unit error of each target point causes."""
-    point = found.point
-    weighted = found.information @ found.by_board
-    shared = found.by_shared.transpose(0, 2, 1) @ weighted
-    pose = found.by_pose.transpose(0, 2, 1) @ weighted
-    n_shared = found.by_shared.shape[2]
-    pull = np.zeros((int(point.max()) + 1, size, 2))
-    np.add.at(pull[:, :n_shared], point, shared)
-    first = n_shared + 6 * found.board
-    for k in range(6):
-        np.add.at(pull, (point, first + k), pose[:, k])
-    return pull
+    determined = joint_covariance(solution.equations, solution.basis)
+    if isinstance(determined, FitFailure):
+        return determined
+    unit, condition = determined
+    found = solution.board_residuals() if solution.print_error.is_seen else None
+    if found is None:
+        return widening * unit, condition
+    eliminated = eliminate_print(solution.equations, solution.basis, found, solution.print_error)
+    return eliminated.covariance(solution.basis, widening), condition
 
 
 _FIRST = SHARED_NAMES.index(WARP_NAMES[0])
@@ -510,13 +417,14 @@ def with_board_warp(flat: Solution, max_steps: int) -> Solution | FitFailure:
     result = adjust(flat.observations, flat.state, basis, flat.weights, max_steps)
     if isinstance(result, FitFailure):
         return result
-    return replace(
+    bowed = replace(
         flat,
         state=result.state,
         basis=basis,
         equations=result.system,
         is_converged=result.is_settled,
     )
+    return settle_print(bowed, max_steps, is_held=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -530,7 +438,7 @@ class BowTest:
     def of(flat: Solution, bowed: Solution) -> BowTest:
         """Compare the solutions without and with bow."""
         n_parameters = len(WARP_NAMES)
-        decrease = max(flat.equations.chi2 - bowed.equations.chi2, 0.0)
+        decrease = max(flat.cost - bowed.cost, 0.0)
         statistic = decrease / n_parameters / bowed.variance_factor
         freedom = max(bowed.degrees_of_freedom, 1)
         return BowTest(float(statistic), float(fdtrc(n_parameters, freedom, statistic)))

@@ -84,3 +84,23 @@ def test_a_worse_arm_that_was_stated_may_move_more() -> None:
     )
     moved = [stripes[0], _moved(stripes[1], 1.5, 0.0)]
     check_postures(moved, HandEyeOptions(exposure_position_mm=0.3))
+
+
+def test_an_arm_whose_every_posture_scatters_so_stands_still_all_the_same() -> None:
+    """Some of whose pairs lie beyond the fixed limits; but
+    one posture that moved beyond it, or all by degrees, did move.
+    """
+    rig = PlateRig(good_postures(12, np.random.default_rng(1)), exposures_per_posture=2)
+    stripes, _ = rig.draw(1)
+    rng = np.random.default_rng(4)
+    sizes = [(0.5 * abs(rng.normal()), np.radians(0.3) * abs(rng.normal())) for _ in range(12)]
+    moved = [s if k % 2 == 0 else _moved(s, *sizes[k // 2]) for k, s in enumerate(stripes)]
+    assert max(size[1] for size in sizes) > np.radians(0.5)
+    check_postures(moved, HandEyeOptions())
+    for shift_mm, turn_deg in ((0.0, 1.2), (3.5, 0.0)):
+        one = [*moved[:-1], _moved(stripes[-1], shift_mm, np.radians(turn_deg))]
+        with pytest.raises(InputError, match="has different poses"):
+            check_postures(one, HandEyeOptions())
+    few = [stripes[0], _moved(stripes[1], 0.0, np.radians(0.6)), *stripes[2:4]]
+    with pytest.raises(InputError, match="has different poses"):
+        check_postures(few, HandEyeOptions())

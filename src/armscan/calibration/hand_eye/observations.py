@@ -44,6 +44,9 @@ SAME_POSTURE_RAD = float(np.radians(0.5))
 scatter by 0.06 mm, 30 mm from where its pose turns, is within it too. Other postures lie degrees
 apart."""
 STANDING_SIGMAS = 10.0
+LEAST_STANDING, TYPICAL_MOVES, FAR_POSTURE = 3, 4.0, np.array([3.0, np.radians(1.0)])
+"""So many postures of several exposures tell by their median what an arm that stands still scatters
+by; one may move by so many times that, but no more than this, in mm and rad."""
 TIP_SHARE = 0.4
 """What the tip's own calibration errs by, over what touches scatter by: the root of 3/20, as of a
 centre (three unknowns) found by twenty touches. It is alike in all touches of the plate, which
@@ -235,24 +238,25 @@ class Posed(Protocol):
 def check_postures(exposures: Sequence[Posed], options: HandEyeOptions) -> None:
     """Refuse a posture's name that stands for different poses of the arm.
 
-    An arm of which a larger scatter from exposure to exposure was given may move that much more.
+    An arm of which a larger scatter from exposure to exposure was given, or is seen in most
+    postures, may move that much more.
 
     Raises
     ------
     InputError
         If two exposures of one posture are further apart than an arm that stands still.
     """
-    exposure_mm = options.exposure_position_mm or 0.0
-    exposure_rad = options.exposure_rotation_rad or 0.0
-    most_mm = max(SAME_POSTURE_MM, STANDING_SIGMAS * exposure_mm)
-    most_rad = max(SAME_POSTURE_RAD, STANDING_SIGMAS * exposure_rad)
+    given = [options.exposure_position_mm or 0.0, options.exposure_rotation_rad or 0.0]
+    most = np.maximum([SAME_POSTURE_MM, SAME_POSTURE_RAD], STANDING_SIGMAS * np.array(given))
     first_of: dict[str, Posed] = {}
-    for exposure in exposures:
-        first = first_of.setdefault(exposure.posture, exposure)
-        change: Pose[Tool, Tool] = first.base_from_tool.inverse() @ exposure.base_from_tool
-        shift_mm = float(np.linalg.norm(change.translation_mm))
-        turn_rad = float(np.linalg.norm(change.rotation_vector_rad))
-        if shift_mm > most_mm or turn_rad > most_rad:
+    firsts = [first_of.setdefault(exposure.posture, exposure) for exposure in exposures]
+    moves = [_move(first, exposure) for first, exposure in zip(firsts, exposures, strict=True)]
+    again = [n for n, first in enumerate(firsts) if first is not exposures[n]]
+    if len({exposures[n].posture for n in again}) >= LEAST_STANDING:
+        typical = TYPICAL_MOVES * np.median([moves[n] for n in again], axis=0)
+        most = np.maximum(most, np.minimum(typical, FAR_POSTURE))
+    for first, exposure, (shift_mm, turn_rad) in zip(firsts, exposures, moves, strict=True):
+        if shift_mm > most[0] or turn_rad > most[1]:
             raise InputError(
                 f"posture '{exposure.posture}' has different poses: the arm moved by "
                 f"{shift_mm:.1f} mm and {np.degrees(turn_rad):.1f} deg from {first.source} to "
@@ -260,6 +264,13 @@ def check_postures(exposures: Sequence[Posed], options: HandEyeOptions) -> None:
                 remedy="give every posture of the arm a view of its own; if the arm stood still, "
                 "check that both exposures have their own poses",
             )
+
+
+def _move(first: Posed, second: Posed) -> FloatArray:
+    """(2,) by how many mm and rad the arm moved."""
+    change: Pose[Tool, Tool] = first.base_from_tool.inverse() @ second.base_from_tool
+    parts = (change.translation_mm, change.rotation_vector_rad)
+    return np.array([np.linalg.norm(part) for part in parts])
 
 
 def check_diameter(diameter_mm: float) -> None:

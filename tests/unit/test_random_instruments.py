@@ -178,9 +178,12 @@ def test_points_stay_as_far_from_a_sphere_as_the_sensor_is_known(seed: int) -> N
     assert hand_eye(seed, on_sphere=True).result == "right"
 
 
-def test_a_hand_eye_that_nothing_tells_is_refused() -> None:
-    """Turns about the plate's normal only: what scatter alone tells of a shift is 108 mm."""
-    found = hand_eye(1300012, on_sphere=False)
+@pytest.mark.parametrize("seed", [1300012, 8200430])
+def test_a_hand_eye_that_nothing_tells_is_refused(seed: int) -> None:
+    """Turns about the plate's normal only: what scatter alone tells of a shift is 108 mm. With two
+    lines a light sheet that lies elsewhere by 1.8 mm was blamed for all of it.
+    """
+    found = hand_eye(seed, on_sphere=False)
     assert found.result == "rightly refused"
     assert "the arm turned about the plate's normal only" in found.reason
 

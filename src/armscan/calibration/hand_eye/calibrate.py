@@ -170,7 +170,7 @@ def calibrate_on_plate(
     mirror = find_mirror(problem, surface, likeliest)
     if mirror is not None:
         return mirror
-    checked = estimate_and_check(problem, surface, likeliest)
+    checked = estimate_and_check(problem, surface, likeliest, cause)
     if isinstance(checked, FitFailure):
         return checked
     return _fit_on_plate(stripes, kept, surface, likeliest, checked, cause=cause)

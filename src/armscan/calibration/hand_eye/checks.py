@@ -31,6 +31,7 @@ from armscan.calibration.hand_eye.estimate import (
     HandEyeSolution,
     LeftOut,
     Problem,
+    conditioning_at,
     estimate,
     leave_each_out,
 )
@@ -419,7 +420,7 @@ class CheckedFit:
 
 
 def estimate_and_check(
-    problem: Problem, plate: PlateSurface, start: Start
+    problem: Problem, plate: PlateSurface, start: Start, cause: str
 ) -> CheckedFit | FitFailure:
     """Estimate, leave wrong postures out, and look for something that moved or is not as given.
 
@@ -427,15 +428,14 @@ def estimate_and_check(
     moved. If what moved explains all postures about as well as leaving some out explains the rest,
     it is believed.
     """
-    state = problem.start(start.tool_from_sensor)
-    first = estimate(problem.without(start.is_wrong), state)
-    if first is None:
-        return NO_SOLUTION
+    first = _first_fit(problem, start, cause)
+    if isinstance(first, FitFailure):
+        return first
     checked = _without_wrong_postures(problem, start, first)
     usual_mm = (first if isinstance(checked, FitFailure) else checked.fit).arm_mm
     trials = [first]
     if start.is_wrong.any():
-        whole = estimate(problem, state)
+        whole = estimate(problem, problem.start(start.tool_from_sensor))
         trials += [] if whole is None else [whole]
     found: tuple[Alternative, ...] | None = None
     for fit in trials:
@@ -460,6 +460,16 @@ def estimate_and_check(
         return moved.failure
     warnings = (*checked.warnings, moved.failure.reason)
     return replace(checked, widening=moved.widening, warnings=warnings)
+
+
+def _first_fit(problem: Problem, start: Start, cause: str) -> HandEyeSolution | FitFailure:
+    """Refused where a usual arm leaves it open: that would be laid on the plate or the sensor."""
+    first = estimate(problem.without(start.is_wrong), problem.start(start.tool_from_sensor))
+    if first is None:
+        return NO_SOLUTION
+    usual = conditioning_at(first.problem, first.state)
+    refusal = refuse_hardly_determined(usual, MOST_OPEN_MM, cause, VARY_POSTURES)
+    return first if refusal is None else refusal
 
 
 def _with_plane_check(

@@ -270,9 +270,9 @@ def target_text(target_error_mm: float) -> str:
         return ""
     return (
         " Residuals of a target point repeat from view to view: the points are printed beside "
-        f"their places by {significant(target_error_mm)} mm (rms an axis). "
-        "Where each lies is solved along, so that the residuals and what is solved do not follow "
-        "the print; how well that is known is in the standard deviations."
+        f"their places by {significant(target_error_mm)} mm (rms an axis). Where each lies is "
+        "estimated together with the camera; unseen views are predicted on the places that the "
+        "other views tell. A lens that the model does not follow may pass for a print that errs."
     )
 
 

@@ -84,6 +84,13 @@ class Observations:
         )
 
     @property
+    def rms_missed_mm(self) -> float:
+        """Root mean square, along an axis, of what the target's points were solved to miss."""
+        missed = np.zeros_like(self.target_mm)
+        missed[self.point] = self.missed_mm
+        return float(np.sqrt(np.mean(missed**2))) if len(missed) else 0.0
+
+    @property
     def n_views(self) -> int:
         """Count of views."""
         return len(self.starts) - 1

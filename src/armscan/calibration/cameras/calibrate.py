@@ -243,7 +243,7 @@ def assemble(
         rms_px=rms(misses_px),
         sigma_point_px=sigma_of_axis(misses_px, solution.degrees_of_freedom),
         noise_scale=_noise_scale(used, solution),
-        target_error_mm=solution.print_error.rms_mm(observations.target_mm),
+        target_error_mm=observations.rms_missed_mm,
         degrees_of_freedom=solution.degrees_of_freedom,
         condition=condition,
         coverage=coverage,

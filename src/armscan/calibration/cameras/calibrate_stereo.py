@@ -387,7 +387,7 @@ def assemble(
         hold_out=hold_out,
         degrees_of_freedom=solution.degrees_of_freedom,
         condition=covariance.condition,
-        target_error_mm=covariance.print_error.rms_mm(solution.observations.left.target_mm),
+        target_error_mm=solution.observations.left.rms_missed_mm,
         is_converged=solution.is_converged,
         warnings=(),
         options=options,

@@ -29,6 +29,9 @@ SIGNIFICANT_SIGMAS = 4.0
 FEWEST_VIEWS = 4
 LEAST_INDEPENDENT = 0.05
 SMOOTH_DEGREE = 3
+MOST_SMOOTH = 0.25
+"""Of all that a print's points may miss, what smooth misses are at most: fewer points than 34 have
+fields of a lower degree."""
 SAME_FIELD = 1e-6
 LEAST_OF_TARGET = 1e-6
 """Standard deviation of a place, over the target's length, of a print that errs smoothly alone."""
@@ -69,11 +72,6 @@ class PrintError:
         """Whether the views show one."""
         return self.sigma_mm > 0.0
 
-    def rms_mm(self, target_mm: FloatArray) -> float:
-        """Of what the points (P, 2) miss along an axis, smooth misses and others."""
-        share = smooth_fields(target_mm).shape[2] / target_mm.size
-        return self.sigma_mm * float(np.sqrt(1.0 + share / (1.0 - self.smooth_share) - share))
-
     def pull(self, missed_mm: FloatArray, fields: FloatArray) -> FloatArray:
         """(P, 2) what draws places that are missed by (P, 2) to where they should be."""
         smooth = np.einsum("pkf,pk->f", fields, missed_mm)
@@ -91,13 +89,15 @@ def smooth_fields(target_mm: FloatArray) -> FloatArray:
     """(P, 2, K) misses of a target's points (P, 2) up to the third degree in their places.
 
     Of unit length and orthogonal to each other, to shifts and turns, and to a scale, which no view
-    tells. A few points have fewer.
+    tells. A few points have fewer (`MOST_SMOOTH`).
     """
     middle = 0.5 * (target_mm.min(axis=0) + target_mm.max(axis=0))
     x, y = ((target_mm - middle) / max(float(np.ptp(target_mm, axis=0).max()), 1e-9)).T
     none, one = np.zeros_like(x), np.ones_like(x)
     found = [(one, none), (none, one), (x, y), (-y, x), (-x, y), (y, x)]
     for degree in range(2, SMOOTH_DEGREE + 1):
+        if len(found) - 2 + 2 * degree > MOST_SMOOTH * (target_mm.size - 4):
+            break
         for power in range(degree + 1):
             value = x**power * y ** (degree - power)
             found += [(value, none), (none, value)]
@@ -190,10 +190,11 @@ class BoardResiduals:
         return missed
 
 
-def seen_print_error(found: BoardResiduals, variance_factor: float) -> PrintError:
+def seen_print_error(found: BoardResiduals, variance_factor: float, widening: float) -> PrintError:
     """Find how far target points miss their places, from how residuals agree between views.
 
-    ``variance_factor`` is sigma0 squared of a solution that takes the print for right.
+    ``variance_factor`` is sigma0 squared of a solution that takes the print for right,
+    ``widening`` of it for residuals that are alike in a view: so many fewer points agree by chance.
     """
     residuals, by_board, point = found.residuals_px, found.by_board, found.point
     missed = np.linalg.solve(by_board, residuals[:, :, None])[:, :, 0]
@@ -203,7 +204,7 @@ def seen_print_error(found: BoardResiduals, variance_factor: float) -> PrintErro
     products = float(np.sum(total**2) - squares.sum())
     pairs = float(np.sum(count * (count - 1)))
     scatter = float(squares.sum()) / (2.0 * len(point))
-    if not products > SIGNIFICANT_SIGMAS * 2.0 * scatter * np.sqrt(pairs):
+    if not products > SIGNIFICANT_SIGMAS * 2.0 * scatter * np.sqrt(pairs * widening):
         return NO_ERROR
     variance = products / (2.0 * pairs)
     explained = variance * float(np.mean(np.sum(by_board**2, axis=(1, 2))))
@@ -438,7 +439,7 @@ def begin_print(solution: S, max_steps: int, widening: Callable[[S], float]) -> 
     found = solution.board_residuals()
     if found is None or len(np.unique(found.view)) < FEWEST_VIEWS:
         return solution
-    error = seen_print_error(found, solution.variance_factor)
+    error = seen_print_error(found, solution.variance_factor, widening(solution))
     if not error.is_seen:
         trial = smooth_trial(found, solution.variance_factor)
         tried = settle_print(solution.with_print_error(trial), max_steps, is_held=True)

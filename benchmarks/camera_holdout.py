@@ -13,10 +13,10 @@ Columns: *ours* is detection, calibration with default options, pose; *OpenCV* i
 (chessboard corners refined by cornerSubPix, or findCirclesGrid), calibrateCamera with its default
 model (k1 k2 p1 p2 k3), solvePnP; *OpenCV, our points* is its calibrateCamera and solvePnP on the
 points of our detector. *bowed* judges ours and OpenCV on boards bowed as our calibration of the
-other folds finds them, in place of flat ones, and *printed* on such boards with their points where
-that calibration finds them printed; OpenCV's cameras are the same. *released* is OpenCV's
-calibrateCameraRO, which finds the places (x, y and z) by itself, from the other folds, too: on the
-points of its own detector and of ours, views that show all points only.
+other folds finds them, in place of flat ones; *printed* judges ours with --solve-print, and OpenCV,
+on such boards with their points where that calibration finds them; OpenCV's cameras are the same.
+*released* is OpenCV's calibrateCameraRO, which finds the places (x, y and z) by itself, from the
+other folds, too: on the points of its own detector and of ours, views that show all points only.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from armscan.calibration.cameras.result import CameraFit
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
@@ -41,6 +41,7 @@ from armscan.vision.targets.target import Chessboard, CircleGrid, TargetView
 
 DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[2] / "shared/data"))
 FOLDS = 5
+SOLVED = CameraOptions(solve_print=True)
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,13 @@ class Ours:
     models: str
     bows_mm: list[FloatArray]
     """(2,) a fold: zero where no bow shows."""
+    printed_bows_mm: list[FloatArray]
     missed_mm: list[FloatArray]
     """(P, 2) a fold: zero where no print error shows."""
+
+
+def bow_of(fit: CameraFit) -> FloatArray:
+    return fit.warp.bow_mm if fit.warp is not None and fit.warp.is_significant else np.zeros(2)
 
 
 def missed_of(fit: CameraFit, n_points: int) -> FloatArray:
@@ -117,30 +123,33 @@ def our_holdout(views: list[TargetView], n_points: int) -> Ours:
     flat: list[FloatArray] = []
     bowed: list[FloatArray] = []
     printed: list[FloatArray] = []
-    models, bows, missed = [], [], []
+    models, bows, printed_bows, missed = [], [], [], []
     for train, test in folds_of(len(views)):
         run = calibrate_camera_from_views([views[i] for i in train])
         if not isinstance(run, CameraRun):
             raise SystemExit(run.reason)
-        fit, warp = run.fit, run.fit.warp
+        with_print = calibrate_camera_from_views([views[i] for i in train], SOLVED)
+        if not isinstance(with_print, CameraRun):
+            raise SystemExit(with_print.reason)
+        fit, other = run.fit, with_print.fit
         models.append("".join(n for n in fit.free_parameters if n[0] in "kp"))
-        shows = warp is not None and warp.is_significant
-        bows.append(warp.bow_mm if warp is not None and shows else np.zeros(2))
-        missed.append(missed_of(fit, n_points))
+        bows.append(bow_of(fit))
+        printed_bows.append(bow_of(other))
+        missed.append(missed_of(other, n_points))
         for i in test:
             view = correct_centres(views[i], fit.camera) if views[i].edges else views[i]
             found = as_printed(view, missed[-1])
-            for residuals, seen, bow in (
-                (flat, view, np.zeros(2)),
-                (bowed, view, bows[-1]),
-                (printed, found, bows[-1]),
+            for residuals, seen, camera, bow in (
+                (flat, view, fit.camera, np.zeros(2)),
+                (bowed, view, fit.camera, bows[-1]),
+                (printed, found, other.camera, printed_bows[-1]),
             ):
-                pose = estimate_board_pose(seen, fit.camera, bow_mm=bow, allow_ambiguous=True)
+                pose = estimate_board_pose(seen, camera, bow_mm=bow, allow_ambiguous=True)
                 if not isinstance(pose, Estimate):
                     raise SystemExit(pose.reason)
                 residuals.append(pose.residuals)
     told = " ".join(sorted(set(models)))
-    return Ours(rms(flat), rms(bowed), rms(printed), told, bows, missed)
+    return Ours(rms(flat), rms(bowed), rms(printed), told, bows, printed_bows, missed)
 
 
 def bent(board: FloatArray, bow_mm: FloatArray) -> FloatArray:
@@ -168,7 +177,10 @@ def opencv_holdout(
             np.zeros(5),
         )
         for i in test:
-            board = objects[i] if ours is None else bent(objects[i], ours.bows_mm[fold])
+            board = objects[i]
+            if ours is not None:
+                bows = ours.printed_bows_mm if is_printed else ours.bows_mm
+                board = bent(board, bows[fold])
             if ours is not None and is_printed:
                 board = board + np.pad(ours.missed_mm[fold], ((0, 0), (0, 1)))
             residuals.append(posed(board, images[i], matrix, distortion))

@@ -16,15 +16,19 @@ from armscan.cli.options import (
     ArmFile,
     ArmPosition,
     ArmRotation,
+    AutoLeaveOut,
     BitsAlign,
     BitsUsed,
+    BoardWarp,
     DefaultOf,
     Document,
     EulerAngles,
+    Fixed,
     LaserColourOption,
     Method,
     MethodOption,
     OptionalTarget,
+    SolvePrint,
     Target,
     given,
     refuse_given,
@@ -94,16 +98,11 @@ def camera(
     again: AgainFile = None,
     scan: TargetScan = None,
     leave_out: NotUsed = None,
-    auto_leave_out: Annotated[
-        bool, typer.Option("--auto-leave-out", help="Leave out views that do not fit.")
-    ] = False,
+    auto_leave_out: AutoLeaveOut = False,
     distortion: Distortion = None,
-    fix: Annotated[
-        list[str] | None, typer.Option(help="Hold 'aspect' (fx = fy) or 'centre'; repeatable.")
-    ] = None,
-    board_warp: Annotated[
-        bool, typer.Option("--board-warp", help="Also solve a bow of the board.")
-    ] = False,
+    fix: Fixed = None,
+    board_warp: BoardWarp = False,
+    solve_print: SolvePrint = False,
     method: MethodOption = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
@@ -122,6 +121,7 @@ def camera(
         "is_aspect_fixed": "aspect" in held or None,
         "is_principal_point_fixed": "centre" in held or None,
         "solve_warp": board_warp or None,
+        "solve_print": solve_print or None,
         "leave_out": tuple(leave_out) if leave_out else None,
         "leave_out_misfits": auto_leave_out or None,
     }

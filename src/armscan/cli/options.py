@@ -129,6 +129,21 @@ class Method(StrEnum):
     THESIS = "thesis"
 
 
+AutoLeaveOut = Annotated[
+    bool, typer.Option("--auto-leave-out", help="Leave out views that do not fit.")
+]
+Fixed = Annotated[
+    list[str] | None, typer.Option(help="Hold 'aspect' (fx = fy) or 'centre'; repeatable.")
+]
+BoardWarp = Annotated[bool, typer.Option("--board-warp", help="Also solve a bow of the board.")]
+SolvePrint = Annotated[
+    bool,
+    typer.Option(
+        "--solve-print",
+        help="Also solve where each point of the target is printed, if the views show that the "
+        "print errs: for 12 different views and more of a target of 35 points and more.",
+    ),
+]
 MethodOption = Annotated[
     Method | None,
     typer.Option("--method", help="thesis: as the thesis prints it, to set it beside armscan's."),

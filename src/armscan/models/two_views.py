@@ -310,7 +310,7 @@ class StereoDiagnostics:
         Squared distance of the typical pair's own ``right_from_left`` from the others' over its
         covariance and six degrees of freedom: about 1 where noise is all there is.
     target_error_mm
-        By how much the target's points miss their places, root mean square of an axis.
+        By how much the target's points miss their places, one standard deviation an axis.
     """
 
     epipolar_rms_px: float

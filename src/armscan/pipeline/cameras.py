@@ -22,9 +22,8 @@ from armscan.calibration.cameras.result import (
     BoardWarp,
     CameraFit,
     CameraOptions,
-    ViewFit,
 )
-from armscan.calibration.cameras.stereo_result import SideFit, StereoFit, ViewResiduals
+from armscan.calibration.cameras.stereo_result import SideFit, StereoFit
 from armscan.errors import InputError, begun
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -155,7 +154,7 @@ def calibrate_camera_from_views(
         done += 1
         rounds, settled = 0, None
         if total > 1:
-            plain = replace(options, distortion=model, n_folds=0)
+            plain = replace(options, distortion=model, n_folds=0, solve_print=False)
             try:
                 views, rounds, settled = _with_settled_centres(views, plain)
                 if settled is not None:
@@ -164,13 +163,20 @@ def calibrate_camera_from_views(
                 # a pinhole may fold over where the lens that is chosen does not
                 if done > 1 or options.distortion != "auto":
                     raise
-        fit = calibrate_camera(views, options)
+        fit = calibrate_camera(views, replace(options, solve_print=False))
         if isinstance(fit, FitFailure):
             return fit
         is_same = settled is not None and settled.free_parameters == fit.free_parameters
         if is_same or done == total:
             progress(ProgressEvent("solve", total, total))
-            return CameraRun(numbered_alike(views, fit, target), (), rounds)
+            fit = numbered_alike(views, fit, target)
+            printed = fit
+            if options.solve_print:
+                again = calibrate_camera([one.view for one in fit.views], options)
+                if isinstance(again, FitFailure):
+                    return again
+                printed = replace(again, refused_views=fit.refused_views)
+            return CameraRun(printed, (), rounds)
         progress(ProgressEvent("solve", done, total))
         model = "fisheye" if fit.camera.lens == "fisheye" else options.distortion
 
@@ -216,7 +222,7 @@ def _views_numbered_alike(
     if target is None or not target.symmetric_turns:
         return views
     seen = [
-        _seen(fit.camera, view.view, view.sensor_from_board, view)
+        _Seen(fit.camera, view.view, view.sensor_from_board, view.residuals_px, view.is_outlier)
         for view in fit.used_views
         if not view.is_misfit
     ]
@@ -229,30 +235,20 @@ def _views_numbered_alike(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """A view with its camera, and its pose, residuals and outliers before that camera, and what
-    the print was found to miss.
-    """
+    """A view with its camera, and its pose, residuals and outliers before that camera."""
 
     camera: CameraModel
     view: TargetView
     pose: Pose[Any, Board]
     residuals_px: FloatArray
-    missed_mm: FloatArray
     is_outlier: BoolArray
-
-
-def _seen(
-    camera: CameraModel, view: TargetView, pose: Pose[Any, Board], fit: ViewFit | ViewResiduals
-) -> _Seen:
-    return _Seen(camera, view, pose, fit.residuals_px, fit.missed_mm, fit.is_outlier)
 
 
 def _numbering_of(seen: Sequence[_Seen], known: Sequence[Numbering]) -> dict[str, Numbering]:
     """Numbering of each view, by source, in which all agree; empty if none changes."""
     places = [one.view.points_board_mm[~one.is_outlier] for one in seen]
     missed = [
-        one.missed_mm[~one.is_outlier]
-        + missed_places_mm(one.camera, one.pose, board_mm, one.residuals_px[~one.is_outlier])
+        missed_places_mm(one.camera, one.pose, board_mm, one.residuals_px[~one.is_outlier])
         for board_mm, one in zip(places, seen, strict=True)
     ]
     chosen = agreeing_numberings(places, missed, known)
@@ -474,10 +470,12 @@ def _pairs_numbered_alike(
             continue
         if pair.left is not None and left is not None:
             where = left.sensor_from_board
-            seen.append(_seen(fit.views.left, pair.left, where, left))
+            seen.append(_Seen(fit.views.left, pair.left, where, left.residuals_px, left.is_outlier))
         elif pair.right is not None and right is not None:
             before = fit.views.right_from_left @ right.sensor_from_board
-            seen.append(_seen(fit.views.right, pair.right, before, right))
+            seen.append(
+                _Seen(fit.views.right, pair.right, before, right.residuals_px, right.is_outlier)
+            )
     turn = _numbering_of(seen, numberings(target))
     if not turn:
         return None

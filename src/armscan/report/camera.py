@@ -103,7 +103,7 @@ def camera_quantities(fit: CameraFit, n_images: int) -> tuple[Quantity, ...]:
         *lens_quantities(fit.camera.lens),
         *parameter_quantities(fit),
         *(bow_quantities(fit.warp.bow_mm) if fit.warp is not None else ()),
-        *print_quantities(fit.target_error_mm),
+        *_print_quantities(fit),
     )
 
 
@@ -135,13 +135,16 @@ def bow_quantities(bow_mm: Sequence[float] | FloatArray) -> tuple[Quantity, ...]
     return (Quantity("board.bow_mm", "Bow of the board", value, shown=shown, meaning=words),)
 
 
-def print_quantities(error_mm: float) -> tuple[Quantity, ...]:
-    """What the target's points miss their places by; nothing where the views show none."""
-    if error_mm == 0.0:
+def _print_quantities(fit: CameraFit) -> tuple[Quantity, ...]:
+    """What the points were solved to miss their places by; nothing where they were not solved."""
+    if not fit.is_print_solved:
         return ()
-    shown = f"{significant(error_mm, 'mm')} rms an axis"
-    words = "where each point is printed is solved along"
-    return (Quantity("board.print_error_mm", "Misprints", error_mm, shown=shown, meaning=words),)
+    missed = np.concatenate([view.missed_mm for view in fit.used_views])
+    largest_mm = float(np.linalg.norm(missed, axis=1).max())
+    shown = f"{significant(fit.target_error_mm, 'mm')} rms an axis"
+    words = f"solved along; the largest {significant(largest_mm, 'mm')}"
+    label, value = "Misprints", fit.target_error_mm
+    return (Quantity("board.print_error_mm", label, value, shown=shown, meaning=words),)
 
 
 def meaning_of(name: str, lens: Lens) -> str:
@@ -187,7 +190,7 @@ def camera_page(
     words = (
         f"{sentence(fit.model_reason)} Pixel (0, 0) is the centre of the top-left pixel. "
         + noise_text(f"{fit.noise_scale:.2g} times")
-        + target_text(fit.target_error_mm)
+        + (PRINT_TEXT if fit.is_print_solved else target_text(fit.target_error_mm, "views"))
     )
     table = quantity_table(PARAMETER_HEADS, parameter_quantities(fit))
     charts = (_camera_residuals(fit), _residual_histogram(fit))
@@ -264,15 +267,21 @@ def noise_text(times: str) -> str:
     )
 
 
-def target_text(target_error_mm: float) -> str:
-    """How far target points miss their places, and what is done about it."""
+PRINT_TEXT = (
+    " Where each point of the target is printed was estimated together with the camera: residuals "
+    "are those from there, and unseen views are predicted on the places that the other views tell. "
+    "A lens that the model does not follow may pass for a print that errs."
+)
+
+
+def target_text(target_error_mm: float, what: str) -> str:
+    """How far target points miss their places, which more of ``what`` do not average."""
     if target_error_mm == 0.0:
         return ""
     return (
-        " Residuals of a target point repeat from view to view: the points are printed beside "
-        f"their places by {significant(target_error_mm)} mm (rms an axis). Where each lies is "
-        "estimated together with the camera; unseen views are predicted on the places that the "
-        "other views tell. A lens that the model does not follow may pass for a print that errs."
+        " Residuals of a target point repeat from view to view: the points miss their places by "
+        f"{significant(target_error_mm)} mm (one standard deviation an axis). More {what} do "
+        "not average that; the standard deviations hold it."
     )
 
 

@@ -26,7 +26,6 @@ from armscan.report.camera import (
     hold_out_quantity,
     meaning_of,
     noise_text,
-    print_quantities,
     rms_texts,
     target_text,
     unit_of,
@@ -114,7 +113,6 @@ def stereo_quantities(fit: StereoFit) -> tuple[Quantity, ...]:
         hold_out_quantity(fit.hold_out, "pairs"),
         *_relative_quantities(fit),
         *(() if bow is None else bow_quantities(bow.bow_mm)),
-        *print_quantities(fit.target_error_mm),
     )
 
 
@@ -180,7 +178,7 @@ def stereo_page(
     where = (
         f"{USES[fit.options.intrinsics]} The right camera's centre lies at x {x:.2f}, y {y:.2f}, "
         f"z {z:.2f} mm in the left camera's frame, which is the Sensor frame (x to the right, y "
-        "down, z forward). " + noise_text(scales) + target_text(fit.target_error_mm)
+        "down, z forward). " + noise_text(scales) + target_text(fit.target_error_mm, "pairs")
     )
     charts = (
         _epipolar_map(fit),

@@ -15,7 +15,7 @@ def solution(chi2: float, degrees_of_freedom: int) -> Solution:
     """What the test looks at of a solution."""
     shared = np.arange(11.0)
     found = SimpleNamespace(
-        cost=chi2,
+        equations=SimpleNamespace(chi2=chi2),
         degrees_of_freedom=degrees_of_freedom,
         variance_factor=chi2 / degrees_of_freedom,
         state=SimpleNamespace(shared=shared),

@@ -12,6 +12,7 @@ from scipy import stats
 
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
+from armscan.calibration.cameras.distortion import typical_coefficients
 from armscan.calibration.cameras.pairs import StereoOptions, StereoPair, views_of
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.calibration.cameras.stereo_result import StereoFit
@@ -106,21 +107,17 @@ def test_the_covariance_holds_the_truth(scene: StereoScene) -> None:
     assert low < float(np.mean(errors)) < high
 
 
-def test_large_misses_of_the_print_do_not_stand_for_noise() -> None:
-    """20 times the noise at the print: as noise of the points they made focal lengths 17 times as
-    wrong as need be, and chi2 a third of what it should be.
+def test_a_usual_size_counts_once_where_the_targets_points_are_off() -> None:
+    """Their variance is taken out of that of unit weight after the solution: k3, which these views
+    do not tell, was stated to be known four times better than to its usual size.
     """
     scene = StereoScene(n_pairs=8, noise_px=(0.02, 0.02), claimed_px=0.02, missed_mm=0.05)
     options = StereoOptions(CameraOptions(n_folds=0), n_folds=0)
-    errors, focal = [], []
-    for seed in range(12):
-        fit = calibrate_stereo(make_pairs(scene, seed)[0], scene.target, options)
-        assert isinstance(fit, StereoFit)
-        errors.append(normalised_stereo_error(scene.views, fit))
-        focal.append(fit.views.left.fx_px - scene.views.left.fx_px)
-    low, high = stats.chi2.ppf([0.0005, 0.9995], 24 * len(errors)) / len(errors)
-    assert low < float(np.mean(errors)) < high
-    assert float(np.sqrt(np.mean(np.square(focal)))) < 0.25
+    fit = calibrate_stereo(make_pairs(scene, 0)[0], scene.target, options)
+    assert isinstance(fit, StereoFit)
+    for camera, sigma in ((fit.views.left, fit.sigma[8]), (fit.views.right, fit.sigma[17])):
+        (usual,) = typical_coefficients(camera, ("k3",))
+        assert 0.6 * usual < sigma < 1.1 * usual
 
 
 def test_agrees_with_opencv_on_the_same_points() -> None:

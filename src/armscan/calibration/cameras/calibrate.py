@@ -16,6 +16,7 @@ from armscan.calibration.cameras.adjustment import (
     State,
     free_basis,
     gather,
+    joint_covariance,
 )
 from armscan.calibration.cameras.distortion import (
     MOST_COST,
@@ -25,14 +26,16 @@ from armscan.calibration.cameras.distortion import (
     contradicted_size,
     cost_of_usual,
     cross_validate,
+    design_effect,
     known_of_usual_lenses,
     level_of_points,
     print_stretch,
     resting_on_usual,
     rms,
     sigma_of_axis,
-    widening_of,
+    with_places_of_print,
 )
+from armscan.calibration.cameras.print_errors import BoardResiduals, eliminate_print
 from armscan.calibration.cameras.result import (
     DISTORTION_PARAMETERS,
     MIN_VIEWS,
@@ -48,20 +51,20 @@ from armscan.calibration.cameras.result import (
     rms_reasons,
 )
 from armscan.calibration.cameras.robust import (
-    EXCESS_ROUNDS,
     MISFIT_LEVEL,
     MISFIT_OUTLIERS,
     SUSPECT_LEVEL,
     WRONG_LEVEL,
     Solution,
+    added_variance_px2,
     better_fit,
     board_warp,
     chi2_of_points,
-    covariance_of_all,
-    levelled,
+    covariance_with_target_error,
+    estimate_target_error,
     residuals_px,
     solve_robustly,
-    with_print_errors,
+    with_excess,
     with_significant_bow,
 )
 from armscan.calibration.cameras.start import (
@@ -202,21 +205,29 @@ def assemble(
     bow = with_significant_bow(chosen.solution, options.max_steps, is_wanted=options.solve_warp)
     if isinstance(bow, FitFailure):
         return bow
-    solution, bow_test = bow
-    if bow_test is not None:
+    plain, bow_test = bow
+    solution = with_places_of_print(plain, options.max_steps) if options.solve_print else plain
+    if bow_test is not None or solution.print_error.is_seen:
         sources = tuple(view.source for view in used)
         validation = cross_validate(solution, sources, options.n_folds)
     observations = solution.observations
-    widening = widening_of(solution)
+    determined = joint_covariance(solution.equations, solution.basis)
+    if isinstance(determined, FitFailure):
+        return determined
+    unit, condition = determined
+    found = solution.board_residuals()
+    target_mm = estimate_target_error(found).sigma_mm
+    target_mm = observations.rms_missed_mm if solution.print_error.is_seen else target_mm
+    design = design_effect(solution)
     # with fy held to fx, pixels that are not square would pass for the print's stretch
     is_told = not options.is_aspect_fixed
-    stretch = print_stretch(solution, options.max_steps) if is_told else (0.0, np.inf)
-    stated = _stated_covariance(solution, chosen.untested, widening)
-    if isinstance(stated, FitFailure):
-        return stated
-    covariance, condition = stated
+    stretch = print_stretch(plain, options.max_steps) if is_told else (0.0, np.inf)
+    sigma0_squared = solution.variance_factor * design.widening
+    covariance = _stated_covariance(unit, solution, chosen.untested, sigma0_squared, found)
+    if isinstance(covariance, FitFailure):
+        return covariance
     # a bent or stretched target is told by its residuals, not by the sigma that they widen
-    refusal = _focal_refusal(solution, covariance / widening)
+    refusal = _focal_refusal(solution, covariance / design.widening)
     if refusal is not None:
         return refusal
     warp = None if bow_test is None else board_warp(solution, bow_test, covariance)
@@ -243,14 +254,14 @@ def assemble(
         rms_px=rms(misses_px),
         sigma_point_px=sigma_of_axis(misses_px, solution.degrees_of_freedom),
         noise_scale=_noise_scale(used, solution),
-        target_error_mm=observations.rms_missed_mm,
+        target_error_mm=target_mm,
         degrees_of_freedom=solution.degrees_of_freedom,
         condition=condition,
         coverage=coverage,
         cross_validation=validation,
         warp=warp,
         model_reason=chosen.reason,
-        design_effect=widening,
+        design_effect=design.widening,
         stretch=stretch[0],
         stretch_sigma=stretch[1],
         warnings=(),
@@ -262,25 +273,33 @@ def assemble(
 
 
 def _stated_covariance(
-    solution: Solution, untested: tuple[str, ...], widening: float
-) -> tuple[FloatArray, float] | FitFailure:
-    """Joint covariance with what was left at zero may be, and its condition."""
-    determined = covariance_of_all(solution, widening)
-    if isinstance(determined, FitFailure):
-        return determined
-    unit, condition = determined
-    shift = np.zeros(len(unit))
+    unit: FloatArray,
+    solution: Solution,
+    untested: tuple[str, ...],
+    sigma0_squared: float,
+    found: BoardResiduals | None,
+) -> FloatArray | FitFailure:
+    """Joint covariance with what the target's points miss and what was left at zero may be."""
+    target_error = estimate_target_error(found)
+    shift, first = np.zeros(len(unit)), unit
     if untested:
-        left = coefficients_left_at_zero(solution, untested, widening)
+        level = target_error.independent_share * sigma0_squared
+        left = coefficients_left_at_zero(solution, untested, level)
         if isinstance(left, FitFailure):
             return left
         unit, shift = left.unit_covariance, left.shift
-    covariance = solution.variance_factor * unit + np.outer(shift, shift)
+    covariance = covariance_with_target_error(unit, sigma0_squared, target_error, found)
+    if found is not None and solution.print_error.is_seen:
+        places = eliminate_print(
+            solution.equations, solution.basis, found, solution.print_error
+        ).covariance(solution.basis)
+        covariance = sigma0_squared * (places + unit - first)
+    covariance = covariance + np.outer(shift, shift)
     if solution.observations.lens == "fisheye":
         # what its decentring may be widens the others; it has no such parameters itself
         absent = [PARAMETER_NAMES.index(name) for name in TANGENTIAL]
         covariance[absent] = covariance[:, absent] = 0.0
-    return covariance, condition
+    return covariance
 
 
 def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | None:
@@ -398,6 +417,8 @@ def _left_out_fit(
     )
 
 
+EXCESS_ROUNDS = 2
+
 MIN_ANGLE_DEG = 5.0
 """Boards that differ in tilt by less than this are parallel: the focal length is not determined."""
 
@@ -418,8 +439,6 @@ def calibrate_camera(
     point weighted by its covariance (see `armscan.calibration.cameras.robust` for what is added to
     the detector's). The covariance is that of the normal equations, scaled by sigma0 squared =
     chi2 / degrees of freedom: the point covariances give the weights, the residuals the level.
-    Where the views show that the print misses its places, these are solved along (see
-    `armscan.calibration.cameras.print_errors`).
 
     A target of wrong size in mm cannot be noticed here: it scales the poses and leaves the camera
     as it is. A numbering that starts at the opposite corner of a symmetric target leaves it, too,
@@ -605,13 +624,11 @@ def _solve(
     for _ in range(EXCESS_ROUNDS):
         if isinstance(solution, FitFailure):
             return solution
-        noisier = levelled(observations, solution)
-        if noisier is observations:
+        excess = added_variance_px2(observations, solution)
+        if excess <= 0.0:
             break
+        noisier = with_excess(observations, excess)
         solution = solve_robustly(noisier, solution.state, basis, trusted, options.max_steps)
-    if isinstance(solution, FitFailure):
-        return solution
-    solution = with_print_errors(observations, solution, trusted, options.max_steps, widening_of)
     if isinstance(solution, FitFailure):
         return solution
     if largest_angle_deg(solution.state.rotations[:, :, 2]) < MIN_ANGLE_DEG:

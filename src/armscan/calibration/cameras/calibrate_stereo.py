@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrate a stereo pair from pairs of views of a target: starting values, joint adjustment, the
-error on pairs left out and the result.
+"""Calibrate a stereo pair from pairs of views of a target: starting values, joint adjustment
+and the result.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,6 @@ from armscan.calibration.cameras.distortion import (
     BEYOND_USUAL,
     rms,
     sigma_of_axis,
-    subset,
     typical_coefficients,
 )
 from armscan.calibration.cameras.joint import (
@@ -28,8 +27,9 @@ from armscan.calibration.cameras.joint import (
     StereoCovariance,
     StereoState,
     adjust_both,
-    both_residuals_px,
-    solve_both_and_print,
+    hold_out_pairs,
+    independent_share,
+    solve_both,
     stack_pair_observations,
     stereo_covariance,
 )
@@ -43,7 +43,6 @@ from armscan.calibration.cameras.pairs import (
     prepare_cameras,
     views_of,
 )
-from armscan.calibration.cameras.print_errors import settle_print
 from armscan.calibration.cameras.relate import (
     Cameras,
     PairNoise,
@@ -66,7 +65,7 @@ from armscan.calibration.cameras.stereo_result import (
     advise,
 )
 from armscan.errors import OptionError
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
 from armscan.models.calibration import CameraCalibration, independent_parameters
@@ -223,122 +222,6 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale))
 
 
-NO_SHARED = np.zeros((N_SHARED, 0))
-
-
-def hold_out_pairs(solution: JointSolution, n_folds: int, max_steps: int) -> CrossValidation | None:
-    """Hold out pairs fold by fold.
-
-    Each fold's pairs are left out, cameras and relative pose are solved from the rest, and each
-    held-out pair gets one board pose, fitted in both images. Views of one camera alone are never
-    held out, and outliers count nowhere.
-
-    Parameters
-    ----------
-    solution
-        Of all pairs; it also is the folds' starting value.
-    n_folds
-        Wanted folds; at most one a pair.
-    max_steps
-        Most iterations of each adjustment.
-
-    Returns
-    -------
-    result
-        None if too few pairs would be left to solve from, or if a fold has no solution.
-    """
-    boards = solution.boards
-    both = np.array([k for k, board in enumerate(boards) if board.is_seen_by_both], dtype=np.int64)
-    folds = min(n_folds, len(both))
-    if folds < 2 or len(both) - int(np.ceil(len(both) / folds)) < MIN_PAIRS:
-        return None
-    every = np.arange(len(boards))
-    predicted: list[tuple[IntArray, FloatArray]] = []
-    for fold in range(folds):
-        test = both[np.arange(len(both)) % folds == fold]
-        part = _held_out_residuals(solution, np.setdiff1d(every, test), test, max_steps)
-        if part is None:
-            return None
-        predicted += [(test[k : k + 1], residuals) for k, residuals in enumerate(part)]
-    in_sample = _per_board(
-        solution.residuals_px(), solution.observations, solution.weights, both.tolist()
-    )
-    ordered = {int(board[0]): residuals for board, residuals in predicted}
-    return CrossValidation(
-        folds,
-        rms(np.concatenate([ordered[int(k)] for k in both])),
-        rms(np.concatenate(in_sample)),
-        tuple(boards[k].name for k in both),
-        tuple(rms(ordered[int(k)]) for k in both),
-    )
-
-
-def _held_out_residuals(
-    solution: JointSolution, train: IntArray, test: IntArray, max_steps: int
-) -> list[FloatArray] | None:
-    """Residuals in both images of each board held out."""
-    training = _subset(solution, train)
-    first = adjust_both(training, _of_boards(solution.state, train), max_steps)
-    if isinstance(first, FitFailure):
-        return None
-    begun = replace(solution, problem=training, state=first.state, equations=first.system)
-    trained = settle_print(begun, max_steps, is_held=True)
-    if isinstance(trained, FitFailure):
-        return None
-    start = _of_boards(solution.state, test)
-    start = StereoState(
-        trained.state.intrinsics,
-        trained.state.right_from_left,
-        start.rotations,
-        start.translations_mm,
-    )
-    testing = replace(_subset(solution, test), basis=NO_SHARED, prior=None)
-    posed = adjust_both(testing, start, max_steps)
-    if isinstance(posed, FitFailure):
-        return None
-    residuals = both_residuals_px(testing.observations, posed.state)
-    return _per_board(residuals, testing.observations, testing.weights, range(len(test)))
-
-
-def _per_board(
-    residuals: tuple[FloatArray, FloatArray],
-    observations: JointObservations,
-    weights: PointWeights,
-    boards: Iterable[int],
-) -> list[FloatArray]:
-    """(K, 2) residuals of the points kept, left and right, of each board."""
-    return [
-        np.concatenate(
-            [
-                values[seen.rows(board)][weight[seen.rows(board)] > 0.0]
-                for values, seen, weight in zip(
-                    residuals, (observations.left, observations.right), weights, strict=True
-                )
-            ]
-        )
-        for board in boards
-    ]
-
-
-def _subset(solution: JointSolution, boards: IntArray) -> JointProblem:
-    left, left_weights = subset(solution.observations.left, solution.weights[0], boards)
-    right, right_weights = subset(solution.observations.right, solution.weights[1], boards)
-    return replace(
-        solution.problem,
-        observations=JointObservations(left, right),
-        weights=(left_weights, right_weights),
-    )
-
-
-def _of_boards(state: StereoState, boards: IntArray) -> StereoState:
-    return StereoState(
-        state.intrinsics,
-        state.right_from_left,
-        state.rotations[boards],
-        state.translations_mm[boards],
-    )
-
-
 NO_POSE = np.full(6, np.nan)
 
 
@@ -387,7 +270,7 @@ def assemble(
         hold_out=hold_out,
         degrees_of_freedom=solution.degrees_of_freedom,
         condition=covariance.condition,
-        target_error_mm=solution.observations.left.rms_missed_mm,
+        target_error_mm=covariance.target_error.sigma_mm,
         is_converged=solution.is_converged,
         warnings=(),
         options=options,
@@ -472,7 +355,6 @@ def _view_residuals(evidence: Evidence, side: int, board: int) -> ViewResiduals 
     return ViewResiduals(
         sensor_from_board=solution.state.pose(board),
         residuals_px=solution.residuals_px()[side][rows],
-        missed_mm=(solution.observations.left, solution.observations.right)[side].missed_mm[rows],
         is_outlier=solution.weights[side][rows] == 0.0,
     )
 
@@ -573,8 +455,16 @@ def _solve(
         _prior(cameras, options, given),
     )
     start = starting_state(boards, cameras, relation.right_from_left)
-    widening, steps = common_design_effect(cameras), options.camera.max_steps
-    return solve_both_and_print(boards.seen_by, problem, start, steps, widening)
+    solution = solve_both(boards.seen_by, problem, start, options.camera.max_steps)
+    if given is not None or problem.prior is None or isinstance(solution, FitFailure):
+        return solution
+    # what the target's points miss is no noise of the points: beside it usual sizes weigh less
+    share = independent_share(solution)
+    if share == 1.0:
+        return solution
+    usual = replace(problem.prior, information=share * problem.prior.information)
+    problem = replace(problem, prior=usual)
+    return solve_both(boards.seen_by, problem, solution.state, options.camera.max_steps)
 
 
 def on_bowed_board(observations: JointObservations, bow_mm: FloatArray) -> JointObservations:

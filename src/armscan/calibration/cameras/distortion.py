@@ -18,17 +18,15 @@ from armscan.calibration.cameras.adjustment import (
     adjust,
     basis_of,
     condition_number,
+    damped_step,
+    joint_covariance,
     linearise,
     normal_equations,
     predict,
     reduced_normal_matrix,
     with_known,
 )
-from armscan.calibration.cameras.print_errors import (
-    eliminate_print,
-    pull_of_places,
-    settle_print,
-)
+from armscan.calibration.cameras.print_errors import begin_print, settle_print
 from armscan.calibration.cameras.result import (
     MAX_STEPS,
     MIN_VIEWS,
@@ -38,8 +36,8 @@ from armscan.calibration.cameras.result import (
 from armscan.calibration.cameras.robust import (
     Solution,
     chi2_of_points,
-    cost_of_print,
-    covariance_of_all,
+    covariance_with_target_error,
+    estimate_target_error,
     residuals_px,
 )
 from armscan.geometry.arrays import FloatArray, IntArray
@@ -267,10 +265,10 @@ def design_effect(solution: Solution) -> DesignEffect:
     on the shared unknowns, poses eliminated, sum to zero. With R_v the information of view v and R
     their sum, independent points give
     ``E sum s_v' R^-1 s_v = sigma0^2 (F - sum tr((R^-1 R_v)^2))``; the design
-    effect (Kish; views are the clusters) is what is found over this. What the print misses is
-    solved, and is in no residual.
+    effect (Kish; views are the clusters) is what is found over this. Errors of the
+    target's points, which are counted by themselves, are taken out before.
     """
-    observations, basis = solution.observations, solution.basis
+    observations, basis = _without_target_error(solution), solution.basis
     known = observations.known
     observations = replace(observations, known=0.0 * known)
     information, pulls, chi2 = [], [], 0.0
@@ -299,9 +297,36 @@ def design_effect(solution: Solution) -> DesignEffect:
     )
 
 
-def widening_of(solution: Solution) -> float:
-    """Factor for variances by the `design_effect`."""
-    return design_effect(solution).widening
+def _without_target_error(solution: Solution) -> Observations:
+    """The observations less what each point of the target misses in the mean of all views."""
+    observations, found = solution.observations, solution.board_residuals()
+    if (
+        solution.print_error.is_seen
+        or found is None
+        or estimate_target_error(found).sigma_mm == 0.0
+    ):
+        return observations
+    missed = np.linalg.solve(found.by_board, found.residuals_px[:, :, None])[:, :, 0]
+    point = found.point
+    total = np.stack([np.bincount(point, missed[:, k]) for k in range(2)], axis=1)
+    mean = total / np.bincount(point)[:, None]
+    points_px = observations.points_px.copy()
+    points_px[solution.weights > 0.0] -= (found.by_board @ mean[point][:, :, None])[:, :, 0]
+    return replace(observations, points_px=points_px)
+
+
+def with_places_of_print(plain: Solution, max_steps: int) -> Solution:
+    """With the places of the print solved along, if the views show that it errs (`begin_print`).
+
+    What is usual of lenses weighs beside the points by the level that is left of them.
+    """
+    begun = begin_print(plain, max_steps, lambda one: max(design_effect(one).value, 1.0))
+    if isinstance(begun, FitFailure) or not begun.print_error.is_seen:
+        return plain
+    ratio = begun.variance_factor * design_effect(begun).widening / level_of_points(plain)
+    seen = replace(begun.observations, known=ratio * begun.observations.known)
+    again = settle_print(replace(begun, observations=seen), max_steps)
+    return plain if isinstance(again, FitFailure) else again
 
 
 FIRST_TERM = 0.3
@@ -341,7 +366,8 @@ def typical_coefficients(camera: CameraModel, names: tuple[str, ...]) -> FloatAr
 
 def level_of_points(solution: Solution) -> float:
     """Variance of a point of unit weight, widened where the residuals of one view are alike."""
-    return solution.variance_factor * widening_of(solution)
+    error = estimate_target_error(solution.board_residuals())
+    return solution.variance_factor * design_effect(solution).widening * error.independent_share
 
 
 def known_of_usual_lenses(solution: Solution, level: float) -> FloatArray:
@@ -369,34 +395,42 @@ def contradicted_size(solution: Solution, level: float) -> int | None:
 
     Solved beside s it is m, of which s is the share w. By the views alone it would be m / (1 - w),
     known to the variance s^2 w / (1 - w). Of a usual lens m is a normal variable of the variance
-    s^2 (1 - w).
+    s^2 (1 - w), and what misprints add to that.
     """
-    known, shares = solution.observations.known, _shares_of_usual(solution)
+    determined = joint_covariance(solution.equations, solution.basis)
+    if isinstance(determined, FitFailure):
+        return None
+    n, unit, known = len(SHARED_NAMES), determined[0], solution.observations.known
+    found = solution.board_residuals()
+    error = estimate_target_error(found)
+    whole = covariance_with_target_error(unit, level / error.independent_share, error, found)
+    shares = known * np.diag(unit)[:n]
+    added = np.maximum(np.diag(whole)[:n] - level * np.diag(unit)[:n], 0.0)
     is_told = (known > 0.0) & (shares < MOST_SHARE)
     variance = np.where(is_told, level / np.where(is_told, known, 1.0) * (1.0 - shares), 1.0)
-    excess = np.where(is_told, np.abs(solution.state.shared), 0.0) / np.sqrt(variance)
+    excess = np.where(is_told, np.abs(solution.state.shared), 0.0) / np.sqrt(variance + added)
     return int(excess.argmax()) if excess.max() > BEYOND_USUAL else None
 
 
 def cost_of_usual(beside: Solution, free: Solution) -> float:
     """By how much chi2 is larger beside usual sizes than free, of the points that both kept, at the
     weights of the free solution: each solution sets points aside and levels weights for itself.
-    What each has the print miss costs what it does in the free one.
+    What the target's points miss in all views, misprints, is no cost.
     """
     kept = (beside.weights > 0.0) & (free.weights > 0.0)
-    costs = []
+    chi2 = []
     for one in (beside, free):
-        seen = replace(free.observations, missed_mm=one.observations.missed_mm)
-        chi2 = float(chi2_of_points(seen, one.state)[kept].sum())
-        costs.append(chi2 + cost_of_print(seen, free.print_error))
-    return costs[0] - costs[1]
+        points_px = _without_target_error(one).points_px
+        seen = replace(free.observations, points_px=points_px)
+        chi2.append(float(chi2_of_points(seen, one.state)[kept].sum()))
+    return chi2[0] - chi2[1]
 
 
 def _shares_of_usual(solution: Solution) -> FloatArray:
-    """(11,) share of what is known of each shared unknown that was so beforehand; NaN if open."""
-    determined = covariance_of_all(solution)
+    """(11,) share of what is known of each shared unknown that was known beforehand."""
+    determined = joint_covariance(solution.equations, solution.basis)
     if isinstance(determined, FitFailure):
-        return np.full(len(SHARED_NAMES), np.nan)
+        return np.zeros(len(SHARED_NAMES))
     return np.asarray(solution.observations.known * np.diag(determined[0])[: len(SHARED_NAMES)])
 
 
@@ -404,7 +438,7 @@ def _shares_of_usual(solution: Solution) -> FloatArray:
 class LeftAtZero:
     """What coefficients that a kind of lens has not, and that may not be zero, do to all else.
 
-    ``unit_covariance`` (S + 6 V, S + 6 V) is as from `covariance_of_all`, with these coefficients
+    ``unit_covariance`` (S + 6 V, S + 6 V) is as from `joint_covariance`, with these coefficients
     unknown as well, but of a usual lens; ``shift`` (S + 6 V,) by what all would move if they were
     solved so.
     """
@@ -414,7 +448,7 @@ class LeftAtZero:
 
 
 def coefficients_left_at_zero(
-    solution: Solution, names: tuple[str, ...], widening: float
+    solution: Solution, names: tuple[str, ...], sigma0_squared: float
 ) -> LeftAtZero | FitFailure:
     """Joint covariance with coefficients that a kind of lens has not as further unknowns.
 
@@ -422,7 +456,8 @@ def coefficients_left_at_zero(
     length and the principal point. Taken as normal variables about zero with
     `typical_coefficients`, the views' own information added (Bayes).
 
-    ``widening`` is that of the points' variance where residuals of one view are alike.
+    ``sigma0_squared`` is the variance of a point of unit weight that the covariance will be scaled
+    with.
     """
     added = basis_of(names, is_aspect_fixed=False)
     basis = np.concatenate([solution.basis, added], axis=1)
@@ -431,18 +466,14 @@ def coefficients_left_at_zero(
         return FitFailure("the solution puts the board behind the camera")
     known = np.zeros(basis.shape[1])
     camera = solution.observations.camera(solution.state.shared[: len(PARAMETER_NAMES)])
-    level = solution.variance_factor * widening
-    known[-len(names) :] = level / typical_coefficients(camera, names) ** 2
+    known[-len(names) :] = sigma0_squared / typical_coefficients(camera, names) ** 2
     equations = replace(equations, shared=equations.shared + np.diag(known))
-    wide = replace(solution, equations=equations, basis=basis)
-    unit, widened = covariance_of_all(wide), covariance_of_all(wide, widening)
-    if isinstance(unit, FitFailure):
-        return unit
-    if isinstance(widened, FitFailure):
-        return widened
+    determined = joint_covariance(equations, basis)
+    if isinstance(determined, FitFailure):
+        return determined
     rows = [SHARED_NAMES.index(name) for name in names]
     pull = equations.shared_gradient[-len(names) :]
-    return LeftAtZero(widened[0], np.asarray(unit[0][:, rows] @ pull))
+    return LeftAtZero(determined[0], np.asarray(determined[0][:, rows] @ pull))
 
 
 def print_stretch(solution: Solution, max_steps: int) -> tuple[float, float]:
@@ -462,20 +493,17 @@ def print_stretch(solution: Solution, max_steps: int) -> tuple[float, float]:
     found = adjust(stretched, solution.state, solution.basis, solution.weights, max_steps)
     if isinstance(found, FitFailure):
         return first
-    begun = replace(solution, observations=stretched, state=found.state, equations=found.system)
-    again = settle_print(begun, max_steps, is_held=True)
-    if isinstance(again, FitFailure):
-        return first
+    again = replace(solution, observations=stretched, state=found.state, equations=found.system)
     rest, sigma = _stretch_step(again)
-    widening = float(np.sqrt(widening_of(again)))
+    widening = float(np.sqrt(design_effect(again).widening))
     return (1.0 + first[0]) * (1.0 + rest) - 1.0, sigma * widening
 
 
 def _stretch_step(solution: Solution) -> tuple[float, float]:
     """Change of the stretch in one step, and its sigma for points that err on their own."""
-    observations, n_free = solution.observations, solution.basis.shape[1]
-    prediction, found = predict(observations, solution.state), solution.board_residuals()
-    if prediction is None or found is None:
+    observations = solution.observations
+    prediction = predict(observations, solution.state)
+    if prediction is None:
         return 0.0, np.inf
     predicted, by_shared, by_pose = prediction
     ahead = solution.state.rotations[observations.view_of_point, :, 1]
@@ -484,13 +512,8 @@ def _stretch_step(solution: Solution) -> tuple[float, float]:
     equations = normal_equations(observations, predicted, free, by_pose, solution.weights)
     wide = np.column_stack([solution.basis, np.zeros(len(SHARED_NAMES))])
     equations = with_known(equations, observations.known, solution.state, wide)
-    if not condition_number(reduced_normal_matrix(equations)) < SINGULAR_CONDITION:
+    step, reduced = damped_step(equations, 0.0), reduced_normal_matrix(equations)
+    if step is None or not condition_number(reduced) < SINGULAR_CONDITION:
         return 0.0, np.inf
-    # the smooth miss that is a stretch is what is asked for
-    rest = found.fields[:, :, 1:]
-    found = replace(found, by_shared=free[solution.weights > 0.0], fields=rest)
-    eliminated = eliminate_print(equations, np.eye(n_free + 1), found, solution.print_error)
-    gradient = np.concatenate([equations.shared_gradient, equations.pose_gradient.ravel()])
-    step, _ = eliminated.steps(gradient, pull_of_places(found, solution.print_error))
-    variance = float(eliminated.inverse()[n_free, n_free]) * solution.variance_factor
-    return float(step[n_free]), float(np.sqrt(variance))
+    variance = float(np.linalg.inv(reduced)[-1, -1]) * solution.variance_factor
+    return float(step[0][-1]), float(np.sqrt(variance))

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint adjustment of two cameras and the boards that both see: parameters, robust solution and
-covariance.
+"""Joint adjustment of two cameras and the boards that both see: parameters, robust solution,
+covariance, and the error on pairs left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,26 +21,22 @@ from armscan.calibration.cameras.adjustment import (
     predict,
     target_points,
 )
-from armscan.calibration.cameras.pairs import StereoPair, views_of
-from armscan.calibration.cameras.print_errors import (
-    NO_ERROR,
-    BoardResiduals,
-    PrintError,
-    begin_print,
-    eliminate_print,
-    settle_print,
-    smooth_fields,
-)
+from armscan.calibration.cameras.distortion import rms, subset
+from armscan.calibration.cameras.pairs import MIN_PAIRS, StereoPair, views_of
+from armscan.calibration.cameras.print_errors import BoardResiduals, smooth_fields
+from armscan.calibration.cameras.result import CrossValidation
 from armscan.calibration.cameras.robust import (
-    EXCESS_ROUNDS,
+    TargetError,
     chi2_of_points,
     claimed_covariances,
+    covariance_with_target_error,
+    estimate_target_error,
     excess_variance_px2,
     judge,
     residuals_px,
     with_excess,
 )
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import Minimum
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
@@ -65,13 +61,6 @@ class JointObservations:
     def n_boards(self) -> int:
         """Count of boards."""
         return self.left.n_views
-
-    def with_places(self, missed_mm: FloatArray) -> JointObservations:
-        """The same of a print whose points miss their places by (P, 2)."""
-        return JointObservations(
-            replace(self.left, missed_mm=missed_mm[self.left.point]),
-            replace(self.right, missed_mm=missed_mm[self.right.point]),
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,15 +187,12 @@ class JointProblem:
         Factors of chi2 of the left and of the right points, 0 to leave a point out.
     prior
         What is known of the intrinsics, or None.
-    print_error
-        By which the places of the print are weighed, which are held.
     """
 
     observations: JointObservations
     basis: FloatArray
     weights: tuple[FloatArray, FloatArray]
     prior: Prior | None
-    print_error: PrintError = NO_ERROR
 
 
 def linearise_both(problem: JointProblem, state: StereoState) -> NormalEquations | None:
@@ -330,7 +316,6 @@ class JointSolution:
         """Coordinates used, and what is known beforehand, minus unknowns."""
         known = 0 if self.problem.prior is None else self.problem.prior.n_known
         n_unknown = int(self.problem.basis.shape[1]) + 6 * len(self.boards)
-        n_unknown += round(self.print_error.n_told)
         return 2 * int(sum(weight.sum() for weight in self.weights)) + known - n_unknown
 
     @property
@@ -341,72 +326,6 @@ class JointSolution:
     def residuals_px(self) -> tuple[FloatArray, FloatArray]:
         """Observed minus predicted of all left and of all right points."""
         return both_residuals_px(self.observations, self.state)
-
-    @property
-    def basis(self) -> FloatArray:
-        """(24, F) free directions of the shared unknowns."""
-        return self.problem.basis
-
-    @property
-    def print_error(self) -> PrintError:
-        """By which the places of the print are weighed."""
-        return self.problem.print_error
-
-    def board_residuals(self) -> BoardResiduals | None:
-        """Kept points of both cameras; left and right see a point of one board in two views."""
-        state, observations = self.state, self.observations
-        left = predict_left(observations.left, state)
-        right = predict_right(observations.right, state)
-        if left is None or right is None:
-            return None
-        parts = []
-        target = observations.left.target_mm
-        fields = smooth_fields(target)
-        for side, (seen, predicted) in enumerate(
-            ((observations.left, left), (observations.right, right))
-        ):
-            kept = np.flatnonzero(self.weights[side] > 0.0)
-            board = np.asarray(seen.view_of_point)[kept]
-            whitening = seen.whitening[kept]
-            parts.append(
-                BoardResiduals(
-                    seen.point[kept],
-                    seen.missed_mm[kept],
-                    (seen.points_px - predicted.points_px)[kept],
-                    predicted.by_pose[kept][:, :, 3:] @ state.rotations[board][:, :, :2],
-                    predicted.by_shared[kept],
-                    predicted.by_pose[kept],
-                    whitening.transpose(0, 2, 1) @ whitening,
-                    board,
-                    2 * board + side,
-                    target,
-                    fields,
-                )
-            )
-        return BoardResiduals.joined(parts)
-
-    def with_places(
-        self, missed_mm: FloatArray, step: FloatArray, max_steps: int
-    ) -> JointSolution | FitFailure:
-        """The minimum for points that miss their places by (P, 2), about a step (F + 6 U,) away."""
-        seen = self.observations.with_places(missed_mm)
-        problem = replace(self.problem, observations=seen)
-        shared, poses = np.split(step, [self.basis.shape[1]])
-        start = retract_state(self.state, self.basis, shared, poses.reshape(-1, 6))
-        found = adjust_both(problem, start, max_steps)
-        if isinstance(found, FitFailure):
-            return found
-        return replace(
-            self,
-            problem=problem,
-            state=found.state,
-            equations=found.system,
-            is_converged=found.is_settled,
-        )
-
-    def with_print_error(self, error: PrintError) -> JointSolution:
-        """The same with another weight of the print's places."""
-        return replace(self, problem=replace(self.problem, print_error=error))
 
 
 def both_residuals_px(
@@ -434,12 +353,7 @@ def stack_pair_observations(
         blank = _without_points(views_of(boards, side)[0])
         seen = [view or blank for view in (board.views[side] for board in boards)]
         sides.append(gather(seen, lenses[side]))
-    target, numbers = target_points(np.concatenate([side.board_mm for side in sides]))
-    left, right = np.split(numbers, [len(sides[0].board_mm)])
-    return JointObservations(
-        replace(sides[0], target_mm=target, point=left),
-        replace(sides[1], target_mm=target, point=right),
-    )
+    return JointObservations(sides[0], sides[1])
 
 
 def _without_points(view: TargetView) -> TargetView:
@@ -483,33 +397,6 @@ def solve_both(
             break
         problem, levels = replace(problem, observations=observations, weights=weights), found
     return solution
-
-
-def solve_both_and_print(
-    boards: Sequence[StereoPair],
-    problem: JointProblem,
-    start: StereoState,
-    max_steps: int,
-    widening: float,
-) -> JointSolution | FitFailure:
-    """As `solve_both`, and the places of the print, too, if it is seen to err (`begin_print`)."""
-    found = solve_both(boards, problem, start, max_steps)
-    if not isinstance(found, FitFailure):
-        found = begin_print(found, max_steps, lambda _: widening)
-    for _ in range(EXCESS_ROUNDS):
-        if isinstance(found, FitFailure) or not found.print_error.is_seen:
-            return found
-        error, residuals = found.print_error, found.board_residuals()
-        if residuals is None:
-            return found
-        seen = problem.observations.with_places(residuals.places_missed_mm)
-        told = replace(found.problem, observations=seen)
-        again = solve_both(boards, told, found.state, max_steps)
-        if isinstance(again, FitFailure):
-            return again
-        weight = again.variance_factor / error.sigma_mm**2
-        found = settle_print(again.with_print_error(replace(error, weight=weight)), max_steps)
-    return found
 
 
 def _levelled(
@@ -568,7 +455,7 @@ class StereoCovariance:
 
     matrix: FloatArray
     condition: float
-    print_error: PrintError
+    target_error: TargetError
 
 
 def stereo_covariance(
@@ -580,39 +467,184 @@ def stereo_covariance(
     was solved follows them, so that their uncertainty is carried into it. ``widening`` is a factor
     on the variance of the points' noise, for residuals that are alike.
     """
-    determined = joint_covariance(solution.equations, solution.basis)
-    found = solution.board_residuals()
+    determined = joint_covariance(solution.equations, solution.problem.basis)
     if isinstance(determined, FitFailure):
         return determined
-    if found is None:
-        return BEHIND
-    eliminated = eliminate_print(solution.equations, solution.basis, found, solution.print_error)
-    matrix = solution.variance_factor * eliminated.covariance(solution.basis, widening)
+    unit, condition = determined
+    found = _board_residuals(solution)
+    error = estimate_target_error(found)
+    matrix = covariance_with_target_error(unit, widening * solution.variance_factor, error, found)
     if held is not None:
-        unit = eliminated.covariance(solution.basis)
-        lever = _followed(solution, unit, found)
+        lever = _followed(solution, unit)
         if isinstance(lever, FitFailure):
             return lever
         matrix = matrix + lever @ held @ lever.T
-    return StereoCovariance(0.5 * (matrix + matrix.T), determined[1], solution.print_error)
+    return StereoCovariance(0.5 * (matrix + matrix.T), condition, error)
 
 
-def _followed(
-    solution: JointSolution, unit: FloatArray, found: BoardResiduals
-) -> FloatArray | FitFailure:
+def independent_share(solution: JointSolution) -> float:
+    """What part of the residuals' variance is of the images, not of the target's points."""
+    return estimate_target_error(_board_residuals(solution)).independent_share
+
+
+def _board_residuals(solution: JointSolution) -> BoardResiduals | None:
+    """Kept points of both cameras; left and right see a point of one board in two views."""
+    state, observations = solution.state, solution.observations
+    left = predict_left(observations.left, state)
+    right = predict_right(observations.right, state)
+    if left is None or right is None:
+        return None
+    parts = []
+    left_mm, right_mm = observations.left.board_mm, observations.right.board_mm
+    target, every = target_points(np.concatenate([left_mm, right_mm]))
+    numbers, fields = np.split(every, [len(left_mm)]), smooth_fields(target)
+    for side, (seen, predicted) in enumerate(
+        ((observations.left, left), (observations.right, right))
+    ):
+        kept = np.flatnonzero(solution.weights[side] > 0.0)
+        board = np.asarray(seen.view_of_point)[kept]
+        whitening = seen.whitening[kept]
+        parts.append(
+            BoardResiduals(
+                numbers[side][kept],
+                seen.missed_mm[kept],
+                (seen.points_px - predicted.points_px)[kept],
+                predicted.by_pose[kept][:, :, 3:] @ state.rotations[board][:, :, :2],
+                predicted.by_shared[kept],
+                predicted.by_pose[kept],
+                whitening.transpose(0, 2, 1) @ whitening,
+                board,
+                2 * board + side,
+                target,
+                fields,
+            )
+        )
+    return BoardResiduals.joined(parts)
+
+
+def _followed(solution: JointSolution, unit: FloatArray) -> FloatArray | FitFailure:
     """(24 + 6 U, 18) how all unknowns follow held intrinsics (implicit function)."""
     unbound = replace(solution.problem, basis=np.eye(N_SHARED), prior=None)
     equations = linearise_both(unbound, solution.state)
     if equations is None:
-        return BEHIND
-    whole = eliminate_print(equations, unbound.basis, found, solution.print_error).matrix
-    lever = -unit @ whole[:, :N_INTRINSICS]
+        return FitFailure(
+            "how the cameras' places follow the given intrinsics cannot be told: at the solution a "
+            "board lies behind a camera",
+            "check that the given calibrations are of these cameras",
+        )
+    cross = equations.cross.transpose(0, 2, 1)[:, :, :N_INTRINSICS].reshape(-1, N_INTRINSICS)
+    lever = -unit @ np.concatenate([equations.shared[:, :N_INTRINSICS], cross])
     lever[:N_INTRINSICS] += np.eye(N_INTRINSICS)
     return np.asarray(lever)
 
 
-BEHIND = FitFailure(
-    "what is uncertain in the cameras' places cannot be told: at the solution a board lies behind "
-    "a camera",
-    "check that the given calibrations are of these cameras",
-)
+NO_SHARED = np.zeros((N_SHARED, 0))
+
+
+def hold_out_pairs(solution: JointSolution, n_folds: int, max_steps: int) -> CrossValidation | None:
+    """Hold out pairs fold by fold.
+
+    Each fold's pairs are left out, cameras and relative pose are solved from the rest, and each
+    held-out pair gets one board pose, fitted in both images. Views of one camera alone are never
+    held out, and outliers count nowhere.
+
+    Parameters
+    ----------
+    solution
+        Of all pairs; it also is the folds' starting value.
+    n_folds
+        Wanted folds; at most one a pair.
+    max_steps
+        Most iterations of each adjustment.
+
+    Returns
+    -------
+    result
+        None if too few pairs would be left to solve from, or if a fold has no solution.
+    """
+    boards = solution.boards
+    both = np.array([k for k, board in enumerate(boards) if board.is_seen_by_both], dtype=np.int64)
+    folds = min(n_folds, len(both))
+    if folds < 2 or len(both) - int(np.ceil(len(both) / folds)) < MIN_PAIRS:
+        return None
+    every = np.arange(len(boards))
+    predicted: list[tuple[IntArray, FloatArray]] = []
+    for fold in range(folds):
+        test = both[np.arange(len(both)) % folds == fold]
+        part = _held_out_residuals(solution, np.setdiff1d(every, test), test, max_steps)
+        if part is None:
+            return None
+        predicted += [(test[k : k + 1], residuals) for k, residuals in enumerate(part)]
+    in_sample = _per_board(
+        solution.residuals_px(), solution.observations, solution.weights, both.tolist()
+    )
+    ordered = {int(board[0]): residuals for board, residuals in predicted}
+    return CrossValidation(
+        folds,
+        rms(np.concatenate([ordered[int(k)] for k in both])),
+        rms(np.concatenate(in_sample)),
+        tuple(boards[k].name for k in both),
+        tuple(rms(ordered[int(k)]) for k in both),
+    )
+
+
+def _held_out_residuals(
+    solution: JointSolution, train: IntArray, test: IntArray, max_steps: int
+) -> list[FloatArray] | None:
+    """Residuals in both images of each board held out."""
+    training = _subset(solution, train)
+    trained = adjust_both(training, _of_boards(solution.state, train), max_steps)
+    if isinstance(trained, FitFailure):
+        return None
+    start = _of_boards(solution.state, test)
+    start = StereoState(
+        trained.state.intrinsics,
+        trained.state.right_from_left,
+        start.rotations,
+        start.translations_mm,
+    )
+    testing = replace(_subset(solution, test), basis=NO_SHARED, prior=None)
+    posed = adjust_both(testing, start, max_steps)
+    if isinstance(posed, FitFailure):
+        return None
+    residuals = both_residuals_px(testing.observations, posed.state)
+    return _per_board(residuals, testing.observations, testing.weights, range(len(test)))
+
+
+def _per_board(
+    residuals: tuple[FloatArray, FloatArray],
+    observations: JointObservations,
+    weights: PointWeights,
+    boards: Iterable[int],
+) -> list[FloatArray]:
+    """(K, 2) residuals of the points kept, left and right, of each board."""
+    return [
+        np.concatenate(
+            [
+                values[seen.rows(board)][weight[seen.rows(board)] > 0.0]
+                for values, seen, weight in zip(
+                    residuals, (observations.left, observations.right), weights, strict=True
+                )
+            ]
+        )
+        for board in boards
+    ]
+
+
+def _subset(solution: JointSolution, boards: IntArray) -> JointProblem:
+    left, left_weights = subset(solution.observations.left, solution.weights[0], boards)
+    right, right_weights = subset(solution.observations.right, solution.weights[1], boards)
+    return replace(
+        solution.problem,
+        observations=JointObservations(left, right),
+        weights=(left_weights, right_weights),
+    )
+
+
+def _of_boards(state: StereoState, boards: IntArray) -> StereoState:
+    return StereoState(
+        state.intrinsics,
+        state.right_from_left,
+        state.rotations[boards],
+        state.translations_mm[boards],
+    )

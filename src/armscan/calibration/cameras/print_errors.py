@@ -276,22 +276,17 @@ class PrintEliminated:
         followed += self.shared @ (self.middle @ (self.shared.T @ places.reshape(-1)))
         return unknowns, (followed - self.carried.T @ unknowns).reshape(-1, 2)
 
-    def covariance(self, basis: FloatArray, widening: float = 1.0) -> FloatArray:
+    def covariance(self, basis: FloatArray) -> FloatArray:
         """(S + 6 V, S + 6 V) of the shared unknowns and the poses, in units of sigma0 squared.
 
-        ``basis`` is (S, F). ``widening`` is a factor on the points' variance that the places were
-        not weighed by; what the places add is not widened.
+        ``basis`` is (S, F).
         """
         inverse, n_free = self.inverse(), basis.shape[1]
         n_poses = len(inverse) - n_free
         lever = np.zeros((len(basis) + n_poses, len(inverse)))
         lever[: len(basis), :n_free] = basis
         lever[len(basis) :, n_free:] = np.eye(n_poses)
-        by_places = inverse @ self.carried
-        by_smooth = by_places @ self.fields
-        added = by_places @ by_places.T - self.error.smooth_share * by_smooth @ by_smooth.T
-        whole = widening * inverse - (widening - 1.0) * self.error.weight * added
-        return np.asarray(lever @ (0.5 * (whole + whole.T)) @ lever.T)
+        return np.asarray(lever @ (0.5 * (inverse + inverse.T)) @ lever.T)
 
 
 def eliminate_print(
@@ -423,7 +418,7 @@ def settle_print(solution: S, max_steps: int, *, is_held: bool = False) -> S | F
         rough = (1.0 - now.smooth_share) / (1.0 - error.smooth_share)
         change = np.log([now.weight / error.weight, rough])
         largest_mm = max(float(np.abs(missed_mm).max()), error.sigma_mm)
-        is_still = np.abs(step).max() < PLACES_SETTLED * largest_mm
+        is_still = np.abs(step[found.point]).max() < PLACES_SETTLED * largest_mm
         if is_still and np.abs(change).max() < WEIGHT_SETTLED:
             break
     return solution
@@ -443,7 +438,9 @@ def begin_print(solution: S, max_steps: int, widening: Callable[[S], float]) -> 
     if not error.is_seen:
         trial = smooth_trial(found, solution.variance_factor)
         tried = settle_print(solution.with_print_error(trial), max_steps, is_held=True)
-        if isinstance(tried, FitFailure) or not _is_smooth(solution, tried, widening(tried)):
+        if isinstance(tried, FitFailure) or not _is_smooth(
+            solution, tried, max(widening(solution), widening(tried))
+        ):
             return solution
         error = trial
     return settle_print(solution.with_print_error(error), max_steps)

@@ -62,6 +62,9 @@ class CameraOptions:
     solve_warp
         Solve two bow parameters of the board along with the camera in any case; they are solved by
         themselves where the board is significantly bowed.
+    solve_print
+        Solve where each point of the target is printed along with the camera, if the views show
+        that the print errs (`armscan.calibration.cameras.print_errors`).
     leave_out
         Sources of views that are not used.
     leave_out_misfits
@@ -79,6 +82,7 @@ class CameraOptions:
     is_aspect_fixed: bool = False
     is_principal_point_fixed: bool = False
     solve_warp: bool = False
+    solve_print: bool = False
     leave_out: tuple[str, ...] = ()
     leave_out_misfits: bool = False
     n_folds: int = 5
@@ -280,8 +284,8 @@ class CameraFit(ArrayRecord):
         `armscan.calibration.cameras.robust`.
     target_error_mm
         Root mean square, along an axis of the board, by which the target's points miss their
-        places, as told by residuals that repeat from view to view; 0 where none do. Each place is
-        solved along (see `armscan.calibration.cameras.print_errors`), and is in the covariance.
+        places, as told by residuals that repeat from view to view; 0 where none do. The covariance
+        holds its effect, or that of places that were solved along.
     degrees_of_freedom
         Count of observed coordinates minus count of unknowns.
     condition
@@ -328,6 +332,11 @@ class CameraFit(ArrayRecord):
     stretch_sigma: float
     warnings: tuple[str, ...]
     options: CameraOptions
+
+    @property
+    def is_print_solved(self) -> bool:
+        """Whether places of the target's points were solved along."""
+        return any(view.missed_mm.any() for view in self.used_views)
 
     @property
     def used_views(self) -> tuple[ViewFit, ...]:

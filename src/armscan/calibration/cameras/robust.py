@@ -5,7 +5,6 @@ misses and the bend of the board.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,19 +17,17 @@ from armscan.calibration.cameras.adjustment import (
     Observations,
     State,
     adjust,
-    joint_covariance,
     moved,
     predict,
     predict_px,
 )
 from armscan.calibration.cameras.print_errors import (
+    FEWEST_VIEWS,
+    LEAST_INDEPENDENT,
     NO_ERROR,
     SIGNIFICANT_SIGMAS,
     BoardResiduals,
     PrintError,
-    begin_print,
-    eliminate_print,
-    settle_print,
     smooth_fields,
 )
 from armscan.calibration.cameras.result import BOW_P, BoardWarp
@@ -141,11 +138,6 @@ class Solution:
     def variance_factor(self) -> float:
         """sigma0 squared: chi2 of the points over the degrees of freedom."""
         return self.chi2 / max(self.degrees_of_freedom, 1)
-
-    @property
-    def cost(self) -> float:
-        """What is least at the minimum: chi2, what is known beforehand, and the print's misses."""
-        return self.equations.chi2 + cost_of_print(self.observations, self.print_error)
 
     def board_residuals(self) -> BoardResiduals | None:
         """The points kept; None if the state is impossible."""
@@ -337,72 +329,85 @@ def _typical(levels: FloatArray) -> float:
     return max(float(np.median(levels)), 1e-12)
 
 
-def cost_of_print(observations: Observations, error: PrintError) -> float:
-    """What the places of a print add to chi2."""
-    missed_mm = np.zeros_like(observations.target_mm)
-    missed_mm[observations.point] = observations.missed_mm
-    return error.cost(missed_mm, smooth_fields(observations.target_mm)) if error.is_seen else 0.0
-
-
-EXCESS_ROUNDS = 2
-
-
-def with_print_errors(
-    claimed: Observations,
-    solution: Solution,
-    trusted: BoolArray,
-    max_steps: int,
-    widening: Callable[[Solution], float],
-) -> Solution | FitFailure:
-    """Solve for the places of the print, too, where the views show that it errs (`begin_print`).
-
-    ``claimed`` are the points with the covariances of their detector. What is left of the residuals
-    tells the noise and the outliers anew.
-    """
-    found = begin_print(solution, max_steps, widening)
-    for _ in range(EXCESS_ROUNDS):
-        if isinstance(found, FitFailure) or not found.print_error.is_seen:
-            return found
-        error = found.print_error
-        seen = levelled(replace(claimed, missed_mm=found.observations.missed_mm), found)
-        again = solve_robustly(seen, found.state, found.basis, trusted, max_steps)
-        if isinstance(again, FitFailure):
-            return again
-        again = again.with_print_error(error)
-        weight = again.variance_factor / error.sigma_mm**2
-        found = settle_print(again.with_print_error(replace(error, weight=weight)), max_steps)
-    return found
-
-
-def levelled(claimed: Observations, solution: Solution) -> Observations:
-    """The observations with what their residuals scatter more than is claimed; the same if none."""
+def added_variance_px2(observations: Observations, solution: Solution) -> float:
+    """Variance to add to the detector's covariances, by the rule of `excess_variance_px2`."""
     kept = solution.weights > 0.0
-    excess = excess_variance_px2(
-        residuals_px(claimed, solution.state)[kept],
-        claimed_covariances(claimed)[kept],
-        float(chi2_of_points(claimed, solution.state)[kept].sum()),
+    return excess_variance_px2(
+        residuals_px(observations, solution.state)[kept],
+        claimed_covariances(observations)[kept],
+        float(chi2_of_points(observations, solution.state)[kept].sum()),
         solution.degrees_of_freedom,
     )
-    return with_excess(claimed, excess) if excess > 0.0 else claimed
 
 
-def covariance_of_all(
-    solution: Solution, widening: float = 1.0
-) -> tuple[FloatArray, float] | FitFailure:
-    """As `joint_covariance`, for a print of which the views alone tell where its points are.
+@dataclass(frozen=True, slots=True)
+class TargetError:
+    """How far the target's points miss their places.
 
-    ``widening`` is that of the points' variance where residuals of one view are alike; what the
-    print misses is not widened.
+    Parameters
+    ----------
+    sigma_mm
+        Standard deviation along each axis of the board; 0 where views show none.
+    independent_share
+        Part of the residuals' variance that is new in every view.
     """
-    determined = joint_covariance(solution.equations, solution.basis)
-    if isinstance(determined, FitFailure):
-        return determined
-    unit, condition = determined
-    found = solution.board_residuals() if solution.print_error.is_seen else None
-    if found is None:
-        return widening * unit, condition
-    eliminated = eliminate_print(solution.equations, solution.basis, found, solution.print_error)
-    return eliminated.covariance(solution.basis, widening), condition
+
+    sigma_mm: float
+    independent_share: float
+
+
+def estimate_target_error(found: BoardResiduals | None) -> TargetError:
+    """Find how far target points miss their places, from how residuals agree between views."""
+    if found is None or len(np.unique(found.view)) < FEWEST_VIEWS:
+        return TargetError(0.0, 1.0)
+    residuals, by_board, point = found.residuals_px, found.by_board, found.point
+    missed = np.linalg.solve(by_board, residuals[:, :, None])[:, :, 0]
+    count = np.bincount(point)
+    total = np.stack([np.bincount(point, missed[:, k]) for k in range(2)], axis=1)
+    squares = np.bincount(point, np.sum(missed**2, axis=1))
+    products = float(np.sum(total**2) - squares.sum())
+    pairs = float(np.sum(count * (count - 1)))
+    scatter = float(squares.sum()) / (2.0 * len(point))
+    if not products > SIGNIFICANT_SIGMAS * 2.0 * scatter * np.sqrt(pairs):
+        return TargetError(0.0, 1.0)
+    variance = products / (2.0 * pairs)
+    explained = variance * float(np.mean(np.sum(by_board**2, axis=(1, 2))))
+    share = 1.0 - explained / float(np.mean(np.sum(residuals**2, axis=1)))
+    return TargetError(float(np.sqrt(variance)), max(share, LEAST_INDEPENDENT))
+
+
+def covariance_with_target_error(
+    unit_covariance: FloatArray,
+    variance_factor: float,
+    error: TargetError,
+    found: BoardResiduals | None,
+) -> FloatArray:
+    """Covariance (S + 6 V, S + 6 V) of shared unknowns and poses with the target's own errors.
+
+    ``unit_covariance`` is that of `armscan.calibration.cameras.adjustment.joint_covariance`,
+    ``variance_factor`` the solution's sigma0 squared.
+    """
+    covariance = error.independent_share * variance_factor * unit_covariance
+    if error.sigma_mm == 0.0 or found is None:
+        return covariance
+    pull = _pull_of_points(found, len(unit_covariance))
+    moved = np.tensordot(unit_covariance, pull, axes=(1, 1))
+    return np.asarray(covariance + error.sigma_mm**2 * np.einsum("ipk,jpk->ij", moved, moved))
+
+
+def _pull_of_points(found: BoardResiduals, size: int) -> FloatArray:
+    """(P, S + 6 V, 2) right-hand side that a unit error of each target point causes."""
+    point = found.point
+    weighted = found.information @ found.by_board
+    shared = found.by_shared.transpose(0, 2, 1) @ weighted
+    pose = found.by_pose.transpose(0, 2, 1) @ weighted
+    n_shared = found.by_shared.shape[2]
+    pull = np.zeros((int(point.max()) + 1, size, 2))
+    np.add.at(pull[:, :n_shared], point, shared)
+    first = n_shared + 6 * found.board
+    for k in range(6):
+        np.add.at(pull, (point, first + k), pose[:, k])
+    return pull
 
 
 _FIRST = SHARED_NAMES.index(WARP_NAMES[0])
@@ -417,14 +422,13 @@ def with_board_warp(flat: Solution, max_steps: int) -> Solution | FitFailure:
     result = adjust(flat.observations, flat.state, basis, flat.weights, max_steps)
     if isinstance(result, FitFailure):
         return result
-    bowed = replace(
+    return replace(
         flat,
         state=result.state,
         basis=basis,
         equations=result.system,
         is_converged=result.is_settled,
     )
-    return settle_print(bowed, max_steps, is_held=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -438,7 +442,7 @@ class BowTest:
     def of(flat: Solution, bowed: Solution) -> BowTest:
         """Compare the solutions without and with bow."""
         n_parameters = len(WARP_NAMES)
-        decrease = max(flat.cost - bowed.cost, 0.0)
+        decrease = max(flat.equations.chi2 - bowed.equations.chi2, 0.0)
         statistic = decrease / n_parameters / bowed.variance_factor
         freedom = max(bowed.degrees_of_freedom, 1)
         return BowTest(float(statistic), float(fdtrc(n_parameters, freedom, statistic)))

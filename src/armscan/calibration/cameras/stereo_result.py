@@ -53,15 +53,12 @@ class ViewResiduals(ArrayRecord):
         by that view alone.
     residuals_px
         (M, 2) observed minus predicted.
-    missed_mm
-        (M, 2) what the print misses each point's place by, as of `ViewFit`.
     is_outlier
         (M,) points left out of the solution as outliers.
     """
 
     sensor_from_board: Pose[Sensor, Board]
     residuals_px: FloatArray = floats("M", 2)
-    missed_mm: FloatArray = floats("M", 2)
     is_outlier: BoolArray = bools("M")
 
     @property
@@ -185,7 +182,7 @@ class StereoFit(ArrayRecord):
     condition
         Of the normal matrix of the free shared unknowns, unit diagonal, boards eliminated.
     target_error_mm
-        By how much the target's points miss their places, root mean square of an axis.
+        By how much the target's points miss their places, one standard deviation an axis.
     is_converged
         False if the adjustment was stopped before the minimum.
     warnings

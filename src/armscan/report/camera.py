@@ -136,9 +136,11 @@ def bow_quantities(bow_mm: Sequence[float] | FloatArray) -> tuple[Quantity, ...]
 
 
 def _print_quantities(fit: CameraFit) -> tuple[Quantity, ...]:
-    """What the points were solved to miss their places by; nothing where they were not solved."""
-    if not fit.is_print_solved:
+    """What the points were solved to miss their places by; nothing where that was not asked for."""
+    if not fit.options.solve_print:
         return ()
+    if not fit.is_print_solved:
+        return (fact("Misprints", "none that the views show: taken as stated"),)
     missed = np.concatenate([view.missed_mm for view in fit.used_views])
     largest_mm = float(np.linalg.norm(missed, axis=1).max())
     shown = f"{significant(fit.target_error_mm, 'mm')} rms an axis"
@@ -190,7 +192,7 @@ def camera_page(
     words = (
         f"{sentence(fit.model_reason)} Pixel (0, 0) is the centre of the top-left pixel. "
         + noise_text(f"{fit.noise_scale:.2g} times")
-        + (PRINT_TEXT if fit.is_print_solved else target_text(fit.target_error_mm, "views"))
+        + _print_text(fit)
     )
     table = quantity_table(PARAMETER_HEADS, parameter_quantities(fit))
     charts = (_camera_residuals(fit), _residual_histogram(fit))
@@ -267,11 +269,16 @@ def noise_text(times: str) -> str:
     )
 
 
-PRINT_TEXT = (
-    " Where each point of the target is printed was estimated together with the camera: residuals "
-    "are those from there, and unseen views are predicted on the places that the other views tell. "
-    "A lens that the model does not follow may pass for a print that errs."
-)
+def _print_text(fit: CameraFit) -> str:
+    """What is said of the target's points."""
+    if not fit.is_print_solved:
+        return target_text(fit.target_error_mm, "views")
+    return (
+        f" The target's points lie {significant(fit.target_error_mm)} mm (rms an axis) beside their "
+        "places. Where each is printed was estimated together with the camera: residuals are those "
+        "from there, and unseen views are predicted on the places that the other views tell. A lens "
+        "that the model does not follow may pass for a print that errs."
+    )
 
 
 def target_text(target_error_mm: float, what: str) -> str:

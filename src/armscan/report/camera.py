@@ -274,10 +274,10 @@ def _print_text(fit: CameraFit) -> str:
     if not fit.is_print_solved:
         return target_text(fit.target_error_mm, "views")
     return (
-        f" The target's points lie {significant(fit.target_error_mm)} mm (rms an axis) beside their "
-        "places. Where each is printed was estimated together with the camera: residuals are those "
-        "from there, and unseen views are predicted on the places that the other views tell. A lens "
-        "that the model does not follow may pass for a print that errs."
+        f" The target's points lie {significant(fit.target_error_mm)} mm (rms an axis) beside "
+        "their places. Where each is printed was estimated together with the camera: residuals "
+        "are those from there, and unseen views are predicted on the places that the other views "
+        "tell. A lens that the model does not follow may pass for a print that errs."
     )
 
 

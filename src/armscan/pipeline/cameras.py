@@ -172,7 +172,10 @@ def calibrate_camera_from_views(
             fit = numbered_alike(views, fit, target)
             printed = fit
             if options.solve_print:
-                again = calibrate_camera([one.view for one in fit.views], options)
+                posed = [one.view for one in fit.views]
+                named = {view.source for view in posed}
+                left_out = tuple(name for name in options.leave_out if name in named)
+                again = calibrate_camera(posed, replace(options, leave_out=left_out))
                 if isinstance(again, FitFailure):
                     return again
                 printed = replace(again, refused_views=fit.refused_views)

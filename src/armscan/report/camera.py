@@ -140,7 +140,7 @@ def _print_quantities(fit: CameraFit) -> tuple[Quantity, ...]:
     if not fit.options.solve_print:
         return ()
     if not fit.is_print_solved:
-        return (fact("Misprints", "none that the views show: taken as stated"),)
+        return (fact("Misprints", "none seen, of which four views and more tell: taken as stated"),)
     missed = np.concatenate([view.missed_mm for view in fit.used_views])
     largest_mm = float(np.linalg.norm(missed, axis=1).max())
     shown = f"{significant(fit.target_error_mm, 'mm')} rms an axis"

@@ -237,3 +237,17 @@ def test_a_print_is_solved_where_it_is_asked_for_alone() -> None:
     assert plain.target_error_mm == pytest.approx(asked.target_error_mm, rel=0.1)
     assert plain.rms_px > 1.5 * asked.rms_px
     assert (plain.sigma[:4] > 1.5 * asked.sigma[:4]).all()
+
+
+@pytest.mark.parametrize("is_asked", [False, True])
+def test_a_point_that_no_view_keeps_tells_nothing(*, is_asked: bool) -> None:
+    views, _ = make_views(Scene(missed_mm=0.02), 6)
+    off = [
+        replace(view, points_px=view.points_px + 3.0 * (view.point_index == 40)[:, None])
+        for view in views
+    ]
+    fit = calibrate_camera(off, replace(OPTIONS, solve_print=is_asked))
+    assert isinstance(fit, CameraFit)
+    assert fit.target_error_mm == pytest.approx(0.02, rel=0.2)
+    truth, value = CAMERA.parameters, fit.camera.parameters
+    assert normalised_error(truth, value, fit.covariance) < 27.9

@@ -104,3 +104,13 @@ def test_an_arm_whose_every_posture_scatters_so_stands_still_all_the_same() -> N
     few = [stripes[0], _moved(stripes[1], 0.0, np.radians(0.6)), *stripes[2:4]]
     with pytest.raises(InputError, match="has different poses"):
         check_postures(few, HandEyeOptions())
+
+
+def test_one_posture_of_many_exposures_is_no_majority() -> None:
+    """One that creeps over eight exposures, beside two that stand still."""
+    rig = PlateRig(good_postures(10, np.random.default_rng(1)), exposures_per_posture=8)
+    stripes, _ = rig.draw(1)
+    kept = [s for k, s in enumerate(stripes) if k < 8 or (k // 8 < 3 and k % 8 < 2) or k % 8 == 0]
+    crept = [_moved(s, 0.4 * k, 0.0) if k < 8 else s for k, s in enumerate(kept)]
+    with pytest.raises(InputError, match="has different poses"):
+        check_postures(crept, HandEyeOptions())

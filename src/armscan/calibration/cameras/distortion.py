@@ -309,7 +309,7 @@ def _without_target_error(solution: Solution) -> Observations:
     missed = np.linalg.solve(found.by_board, found.residuals_px[:, :, None])[:, :, 0]
     point = found.point
     total = np.stack([np.bincount(point, missed[:, k]) for k in range(2)], axis=1)
-    mean = total / np.bincount(point)[:, None]
+    mean = total / np.maximum(np.bincount(point), 1)[:, None]
     points_px = observations.points_px.copy()
     points_px[solution.weights > 0.0] -= (found.by_board @ mean[point][:, :, None])[:, :, 0]
     return replace(observations, points_px=points_px)

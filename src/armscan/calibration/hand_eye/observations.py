@@ -45,8 +45,8 @@ scatter by 0.06 mm, 30 mm from where its pose turns, is within it too. Other pos
 apart."""
 STANDING_SIGMAS = 10.0
 LEAST_STANDING, TYPICAL_MOVES, FAR_POSTURE = 3, 4.0, np.array([3.0, np.radians(1.0)])
-"""So many postures of several exposures tell by their median what an arm that stands still scatters
-by; one may move by so many times that, but no more than this, in mm and rad."""
+"""So many postures of several exposures tell by their median what a standing arm scatters by; one
+may move by so many times that, but no more than this, in mm and rad."""
 TIP_SHARE = 0.4
 """What the tip's own calibration errs by, over what touches scatter by: the root of 3/20, as of a
 centre (three unknowns) found by twenty touches. It is alike in all touches of the plate, which
@@ -238,8 +238,7 @@ class Posed(Protocol):
 def check_postures(exposures: Sequence[Posed], options: HandEyeOptions) -> None:
     """Refuse a posture's name that stands for different poses of the arm.
 
-    An arm of which a larger scatter from exposure to exposure was given, or is seen in most
-    postures, may move that much more.
+    An arm of which a larger scatter was given, or is seen in most postures, may move more.
 
     Raises
     ------
@@ -251,9 +250,12 @@ def check_postures(exposures: Sequence[Posed], options: HandEyeOptions) -> None:
     first_of: dict[str, Posed] = {}
     firsts = [first_of.setdefault(exposure.posture, exposure) for exposure in exposures]
     moves = [_move(first, exposure) for first, exposure in zip(firsts, exposures, strict=True)]
-    again = [n for n, first in enumerate(firsts) if first is not exposures[n]]
-    if len({exposures[n].posture for n in again}) >= LEAST_STANDING:
-        typical = TYPICAL_MOVES * np.median([moves[n] for n in again], axis=0)
+    farthest: dict[str, FloatArray] = {}
+    for first, exposure, move in zip(firsts, exposures, moves, strict=True):
+        if first is not exposure:
+            farthest[first.posture] = np.maximum(farthest.get(first.posture, 0.0), move)
+    if len(farthest) >= LEAST_STANDING:
+        typical = TYPICAL_MOVES * np.median(list(farthest.values()), axis=0)
         most = np.maximum(most, np.minimum(typical, FAR_POSTURE))
     for first, exposure, (shift_mm, turn_rad) in zip(firsts, exposures, moves, strict=True):
         if shift_mm > most[0] or turn_rad > most[1]:

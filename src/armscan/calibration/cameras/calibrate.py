@@ -35,7 +35,7 @@ from armscan.calibration.cameras.distortion import (
     sigma_of_axis,
     with_places_of_print,
 )
-from armscan.calibration.cameras.print_errors import BoardResiduals, eliminate_print
+from armscan.calibration.cameras.print_errors import eliminate_print, estimate_target_error
 from armscan.calibration.cameras.result import (
     DISTORTION_PARAMETERS,
     MIN_VIEWS,
@@ -61,7 +61,6 @@ from armscan.calibration.cameras.robust import (
     board_warp,
     chi2_of_points,
     covariance_with_target_error,
-    estimate_target_error,
     residuals_px,
     solve_robustly,
     with_excess,
@@ -215,15 +214,14 @@ def assemble(
     if isinstance(determined, FitFailure):
         return determined
     unit, condition = determined
-    found = solution.board_residuals()
-    target_mm = estimate_target_error(found).sigma_mm
+    target_mm = estimate_target_error(solution.board_residuals()).sigma_mm
     target_mm = observations.rms_missed_mm if solution.print_error.is_seen else target_mm
     design = design_effect(solution)
     # with fy held to fx, pixels that are not square would pass for the print's stretch
     is_told = not options.is_aspect_fixed
     stretch = print_stretch(plain, options.max_steps) if is_told else (0.0, np.inf)
     sigma0_squared = solution.variance_factor * design.widening
-    covariance = _stated_covariance(unit, solution, chosen.untested, sigma0_squared, found)
+    covariance = _stated_covariance(unit, solution, chosen.untested, sigma0_squared)
     if isinstance(covariance, FitFailure):
         return covariance
     # a bent or stretched target is told by its residuals, not by the sigma that they widen
@@ -277,9 +275,9 @@ def _stated_covariance(
     solution: Solution,
     untested: tuple[str, ...],
     sigma0_squared: float,
-    found: BoardResiduals | None,
 ) -> FloatArray | FitFailure:
     """Joint covariance with what the target's points miss and what was left at zero may be."""
+    found = solution.board_residuals()
     target_error = estimate_target_error(found)
     shift, first = np.zeros(len(unit)), unit
     if untested:

@@ -26,7 +26,11 @@ from armscan.calibration.cameras.adjustment import (
     reduced_normal_matrix,
     with_known,
 )
-from armscan.calibration.cameras.print_errors import begin_print, settle_print
+from armscan.calibration.cameras.print_errors import (
+    begin_print,
+    estimate_target_error,
+    settle_print,
+)
 from armscan.calibration.cameras.result import (
     MAX_STEPS,
     MIN_VIEWS,
@@ -37,7 +41,6 @@ from armscan.calibration.cameras.robust import (
     Solution,
     chi2_of_points,
     covariance_with_target_error,
-    estimate_target_error,
     residuals_px,
 )
 from armscan.geometry.arrays import FloatArray, IntArray

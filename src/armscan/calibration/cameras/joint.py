@@ -23,14 +23,16 @@ from armscan.calibration.cameras.adjustment import (
 )
 from armscan.calibration.cameras.distortion import rms, subset
 from armscan.calibration.cameras.pairs import MIN_PAIRS, StereoPair, views_of
-from armscan.calibration.cameras.print_errors import BoardResiduals, smooth_fields
+from armscan.calibration.cameras.print_errors import (
+    BoardResiduals,
+    TargetError,
+    estimate_target_error,
+)
 from armscan.calibration.cameras.result import CrossValidation
 from armscan.calibration.cameras.robust import (
-    TargetError,
     chi2_of_points,
     claimed_covariances,
     covariance_with_target_error,
-    estimate_target_error,
     excess_variance_px2,
     judge,
     residuals_px,
@@ -497,7 +499,7 @@ def _board_residuals(solution: JointSolution) -> BoardResiduals | None:
     parts = []
     left_mm, right_mm = observations.left.board_mm, observations.right.board_mm
     target, every = target_points(np.concatenate([left_mm, right_mm]))
-    numbers, fields = np.split(every, [len(left_mm)]), smooth_fields(target)
+    numbers = np.split(every, [len(left_mm)])
     for side, (seen, predicted) in enumerate(
         ((observations.left, left), (observations.right, right))
     ):
@@ -516,7 +518,6 @@ def _board_residuals(solution: JointSolution) -> BoardResiduals | None:
                 board,
                 2 * board + side,
                 target,
-                fields,
             )
         )
     return BoardResiduals.joined(parts)

@@ -133,8 +133,6 @@ class BoardResiduals:
         (N,) number of the view: two cameras have two views of one board.
     target_mm
         (P, 2) places of the target's points.
-    fields
-        (P, 2, K) their smooth misses (`smooth_fields`).
     """
 
     point: IntArray
@@ -147,7 +145,6 @@ class BoardResiduals:
     board: IntArray
     view: IntArray
     target_mm: FloatArray
-    fields: FloatArray
 
     @staticmethod
     def joined(parts: Sequence[BoardResiduals]) -> BoardResiduals:
@@ -163,13 +160,17 @@ class BoardResiduals:
             np.concatenate([part.board for part in parts]),
             np.concatenate([part.view for part in parts]),
             parts[0].target_mm,
-            parts[0].fields,
         )
 
     @property
     def n_points(self) -> int:
         """Count P of the target's points."""
         return len(self.target_mm)
+
+    @property
+    def fields(self) -> FloatArray:
+        """(P, 2, K) smooth misses of the target's points (`smooth_fields`)."""
+        return smooth_fields(self.target_mm)
 
     @property
     def length_mm(self) -> float:
@@ -190,12 +191,30 @@ class BoardResiduals:
         return missed
 
 
-def seen_print_error(found: BoardResiduals, variance_factor: float, widening: float) -> PrintError:
+@dataclass(frozen=True, slots=True)
+class TargetError:
+    """How far the target's points miss their places.
+
+    Parameters
+    ----------
+    sigma_mm
+        Standard deviation along each axis of the board; 0 where views show none.
+    independent_share
+        Part of the residuals' variance that is new in every view.
+    """
+
+    sigma_mm: float
+    independent_share: float
+
+
+def estimate_target_error(found: BoardResiduals | None, widening: float = 1.0) -> TargetError:
     """Find how far target points miss their places, from how residuals agree between views.
 
-    ``variance_factor`` is sigma0 squared of a solution that takes the print for right,
-    ``widening`` of it for residuals that are alike in a view: so many fewer points agree by chance.
+    ``widening`` is that of the points' variance for residuals that are alike in a view: so many
+    fewer points agree by chance.
     """
+    if found is None or len(np.unique(found.view)) < FEWEST_VIEWS:
+        return TargetError(0.0, 1.0)
     residuals, by_board, point = found.residuals_px, found.by_board, found.point
     missed = np.linalg.solve(by_board, residuals[:, :, None])[:, :, 0]
     count = np.bincount(point)
@@ -205,12 +224,22 @@ def seen_print_error(found: BoardResiduals, variance_factor: float, widening: fl
     pairs = float(np.sum(count * (count - 1)))
     scatter = float(squares.sum()) / (2.0 * len(point))
     if not products > SIGNIFICANT_SIGMAS * 2.0 * scatter * np.sqrt(pairs * widening):
-        return NO_ERROR
+        return TargetError(0.0, 1.0)
     variance = products / (2.0 * pairs)
     explained = variance * float(np.mean(np.sum(by_board**2, axis=(1, 2))))
     share = 1.0 - explained / float(np.mean(np.sum(residuals**2, axis=1)))
-    independent = variance_factor * max(share, LEAST_INDEPENDENT)
-    return PrintError(float(np.sqrt(variance)), independent / variance)
+    return TargetError(float(np.sqrt(variance)), max(share, LEAST_INDEPENDENT))
+
+
+def seen_print_error(found: BoardResiduals, variance_factor: float, widening: float) -> PrintError:
+    """`estimate_target_error` as a size of the places; `NO_ERROR` where none is seen.
+
+    ``variance_factor`` is sigma0 squared of a solution that takes the print for right.
+    """
+    seen = estimate_target_error(found, widening)
+    if seen.sigma_mm == 0.0:
+        return NO_ERROR
+    return PrintError(seen.sigma_mm, variance_factor * seen.independent_share / seen.sigma_mm**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -316,8 +345,9 @@ def eliminate_print(
         for k in range(6):
             np.add.at(cross, (found.point, n_free + 6 * found.board + k), by_pose[:, k])
     own = np.asarray(np.linalg.inv(normal + error.weight * np.eye(2)), dtype=np.float64)
-    fields = found.fields[:n_points]
-    flat = fields.reshape(2 * n_points, found.fields.shape[2])
+    every = found.fields
+    fields = every[:n_points]
+    flat = fields.reshape(2 * n_points, every.shape[2])
     shared = (own @ fields).reshape(flat.shape)
     lent = error.weight * error.smooth_share
     middle = np.asarray(np.linalg.inv(np.eye(flat.shape[1]) - lent * flat.T @ shared) * lent)

@@ -22,13 +22,11 @@ from armscan.calibration.cameras.adjustment import (
     predict_px,
 )
 from armscan.calibration.cameras.print_errors import (
-    FEWEST_VIEWS,
-    LEAST_INDEPENDENT,
     NO_ERROR,
     SIGNIFICANT_SIGMAS,
     BoardResiduals,
     PrintError,
-    smooth_fields,
+    TargetError,
 )
 from armscan.calibration.cameras.result import BOW_P, BoardWarp
 from armscan.geometry.arrays import BoolArray, FloatArray
@@ -160,7 +158,6 @@ class Solution:
             view,
             view,
             observations.target_mm,
-            smooth_fields(observations.target_mm),
         )
 
     def with_places(
@@ -338,42 +335,6 @@ def added_variance_px2(observations: Observations, solution: Solution) -> float:
         float(chi2_of_points(observations, solution.state)[kept].sum()),
         solution.degrees_of_freedom,
     )
-
-
-@dataclass(frozen=True, slots=True)
-class TargetError:
-    """How far the target's points miss their places.
-
-    Parameters
-    ----------
-    sigma_mm
-        Standard deviation along each axis of the board; 0 where views show none.
-    independent_share
-        Part of the residuals' variance that is new in every view.
-    """
-
-    sigma_mm: float
-    independent_share: float
-
-
-def estimate_target_error(found: BoardResiduals | None) -> TargetError:
-    """Find how far target points miss their places, from how residuals agree between views."""
-    if found is None or len(np.unique(found.view)) < FEWEST_VIEWS:
-        return TargetError(0.0, 1.0)
-    residuals, by_board, point = found.residuals_px, found.by_board, found.point
-    missed = np.linalg.solve(by_board, residuals[:, :, None])[:, :, 0]
-    count = np.bincount(point)
-    total = np.stack([np.bincount(point, missed[:, k]) for k in range(2)], axis=1)
-    squares = np.bincount(point, np.sum(missed**2, axis=1))
-    products = float(np.sum(total**2) - squares.sum())
-    pairs = float(np.sum(count * (count - 1)))
-    scatter = float(squares.sum()) / (2.0 * len(point))
-    if not products > SIGNIFICANT_SIGMAS * 2.0 * scatter * np.sqrt(pairs):
-        return TargetError(0.0, 1.0)
-    variance = products / (2.0 * pairs)
-    explained = variance * float(np.mean(np.sum(by_board**2, axis=(1, 2))))
-    share = 1.0 - explained / float(np.mean(np.sum(residuals**2, axis=1)))
-    return TargetError(float(np.sqrt(variance)), max(share, LEAST_INDEPENDENT))
 
 
 def covariance_with_target_error(

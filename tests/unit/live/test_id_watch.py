@@ -184,8 +184,8 @@ def test_a_session_tells_of_an_arm_without_ids() -> None:
     assert told_of(frames, samples) == {(SAMPLES_WITHOUT, "arm")}
     with_ids = [replace(one, trigger_id=one.number) for one in samples]
     assert told_of(frames, with_ids, is_arm_first=True) == set()
-    # counts that were apart from the start
-    begun = [replace(one, trigger_id=one.number + 3) for one in frames]
+    # counts that were apart from the start, by more than there are samples
+    begun = [replace(one, trigger_id=one.number + 30) for one in frames]
     assert told_of(begun, with_ids) == {(IDS_APART, "arm")}
 
 

@@ -19,7 +19,7 @@ NEWTON_TOLERANCE_MM = 1e-6
 """A last step larger than this means that the ray does not meet the bowed sheet."""
 SETTLED_MM = 1e-9
 """Steps double their digits: the one after this would change nothing."""
-MAX_FAN = 0.8
+MAX_FAN = (2.0, 0.8)
 """Largest lean and spread that a bow may ask for; one that reaches it is not known."""
 NEAREST_SOURCE = 0.2
 """Nearer to the light's source than this part of its distance the sheet is not followed."""

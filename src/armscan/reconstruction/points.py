@@ -154,7 +154,7 @@ def known_rays(sensor: SensorCalibration, sheet: int) -> tuple[LightSheet, float
     variance = np.diag(sensor_covariance(sensor, sheet))[N_CAMERA : N_CAMERA + N_SHEET]
     of_uv, of_u2v = np.sqrt(variance[[_OF_BOW + _UV, _OF_BOW + _U2V]])
     slant = max(LEAST_SLANT, FAN_SIGMAS * float(np.hypot(0.5 * of_uv, of_u2v)) / bow)
-    if slant < LARGEST_SLANT and np.abs(model.fan).max() < MAX_FAN:
+    if slant < LARGEST_SLANT and (np.abs(model.fan) < MAX_FAN).all():
         return model, slant
     return replace(model, fan=np.zeros(2)), LARGEST_SLANT
 

@@ -8,8 +8,10 @@ import numpy as np
 
 from armscan.calibration.sheets.model import _OneSheet
 from armscan.models.light_sheet import BOW_TERMS, LightSheet
+from rigs.instrument_stages import run_camera, run_sheets
+from rigs.instruments import draw_instrument
 
-U2, UV, U2V = (BOW_TERMS.index(term) for term in ((2, 0), (1, 1), (2, 1)))
+U2, UV, U3, U2V = (BOW_TERMS.index(term) for term in ((2, 0), (1, 1), (3, 0), (2, 1)))
 FLAT = LightSheet(
     origin_mm=np.array([0.0, 0.0, 130.0]), axes=np.eye(3), scale_mm=25.0, bow_mm=np.zeros(5)
 )
@@ -30,9 +32,11 @@ class _Stated(_OneSheet):
         bow_mm, sigma_mm, chi2_of_fan = self.told
         bow = np.zeros(5)
         bow[U2] = bow_mm
-        # light that spreads by 0.2 leaves, of rays taken for parallel, -0.2 u^2 v of the bow
+        # light that spreads by 0.2 leaves, of rays taken for parallel, -0.2 u^2 v of the bow, and
+        # light that leans by 0.1 -0.3 u^2 v of what goes with u^3
+        bow[U3] = 0.3 * bow_mm
         bow[UV] = 2.0 * bow_mm * (start.fan[0] - 0.1)
-        bow[U2V] = bow_mm * (start.fan[1] - 0.2)
+        bow[U2V] = bow_mm * (start.fan[1] - 0.2) + 3.0 * bow[U3] * (start.fan[0] - 0.1)
         return SimpleNamespace(
             sheets=(replace(start, bow_mm=bow),),
             chi2=chi2_of_fan(start.fan),
@@ -52,3 +56,15 @@ def test_a_fan_that_explains_the_stripes_worse_is_not_followed() -> None:
     found = sheet.solve_bowed(FLAT, 1.0)
     assert np.array_equal(found.sheets[0].fan, [0.0, 0.0])
     assert found.chi2 == 0.0
+
+
+def test_the_fan_of_light_that_leans_is_where_its_source_is() -> None:
+    """Cones whose rays lean by two thirds: a ray through ``(u, 0)`` comes from the source."""
+    made = draw_instrument(8200079)
+    camera = run_camera(made)
+    sheets = run_sheets(made, camera.calibration, camera.information)
+    assert sheets.fit is not None and sheets.outcome.result == "right"
+    for found, light in zip(sheets.fit.sheets, sheets.names, strict=True):
+        sheet = found.sheet
+        u, v = sheet.axes[:2] @ (made.lights[light].source - sheet.origin_mm) / sheet.scale_mm
+        np.testing.assert_allclose(sheet.fan, [u / v, -1.0 / v], atol=0.1)

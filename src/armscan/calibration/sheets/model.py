@@ -306,12 +306,14 @@ N_DOUBTED = 4
 SCATTER_SETTLED = 0.06
 """A step of the factors that are tried."""
 MAX_RAISES = 10
-FAN_ROUNDS = 5
+FAN_ROUNDS = 8
 FAN_SETTLED = 1e-3
+MOST_AHEAD = 3.0
+"""Steps by which a round may go on beyond what it asks for."""
 USUAL_FAN = 0.5
 """Size of a fan's lean and spread where the bow is too small to show them: a source twice as far as
 the calibrated region is wide. It only keeps them finite."""
-U2, UV, U2V = (BOW_TERMS.index(term) for term in ((2, 0), (1, 1), (2, 1)))
+U2, UV, U3, U2V = (BOW_TERMS.index(term) for term in ((2, 0), (1, 1), (3, 0), (2, 1)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -575,24 +577,27 @@ class _OneSheet:
         """Fit a bowed sheet, and find from the bow itself how its light spreads.
 
         Where the rays come from shows in how the bow along the stripe changes with depth: to first
-        order a fan adds ``-2 lean u v - spread u^2 v`` to ``u^2``. A bow too weak to show it can
-        lead astray: the fan is followed as long as the stripes fit no worse for it.
+        order a fan adds ``-2 lean u v - spread u^2 v`` to ``u^2`` and ``-3 lean u^2 v`` to ``u^3``.
+        A bow too weak to show it can lead astray: a fan by which the stripes fit worse is halved.
         """
         best: SheetSolution | None = None
-        least = np.inf
+        least, best_fan = np.inf, start.fan
+        before: tuple[FloatArray, FloatArray] | None = None
         for _ in range(FAN_ROUNDS):
             solution = self.solve(start, sigma_factor, is_bowed=True)
             if isinstance(solution, FitFailure):
                 return solution if best is None else best
-            sheet = solution.sheets[0]
-            cost = solution.chi2 + float(((sheet.fan / USUAL_FAN) ** 2).sum())
+            cost = solution.chi2 + float(((start.fan / USUAL_FAN) ** 2).sum())
             if cost >= least:
+                before, start = None, replace(start, fan=0.5 * (best_fan + start.fan))
+                continue
+            best, least, best_fan = solution, cost, start.fan
+            asked = self._fan_of(solution)
+            step = asked - best_fan
+            if float(np.abs(step).max()) < FAN_SETTLED:
                 break
-            best, least = solution, cost
-            fan = self._fan_of(solution)
-            if float(np.abs(fan - sheet.fan).max()) < FAN_SETTLED:
-                break
-            start = replace(start, fan=fan)
+            start = replace(start, fan=_ahead(asked, step, before))
+            before = asked, step
         return best if best is not None else solution
 
     def _fan_of(self, solution: SheetSolution) -> FloatArray:
@@ -602,14 +607,11 @@ class _OneSheet:
         variance = np.diag(solution.covariance)[self.errors.n_camera + N_PLANE :]
         lean, spread = sheet.fan
         sideways = 2.0 * lean * bow - sheet.bow_mm[UV]
-        weaker = spread * bow - sheet.bow_mm[U2V]
-        fan = np.array(
-            [
-                0.5 * bow * sideways / (bow**2 + 0.25 * variance[UV] / USUAL_FAN**2),
-                bow * weaker / (bow**2 + variance[U2V] / USUAL_FAN**2),
-            ]
-        )
-        return np.asarray(np.clip(fan, -MAX_FAN, MAX_FAN))
+        leans = 0.5 * bow * sideways / (bow**2 + 0.25 * variance[UV] / USUAL_FAN**2)
+        leans = float(np.clip(leans, -MAX_FAN[0], MAX_FAN[0]))
+        weaker = spread * bow - sheet.bow_mm[U2V] - 3.0 * (leans - lean) * sheet.bow_mm[U3]
+        spreads = bow * weaker / (bow**2 + variance[U2V] / USUAL_FAN**2)
+        return np.array([leans, np.clip(spreads, -MAX_FAN[1], MAX_FAN[1])])
 
     def charged_to_boards(
         self, model: SheetModel, factors: tuple[float, ...]
@@ -669,6 +671,18 @@ class _OneSheet:
                 break
             factor *= float(np.sqrt(test.f_ratio))
         return replace(model, sheet=solution.sheets[0], sigma_factor=factor)
+
+
+def _ahead(
+    asked: FloatArray, step: FloatArray, before: tuple[FloatArray, FloatArray] | None
+) -> FloatArray:
+    """Where rounds ``x -> asked`` of steps ``asked - x`` lead, by the secant of the last two."""
+    if before is None:
+        return asked
+    change = step - before[1]
+    share = float(step @ change) / max(float(change @ change), FAN_SETTLED**2)
+    ahead = asked - np.clip(share, -MOST_AHEAD, 1.0) * (asked - before[0])
+    return np.asarray(np.clip(ahead, -np.array(MAX_FAN), MAX_FAN))
 
 
 def _is_explained(test: FTest) -> bool:

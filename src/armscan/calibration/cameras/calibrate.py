@@ -577,7 +577,8 @@ def _beside_usual_sizes(
     level = level_of_points(free)
     known = known_of_usual_lenses(free, level)
     while True:
-        solution = _solve(used, replace(observations, known=known), prepared, _ALL, options)
+        beside_sizes = replace(observations, known=known)
+        solution = _solve(used, beside_sizes, prepared, _ALL, options, more=[first.state])
         if isinstance(solution, FitFailure):
             return solution
         beside = _with_its_bow(solution, options)
@@ -608,7 +609,10 @@ def _solve(
     prepared: PreparedViews,
     model: DistortionModel,
     options: CameraOptions,
+    *,
+    more: Sequence[State] = (),
 ) -> Solution | FitFailure:
+    """The best fit from the closed forms, and from states that are likely to be near."""
     basis, _ = free_basis(model, options)
     starts = _starts(used, observations, prepared, model, options)
     if isinstance(starts, FitFailure):
@@ -616,7 +620,7 @@ def _solve(
     trusted = starts[0][1]
     found = [
         solve_robustly(observations, state, basis, trusted, options.max_steps)
-        for state, _ in starts
+        for state in [*(state for state, _ in starts), *more]
     ]
     solution = reduce(better_fit, [_unmirrored(each, trusted, options) for each in found])
     for _ in range(EXCESS_ROUNDS):

@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Base, Points, Pose, Sensor
@@ -24,10 +22,10 @@ from armscan.reconstruction.labels import (
 )
 from armscan.reconstruction.segments import (
     SHARPNESS,
-    STUDENT,
     ImageMemory,
     LoneLines,
     Pieces,
+    SurfaceMemory,
     cut_pieces,
     likeliest,
     smoothed_posterior,
@@ -45,156 +43,6 @@ FIELD_MM = 85.0
 """The lengths in mm hold for fields of view up to this. Wider ones see coarser points of larger
 things: there all lengths grow with the field. Smaller ones do not have a better arm, nor a slower
 hand."""
-SPACING_MM = 0.5
-"""Remembered points of one stripe are thinned to about this."""
-N_NEAR = 32
-REACH_MM = 5.0
-"""Nothing is predicted further than this from all that is known."""
-NOISE_MM = 0.04
-"""Stripe, arm and calibration together, between exposures of one pass."""
-BEND_PER_MM = 0.06
-"""Half the curvature of surfaces, 1/mm: a plane is off by this times the distance squared."""
-SLOPE = 1.0
-"""Standard deviation, before anything is known, of a surface's slope towards the camera."""
-EDGE_ON = 0.05
-"""Least cosine between a surface's normal and the camera's axis."""
-SHARP_MM = 0.3
-"""Vaguer predictions err by the same all along a segment; the change is steep (fourth power)."""
-AMID_MM, MOST_PULL, LEAST_AMID = 2.0, 0.5, 3
-"""A place is seen again if so many known points lie within this of it, and not on one side: the
-mean of the unit vectors to them is shorter than this (of a half disc it is 0.64)."""
-
-
-@dataclass(slots=True, eq=False)
-class SurfaceMemory:
-    """Points in Base of the last exposures.
-
-    Parameters
-    ----------
-    n_exposures
-        How many exposures are remembered.
-    depth_span_mm
-        Width of the range over which a new surface is as likely at any depth.
-    scale
-        By which all lengths in mm grow, see `FIELD_MM`.
-    """
-
-    n_exposures: int = 40
-    depth_span_mm: float = 60.0
-    scale: float = 1.0
-    _kept: deque[FloatArray] = field(default_factory=deque)
-    _tree: cKDTree | None = None
-
-    def __len__(self) -> int:
-        """Count of remembered points."""
-        return sum(len(points) for points in self._kept)
-
-    def forget(self) -> None:
-        """Begin anew."""
-        self._kept.clear()
-        self._tree = None
-
-    def remember(self, points_base_mm: FloatArray) -> None:
-        """Add the points (N, 3) of an exposure, in the order of their stripes."""
-        points = points_base_mm / self.scale
-        step = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
-        # a jump between stripes counts for one step, so that each stripe's first point is kept
-        arc = np.floor(np.cumsum(np.minimum(step, SPACING_MM)) / SPACING_MM)
-        kept = points[np.diff(arc, prepend=-1.0) != 0]
-        self._kept.append(kept)
-        while len(self._kept) > self.n_exposures:
-            self._kept.popleft()
-        self._tree = None
-
-    def evidence(
-        self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor]
-    ) -> tuple[FloatArray, FloatArray]:
-        """How well points (S, 3) of a new exposure continue what is known.
-
-        Where the surface is known nearby, it is continued by a local plane with a weak prior on
-        its slope, so that the prediction is the vaguer the further it reaches.
-
-        Returns
-        -------
-        log_gain
-            (S,) logarithm of the density of the point's depth over that of a new surface, which
-            may be anywhere: 0 where nothing is known or the point does not fit.
-        sharpness
-            (S,) 1 for a prediction well within `SHARP_MM`, towards 0 the vaguer it is.
-        """
-        n = len(points_sensor_mm)
-        gain, sharpness = np.zeros(n), np.zeros(n)
-        if not n or not len(self):
-            return gain, sharpness
-        near, distance = self._neighbours(points_sensor_mm, base_from_sensor, REACH_MM)
-        known = np.flatnonzero(np.isfinite(distance[:, 0]))
-        if not len(known):
-            return gain, sharpness
-        near, distance = near[known], distance[known]
-        offset, sigma = _continued(
-            near @ base_from_sensor.rotation, distance, np.isfinite(distance)
-        )
-        share = 1.0 + (offset / sigma) ** 2 / STUDENT
-        peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / sigma
-        gain[known] = np.log1p(self.depth_span_mm / self.scale * peak / share**2)
-        sharpness[known] = 1.0 / (1.0 + (sigma / SHARP_MM) ** 4)
-        return gain, sharpness
-
-    def sees_again(
-        self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor]
-    ) -> BoolArray:
-        """(S,) True for points (S, 3) amid known ones: not beyond the edge of what is known."""
-        if not len(self):
-            return np.zeros(len(points_sensor_mm), dtype=np.bool_)
-        near, distance = self._neighbours(points_sensor_mm, base_from_sensor, AMID_MM)
-        is_near = np.isfinite(distance)
-        towards = near / np.where(is_near & (distance > 0.0), distance, np.inf)[..., None]
-        n_near = is_near.sum(axis=1)
-        pull = np.linalg.norm(towards.sum(axis=1), axis=1) / np.maximum(n_near, 1)
-        return np.asarray((n_near >= LEAST_AMID) & (pull < MOST_PULL))
-
-    def _neighbours(
-        self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor], reach_mm: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """From each place to known points around it: (S, K, 3) in Base, and distances (S, K),
-        infinite where there are no more.
-        """
-        if self._tree is None:
-            self._tree = cKDTree(np.concatenate(self._kept))
-        in_sensor: Points[Sensor] = Points(points_sensor_mm)
-        places = (base_from_sensor @ in_sensor).xyz_mm / self.scale
-        found = self._tree.query(places, k=N_NEAR, distance_upper_bound=reach_mm)
-        distance, index = np.asarray(found[0]), np.asarray(found[1])
-        near = self._tree.data[np.where(np.isfinite(distance), index, 0)] - places[:, None]
-        return near, distance
-
-
-def _continued(
-    near_mm: FloatArray, distance_mm: FloatArray, is_near: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Depth (S,) of the surface over each place, from its neighbours (S, K, 3), and its sigma.
-
-    The plane of least squared distances, so that a wall seen edge-on is a plane like any other: to
-    depths over the image plane, noise across the wall would be a slope, and the plane beside it.
-    """
-    bend = BEND_PER_MM * np.where(is_near, distance_mm, 0.0) ** 2
-    weight = is_near / (NOISE_MM**2 + bend**2)
-    total = weight.sum(axis=1)
-    near = np.where(is_near[..., None], near_mm, 0.0)
-    middle = np.einsum("sk,ski->si", weight, near) / total[:, None]
-    off = near - middle[:, None]
-    scatter = (off * weight[..., None]).transpose(0, 2, 1) @ off
-    scatter[:, [0, 1], [0, 1]] += SLOPE**-2
-    size, axes = np.linalg.eigh(scatter)
-    normal = axes[:, :, 0]
-    along = np.einsum("sij,si->sj", axes, middle)
-    # what scatters across the plane scatters along it too, and tells nothing of its slope
-    spread = np.maximum(size[:, 1:] - size[:, :1], SLOPE**-2)
-    variance = NOISE_MM**2 + 1.0 / total + (along[:, 1:] ** 2 / spread).sum(axis=1)
-    facing = np.maximum(np.abs(normal[:, 2]), EDGE_ON)
-    return along[:, 0] / facing, np.sqrt(variance) / facing
-
-
 OUTSIDE = -4.0
 """Log-likelihood of a piece that lies outside the depths of a sheet, over one that is inside."""
 DIRECTION_RAD = np.radians(25.0)
@@ -266,10 +114,21 @@ def hypothesise(
 
 
 def still_evidence(
-    pieces: Pieces, hypotheses: Hypotheses, sensor: SensorCalibration, *, is_still: bool = False
+    pieces: Pieces,
+    hypotheses: Hypotheses,
+    sensor: SensorCalibration,
+    *,
+    is_still: bool = False,
+    is_wide: bool = False,
 ) -> FloatArray:
-    """(P, H) log-likelihood of the pieces' depths and directions, in this exposure alone."""
-    depth = OUTSIDE * pieces.mean((~hypotheses.is_inside).astype(np.float64))
+    """(P, H) log-likelihood of the pieces' depths and directions, in this exposure alone.
+
+    With ``is_wide`` depths that are near speak against no sheet. Boards show each line other
+    depths; what lies beyond those of its own line, and of many lines within those of another, would
+    be named by depth alone and then be the past.
+    """
+    is_possible = hypotheses.is_near if is_wide else hypotheses.is_inside
+    depth = OUTSIDE * pieces.mean((~is_possible).astype(np.float64))
     usual = np.stack([frontal_direction(sensor, k) for k in hypotheses.sheets], axis=1)
     turn = np.arccos(np.clip(np.abs(pieces.direction @ usual), 0.0, 1.0))
     likelihood = (1.0 - ODD_DIRECTION) * np.exp(-0.5 * (turn / DIRECTION_RAD) ** 2) + ODD_DIRECTION
@@ -324,7 +183,7 @@ def past_evidence(pieces: Pieces, log_gain: FloatArray, sharpness: FloatArray) -
     pieces
         Of the profile.
     log_gain, sharpness
-        (S, H) from `armscan.reconstruction.label_cross.SurfaceMemory.evidence`.
+        (S, H) from `armscan.reconstruction.segments.SurfaceMemory.evidence`.
     """
     sharp = INDEPENDENT * pieces.mean(log_gain * sharpness)
     vague = _vote(pieces) * pieces.mean(log_gain * (1.0 - sharpness))
@@ -611,11 +470,14 @@ class CrossLabeller:
                 gain[:, h] = self._image.log_gain(samples_px, k)
             else:
                 points = hypotheses.points_mm[h]
-                gain[:, h], sharpness[:, h] = self._surface.evidence(points, pose)
+                normal = self._sensor.sheets[k].sheet.axes[2]
+                gain[:, h], sharpness[:, h] = self._surface.evidence(points, pose, normal)
         past = past_evidence(pieces, gain, sharpness)
-        is_alone = pose is None and not len(self._image)
-        is_still = is_alone and len(hypotheses.sheets) <= MOST_IN_STILL
-        evidence = past + still_evidence(pieces, hypotheses, self._sensor, is_still=is_still)
+        is_alone, n = pose is None and not len(self._image), len(hypotheses.sheets)
+        is_still, is_wide = is_alone and n <= MOST_IN_STILL, not is_alone and n > MOST_BY_PAST
+        evidence = past + still_evidence(
+            pieces, hypotheses, self._sensor, is_still=is_still, is_wide=is_wide
+        )
         switch = switch_probability(pieces, len(hypotheses.sheets))
         posterior = smoothed_posterior(evidence, switch)
         for _ in range(ROUNDS):

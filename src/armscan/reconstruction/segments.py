@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unbroken segments of stripes: within one, neighbouring points lie on one line of light. How names
-go on along them, and from image to image.
+go on along them, and from image to image: by the stripe's last place and by the surface.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
+from armscan.geometry.poses import Base, Points, Pose, Sensor
 from armscan.kernels.chains import compare_light, cut_at_largest
 from armscan.kernels.naming import find_steps, number_segments, take_every
 from armscan.records.profile import Profile, StripeFlag
@@ -350,6 +352,180 @@ def _nearest(last: _Stripe, points_px: FloatArray) -> tuple[FloatArray, IntArray
     """Distance (N,) to the nearest point of a stripe that moved on, and its index."""
     found = cKDTree(last.points_px + last.motion_px).query(points_px)
     return np.asarray(found[0]), np.asarray(found[1])
+
+
+SPACING_MM = 0.5
+"""Remembered points of one stripe are thinned to about this."""
+N_NEAR = 32
+REACH_MM = 5.0
+"""Nothing is predicted further than this from all that is known."""
+NOISE_MM = 0.04
+"""Stripe, arm and calibration together, between exposures of one pass."""
+BEND_PER_MM = 0.06
+"""Half the curvature of surfaces, 1/mm: a plane is off by this times the distance squared."""
+SLOPE = 1.0
+"""Standard deviation, before anything is known, of a surface's slope towards the camera."""
+EDGE_ON = 0.05
+"""Least cosine between a surface's normal and the camera's axis, or sine of that to a sheet's."""
+SHARP_MM = 0.3
+"""Vaguer predictions err by the same all along a segment; the change is steep (fourth power)."""
+AMID_MM, MOST_PULL, LEAST_AMID = 2.0, 0.5, 3
+"""A place is seen again if so many known points lie within this of it, and not on one side: the
+mean of the unit vectors to them is shorter than this (of a half disc it is 0.64)."""
+MOST_ROUGH = 1.0
+"""Chi-square, over its degrees of freedom, of the plane through a place that is seen again and the
+known points around it. Between two levels a plane fits the points of neither."""
+
+
+@dataclass(slots=True, eq=False)
+class SurfaceMemory:
+    """Points in Base of the last exposures.
+
+    Parameters
+    ----------
+    n_exposures
+        How many exposures are remembered.
+    depth_span_mm
+        Width of the range over which a new surface is as likely at any depth.
+    scale
+        By which all lengths in mm grow in wide fields.
+    """
+
+    n_exposures: int = 40
+    depth_span_mm: float = 60.0
+    scale: float = 1.0
+    _kept: deque[FloatArray] = field(default_factory=deque)
+    _tree: cKDTree | None = None
+
+    def __len__(self) -> int:
+        """Count of remembered points."""
+        return sum(len(points) for points in self._kept)
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._kept.clear()
+        self._tree = None
+
+    def remember(self, points_base_mm: FloatArray) -> None:
+        """Add the points (N, 3) of an exposure, in the order of their stripes."""
+        points = points_base_mm / self.scale
+        step = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
+        # a jump between stripes counts for one step, so that each stripe's first point is kept
+        arc = np.floor(np.cumsum(np.minimum(step, SPACING_MM)) / SPACING_MM)
+        kept = points[np.diff(arc, prepend=-1.0) != 0]
+        self._kept.append(kept)
+        while len(self._kept) > self.n_exposures:
+            self._kept.popleft()
+        self._tree = None
+
+    def evidence(
+        self,
+        points_sensor_mm: FloatArray,
+        base_from_sensor: Pose[Base, Sensor],
+        sheet_normal: FloatArray | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """How well points (S, 3) of a new exposure continue what is known.
+
+        Where the surface is known nearby, it is continued by a local plane with a weak prior on
+        its slope, so that the prediction is the vaguer the further it reaches, and the vaguer the
+        closer it runs along the sheet of that normal (3,), in Sensor.
+
+        Returns
+        -------
+        log_gain
+            (S,) logarithm of the density of the point's depth over that of a new surface, which
+            may be anywhere: 0 where nothing is known or the point does not fit.
+        sharpness
+            (S,) 1 for a prediction well within `SHARP_MM`, towards 0 the vaguer it is.
+        """
+        n = len(points_sensor_mm)
+        gain, sharpness = np.zeros(n), np.zeros(n)
+        if not n or not len(self):
+            return gain, sharpness
+        near, distance = self._neighbours(points_sensor_mm, base_from_sensor, REACH_MM)
+        known = np.flatnonzero(np.isfinite(distance[:, 0]))
+        if not len(known):
+            return gain, sharpness
+        near, distance = near[known], distance[known]
+        offset, sigma = _continued(near @ base_from_sensor.rotation, distance, sheet_normal)
+        share = 1.0 + (offset / sigma) ** 2 / STUDENT
+        peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / sigma
+        gain[known] = np.log1p(self.depth_span_mm / self.scale * peak / share**2)
+        sharpness[known] = 1.0 / (1.0 + (sigma / SHARP_MM) ** 4)
+        return gain, sharpness
+
+    def sees_again(
+        self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor]
+    ) -> BoolArray:
+        """(S,) True for points (S, 3) amid known ones, on one smooth surface with them.
+
+        That is neither beyond the edge of what is known, nor between two levels of it.
+        """
+        if not len(self):
+            return np.zeros(len(points_sensor_mm), dtype=np.bool_)
+        near, distance = self._neighbours(points_sensor_mm, base_from_sensor, AMID_MM)
+        is_near = np.isfinite(distance)
+        towards = near / np.where(is_near & (distance > 0.0), distance, np.inf)[..., None]
+        n_near = is_near.sum(axis=1)
+        pull = np.linalg.norm(towards.sum(axis=1), axis=1) / np.maximum(n_near, 1)
+        with_place = np.pad(near, ((0, 0), (1, 0), (0, 0))), np.pad(distance, ((0, 0), (1, 0)))
+        chi2 = np.linalg.eigvalsh(_scatter(*with_place)[2])[:, 0]
+        is_smooth = chi2 < MOST_ROUGH * np.maximum(n_near - 2, 1)
+        return np.asarray((n_near >= LEAST_AMID) & (pull < MOST_PULL) & is_smooth)
+
+    def _neighbours(
+        self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor], reach_mm: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """From each place to known points around it: (S, K, 3) in Base, and distances (S, K),
+        infinite where there are no more.
+        """
+        if self._tree is None:
+            self._tree = cKDTree(np.concatenate(self._kept))
+        in_sensor: Points[Sensor] = Points(points_sensor_mm)
+        places = (base_from_sensor @ in_sensor).xyz_mm / self.scale
+        found = self._tree.query(places, k=N_NEAR, distance_upper_bound=reach_mm)
+        distance, index = np.asarray(found[0]), np.asarray(found[1])
+        near = self._tree.data[np.where(np.isfinite(distance), index, 0)] - places[:, None]
+        return near, distance
+
+
+def _scatter(
+    near_mm: FloatArray, distance_mm: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weight (S,), middle (S, 3) and scatter about it (S, 3, 3) of neighbours (S, K, 3)."""
+    is_near = np.isfinite(distance_mm)
+    bend = BEND_PER_MM * np.where(is_near, distance_mm, 0.0) ** 2
+    weight = is_near / (NOISE_MM**2 + bend**2)
+    total = weight.sum(axis=1)
+    near = np.where(is_near[..., None], near_mm, 0.0)
+    middle = np.einsum("sk,ski->si", weight, near) / total[:, None]
+    off = near - middle[:, None]
+    return total, middle, (off * weight[..., None]).transpose(0, 2, 1) @ off
+
+
+def _continued(
+    near_mm: FloatArray, distance_mm: FloatArray, sheet_normal: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Depth (S,) of the surface over each place, from its neighbours (S, K, 3), and its sigma.
+
+    The plane of least squared distances, so that a wall seen edge-on is a plane like any other: to
+    depths over the image plane, noise across the wall would be a slope, and the plane beside it.
+    Where that plane runs along the sheet it tells nothing: no light falls on a wall within the
+    sheet, and all that the sheet may have drawn lies on it. A stripe that jumps gives such planes.
+    """
+    total, middle, scatter = _scatter(near_mm, distance_mm)
+    scatter[:, [0, 1], [0, 1]] += SLOPE**-2
+    size, axes = np.linalg.eigh(scatter)
+    normal = axes[:, :, 0]
+    along = np.einsum("sij,si->sj", axes, middle)
+    # what scatters across the plane scatters along it too, and tells nothing of its slope
+    spread = np.maximum(size[:, 1:] - size[:, :1], SLOPE**-2)
+    variance = NOISE_MM**2 + 1.0 / total + (along[:, 1:] ** 2 / spread).sum(axis=1)
+    facing = np.abs(normal[:, 2])
+    if sheet_normal is not None:
+        facing = np.minimum(facing, np.linalg.norm(np.cross(normal, sheet_normal), axis=1))
+    facing = np.maximum(facing, EDGE_ON)
+    return along[:, 0] / facing, np.sqrt(variance) / facing
 
 
 LEAST_SEEN = 30

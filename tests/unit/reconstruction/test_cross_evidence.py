@@ -69,6 +69,19 @@ def test_points_of_the_right_hypothesis_are_the_plate() -> None:
     assert (evidence[out, 1] < evidence[out, 0] + OUTSIDE / len(pieces)).all()
 
 
+def test_depths_that_are_near_speak_against_no_sheet_where_that_is_asked() -> None:
+    """A plate beyond the depths of its own line, and within those of another: no name by depth."""
+    pieces, samples = pieces_of(stripe_px("A", 140.0))
+    found = hypothesise(samples, (0, 1), SENSOR, DEPTHS)
+    assert found.is_near.all()
+    outside = ~found.is_inside[:, 1]
+    strict = still_evidence(pieces, found, SENSOR)
+    wide = still_evidence(pieces, found, SENSOR, is_wide=True)
+    assert wide[:, 0] == pytest.approx(strict[:, 0], abs=1e-12)
+    share = pieces.mean(outside.astype(float))
+    assert wide[:, 1] - strict[:, 1] == pytest.approx(-OUTSIDE * share / len(pieces))
+
+
 def test_a_long_stretch_does_not_count_each_of_its_pieces() -> None:
     long, short = pieces_of(stripe_px("B", 140.0))[0], pieces_of(stripe_px("B", 140.0, 0.6))[0]
     assert len(short) == 1

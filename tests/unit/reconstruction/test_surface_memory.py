@@ -10,7 +10,8 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Points, Pose, Sensor
-from armscan.reconstruction.label_cross import REACH_MM, SPACING_MM, CrossLabeller, SurfaceMemory
+from armscan.reconstruction.label_cross import CrossLabeller
+from armscan.reconstruction.segments import REACH_MM, SPACING_MM, SurfaceMemory
 from rigs.cross_rig import sensor
 
 BASE_FROM_SENSOR: Pose[Base, Sensor] = Pose.from_vectors([2.9, 0.3, -0.2], [600.0, -150.0, 140.0])
@@ -164,3 +165,37 @@ def test_stripes_that_follow_each_other_in_one_exposure_are_both_kept() -> None:
     memory.remember((BASE_FROM_SENSOR @ in_sensor).xyz_mm)
     assert gain(memory, at(0.1, 0.0)) > 4.0
     assert gain(memory, at(8.1, 0.0)) > 4.0
+
+
+def test_a_plane_along_the_sheet_tells_nothing() -> None:
+    """All points of a stripe that jumps lie in its sheet, and so does whatever it may have drawn.
+
+    Another line's stripe that passes the jump would fit under this sheet whatever it lies on.
+    """
+    normal = np.array([0.0, np.cos(0.6), np.sin(0.6)])
+    along = np.array([0.0, -np.sin(0.6), np.cos(0.6)])
+    x, memory = np.linspace(-4.0, 4.0, 161), SurfaceMemory()
+    height = np.where(x < 0.0, 0.0, 2.5)
+    in_sheet = np.array([0.0, 0.0, 140.0]) + x[:, None] * [1.0, 0.0, 0.0] + height[:, None] * along
+    in_sensor: Points[Sensor] = Points(in_sheet)
+    memory.remember((BASE_FROM_SENSOR @ in_sensor).xyz_mm)
+    between = np.array([[0.0, 0.0, 140.0]]) + 1.25 * along
+    assert memory.evidence(between, BASE_FROM_SENSOR)[1][0] > 0.9
+    assert memory.evidence(between, BASE_FROM_SENSOR, normal)[1][0] < 0.1
+    # across the sheet the surface of three stripes is as sharp as before
+    plane = taught(-1.0, 0.0, 1.0).evidence(at(0.0, 0.3), BASE_FROM_SENSOR, normal)
+    assert plane[0][0] > 4.0
+    assert plane[1][0] > 0.9
+
+
+def test_between_two_levels_nothing_is_seen_again() -> None:
+    """A plane through the edge of each is near both, and continues neither."""
+    memory = SurfaceMemory()
+    for y in np.arange(-2.0, 2.01, 0.4):
+        x = np.linspace(0.0, 6.0, 121)
+        level = np.stack([x, np.full_like(x, y), np.where(x < 3.0, 140.0, 142.0)], axis=1)
+        in_sensor: Points[Sensor] = Points(level)
+        memory.remember((BASE_FROM_SENSOR @ in_sensor).xyz_mm)
+    places = np.array([[0.8, 0.1, 140.0], [5.2, 0.1, 142.0], [3.0, 0.1, 141.0]])
+    again = memory.sees_again(places, BASE_FROM_SENSOR)
+    assert again.tolist() == [True, True, False]

@@ -469,9 +469,10 @@ class SurfaceMemory:
         n_near = is_near.sum(axis=1)
         pull = np.linalg.norm(towards.sum(axis=1), axis=1) / np.maximum(n_near, 1)
         with_place = np.pad(near, ((0, 0), (1, 0), (0, 0))), np.pad(distance, ((0, 0), (1, 0)))
-        chi2 = np.linalg.eigvalsh(_scatter(*with_place)[2])[:, 0]
-        is_smooth = chi2 < MOST_ROUGH * np.maximum(n_near - 2, 1)
-        return np.asarray((n_near >= LEAST_AMID) & (pull < MOST_PULL) & is_smooth)
+        chi2 = np.linalg.eigvalsh(_scatter(*with_place)[2])[:, 0] / np.maximum(n_near - 2, 1)
+        is_amid = (n_near >= LEAST_AMID) & (pull < MOST_PULL)
+        usual = float(np.median(chi2[is_amid])) if is_amid.any() else 0.0
+        return np.asarray(is_amid & (chi2 < MOST_ROUGH * max(1.0, 2.0 * usual)))
 
     def _neighbours(
         self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor], reach_mm: float

@@ -332,9 +332,10 @@ def with_places_of_print(plain: Solution, max_steps: int) -> Solution:
     return plain if isinstance(again, FitFailure) else again
 
 
-FIRST_TERM = 0.3
-"""A lens moves points at the image's corner by k1 r^2 of the radius: of the size r^2, for k1 is of
-the size 1, at most this..."""
+LEAST_FIRST, MOST_FIRST = 0.1, 0.3
+"""The first radial term is counted to move points at the image's corner by r^2 of the radius, k1
+being of the size 1, at most by 0.3 and at least by 0.1: lenses of long focal length bend their
+smaller field about as much..."""
 NEXT_TERM = 0.3
 """...and each further radial term is about this part of the one before it."""
 TYPICAL_TANGENTIAL = 1e-3
@@ -356,7 +357,7 @@ def typical_coefficients(camera: CameraModel, names: tuple[str, ...]) -> FloatAr
     """
     half = 0.5 * np.array([camera.width_px, camera.height_px])
     square = float(np.sum((half / camera.parameters[:2]) ** 2))
-    first = min(square, FIRST_TERM)
+    first = min(max(square, LEAST_FIRST), MOST_FIRST)
     typical = {
         "k1": np.inf,
         "k2": NEXT_TERM * first / square**2,

@@ -226,7 +226,7 @@ def _fit_on_plate(
 
 
 def _conditioning(fit: HandEyeSolution) -> Conditioning:
-    return conditioning_at(fit.problem, fit.state, fit.noise.sigmas)
+    return conditioning_at(fit.problem.at_rest, fit.state, fit.noise.sigmas)
 
 
 def _evidence(
@@ -301,7 +301,7 @@ def calibrate_on_sphere(
     if refused is not None:
         return refused
     thinned = tuple(section.thinned(START_POINTS) for section in sections)
-    few = _plain(Problem(condense_sphere(thinned, START_PIECES), surface, options))
+    few = Problem(condense_sphere(thinned, START_PIECES), surface, options).at_rest
     refused = refuse_few_postures(few, TURN_THE_TOOL)
     if refused is not None:
         return refused
@@ -355,7 +355,9 @@ def _search(
     if refused is not None:
         refused = _misread(few, sections, refused, _typical_mm(few, kept[0]))
     else:
-        refused = _refuse_open(few, conditioning_at(few, kept[0]), 2.0 * radius_mm)
+        # All that the points scatter counts as the arm's here; the estimate tells how much is.
+        most_mm = max(UNDERDETERMINED_PART * 2.0 * radius_mm, MOST_OPEN_MM)
+        refused = _refuse_open(few, conditioning_at(few, kept[0]), most_mm)
     return tuple(kept) if refused is None else refused
 
 
@@ -364,29 +366,20 @@ def _is_apart(one: HandEyeState, other: HandEyeState) -> bool:
     return turn_rad > APART_ON_SPHERE_RAD
 
 
-def _refuse_open(
-    problem: Problem, conditioning: Conditioning, diameter_mm: float, most_mm: float = np.inf
-) -> FitFailure | None:
-    """Refuse postures that leave a combination of the unknowns open or nearly so."""
+def _refuse_open(problem: Problem, conditioning: Conditioning, most_mm: float) -> FitFailure | None:
+    """Refuse postures that leave a combination of the unknowns open, or known worse than that."""
     cause, remedy = ": the tool hardly turns, or about one axis only", TURN_THE_TOOL
     if turns_about_two_axes(problem.observations):
         cause, remedy = (
             ", though the tool turns: the scatter of arm and stripes or the sensor leaves it open",
             SCAN_MORE,
         )
-    most_mm = min(max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM), most_mm)
     return refuse_hardly_determined(conditioning, most_mm, cause, remedy)
-
-
-def _plain(problem: Problem) -> Problem:
-    """With distances from the sphere's one centre, which need no noise model."""
-    radius_mm = float(problem.surface.start[3])
-    return replace(problem, surface=SphereSurface(radius_mm, has_own_centres=False))
 
 
 def _refuse_far(problem: Problem, state: HandEyeState) -> FitFailure | None:
     """Refuse points that stay away from any sphere; say whether another diameter would do."""
-    problem = _plain(problem)
+    problem = problem.at_rest
     limit_mm = problem.far_mm(problem.place(state))
     typical_mm = _typical_mm(problem, state)
     if not typical_mm > limit_mm:
@@ -448,7 +441,8 @@ def _likeliest(
     refused = _refuse_far(problem, best.state)
     if refused is None:
         diameter_mm = 2.0 * float(start.surface[3])
-        refused = _refuse_open(problem, _conditioning(best), diameter_mm, MOST_OPEN_MM)
+        most_mm = max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM)
+        refused = _refuse_open(problem, _conditioning(best), min(most_mm, MOST_OPEN_MM))
     if refused is not None:
         return refused
     for _, other in solved[1:]:

@@ -15,6 +15,7 @@ from numpy.linalg import LinAlgError
 from scipy.special import chdtrc
 
 from armscan.calibration.hand_eye.noise import (
+    AtRest,
     LinearSolution,
     NoiseComponent,
     NoiseEstimate,
@@ -31,6 +32,7 @@ from armscan.calibration.hand_eye.surface import (
     Placed,
     PlateSurface,
     ReferenceSurface,
+    SphereSurface,
     free_columns,
     place,
 )
@@ -94,6 +96,13 @@ class Problem:
     def place(self, state: HandEyeState) -> Placed:
         """Place the observations."""
         return place(self.observations, self.surface, state)
+
+    @property
+    def at_rest(self) -> Problem:
+        """With distances about the sphere's common centre, not where the arm throws each stripe."""
+        if not isinstance(self.surface, SphereSurface):
+            return self
+        return replace(self, surface=replace(self.surface, has_own_centres=False))
 
     def start(self, pose: Pose[Tool, Sensor]) -> HandEyeState:
         """A hand-eye with the surface as given."""
@@ -446,6 +455,7 @@ def joint_covariance(solution: HandEyeSolution) -> JointCovariance:
             solution.components,
             solution.known,
             solution.noise,
+            at_rest=_at_rest(solution),
         )
         follow = None if by_sensor is None else -solution.linear.gain[hand_eye] @ by_sensor
         own = whole.matrix[hand_eye, hand_eye]
@@ -458,6 +468,7 @@ def joint_covariance(solution: HandEyeSolution) -> JointCovariance:
         solution.problem.surface_covariance(placed),
         solution.noise,
         n_unit=len(units),
+        at_rest=_at_rest(solution, root),
     )
     after, between = whole.matrix[n:, n:], whole.matrix[hand_eye, n:]
     by_units = np.linalg.solve(after, between.T).T
@@ -470,6 +481,23 @@ def joint_covariance(solution: HandEyeSolution) -> JointCovariance:
         dhand_eye_dsensor=by_units @ units,
         sensor=0.5 * (moved + moved.T),
     )
+
+
+def _at_rest(solution: HandEyeSolution, root: FloatArray | None = None) -> AtRest | None:
+    """About a sphere's common centre; None for a plate.
+
+    ``root`` (P, U) is what the sensor errs by for each of the last U unknowns, if it is solved for.
+    """
+    problem = solution.problem.at_rest
+    if problem is solution.problem:
+        return None
+    placed = problem.place(solution.state)
+    jacobian, known = placed.jacobian[:, problem.columns], problem.surface_covariance(placed)
+    if root is not None and placed.by_sensor is not None:
+        jacobian = np.concatenate([jacobian, placed.by_sensor @ root], axis=1)
+    elif solution.state.sensor is not None:
+        known = known + problem.sensor_covariance(placed)
+    return AtRest(jacobian, problem.components(placed), known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,6 +18,7 @@ of every standard deviation is held near its typical value by a wide normal dist
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -600,6 +601,18 @@ class SolutionCovariance:
     region_factor: float = 1.0
 
 
+class AtRest(NamedTuple):
+    """Derivatives (M, K), causes of scatter and known covariance (M, M) without what errors do.
+
+    An estimate about places that errors have moved takes these for a part of its geometry: a stripe
+    on a ball that the arm throws off a great circle would tell how far off the hand-eye put it.
+    """
+
+    jacobian: FloatArray
+    components: tuple[NoiseComponent, ...]
+    known: FloatArray
+
+
 def covariance_over_noise(
     residual: FloatArray,
     jacobian: FloatArray,
@@ -608,6 +621,7 @@ def covariance_over_noise(
     estimate: NoiseEstimate,
     *,
     n_unit: int = 0,
+    at_rest: AtRest | None = None,
 ) -> SolutionCovariance:
     """Covariance of the solution with the estimated scatter not taken as known.
 
@@ -616,7 +630,9 @@ def covariance_over_noise(
     sampling. It is what the errors' squares are on average. No covariance says more of errors whose
     scatter is uncertain: of few postures, more than 5 % of them lie outside the usual 95 % region,
     which therefore has its own factor. The last ``n_unit`` unknowns of the ``jacobian`` are known
-    beforehand, to a variance of 1, and are not in ``known``, the covariance of the residuals.
+    beforehand, to a variance of 1, and are not in ``known``, the covariance of the residuals. The
+    covariances are those of ``at_rest`` where it is given; how likely they are, and what the
+    solutions move by, are not.
 
     Raises
     ------
@@ -624,17 +640,19 @@ def covariance_over_noise(
         If the covariance of the residuals is not positive definite.
     """
     posterior = _Posterior.of(residual, jacobian, components, known)
-    free = posterior.free
-    total = total_covariance(components, estimate.sigmas) + known
-    centre = _solve(residual, jacobian, total, n_unit)
-    if centre is None:
+    rest = AtRest(jacobian, components, known) if at_rest is None else at_rest
+    of_rest = _Posterior.of(residual, rest.jacobian, rest.components, rest.known)
+    free, mode = posterior.free, posterior.logs(estimate.sigmas)
+    centre = _solve(residual, jacobian, posterior.covariance(mode), n_unit)
+    stated = _solve(residual, rest.jacobian, of_rest.covariance(mode), n_unit)
+    if centre is None or stated is None:
         raise EstimationError(
             "the covariance of the hand-eye's residuals is not positive definite",
             remedy="check the standard deviations given, and the poses",
         )
     spread = estimate.log_covariance[np.ix_(free, free)]
     if len(free) == 0 or not spread.any():
-        return SolutionCovariance(centre.covariance)
+        return SolutionCovariance(stated.covariance)
     try:
         factor = np.sqrt(INFLATION) * np.linalg.cholesky(0.5 * (spread + spread.T))
     except LinAlgError:
@@ -642,13 +660,16 @@ def covariance_over_noise(
             "the postures do not tell how much each cause scatters",
             remedy="take more postures, or give the arm's scatter",
         ) from None
-    mode, parts, moved, weights = posterior.logs(estimate.sigmas), [], [], []
+    parts, moved, weights = [], [], []
     for draw in normal_draws(len(free)):
         logs = mode + factor @ draw
         one = _solve(residual, jacobian, posterior.covariance(logs), n_unit)
-        if one is not None:
+        own = one
+        if at_rest is not None:
+            own = _solve(residual, rest.jacobian, of_rest.covariance(logs), n_unit)
+        if one is not None and own is not None:
             likelihood = one.log_likelihood - 0.5 * float(logs @ posterior.precision @ logs)
-            parts.append(one.covariance)
+            parts.append(own.covariance)
             moved.append(one.step - centre.step)
             weights.append(likelihood + 0.5 * float(draw @ draw))
     share = np.exp(np.array(weights) - max(weights))

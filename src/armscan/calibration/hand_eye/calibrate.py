@@ -95,6 +95,8 @@ LIKELY_DIAMETER = 0.2
 NAMED_STRIPES = 3
 MOST_READ = 24
 """Stripes on a sphere, evenly spread, that other readings of the poses are tried on."""
+LEAST_TURN_DEG = 1.0
+"""A tool that turns by less about a second axis may not turn at all: robots err by some tenths."""
 UNDERDETERMINED_PART, UNDERDETERMINED_MM = 0.2, 2.0
 """A combination known less well than this part of the diameter and than this is not determined."""
 TURN_THE_TOOL = (
@@ -367,8 +369,13 @@ def _is_apart(one: HandEyeState, other: HandEyeState) -> bool:
 
 
 def _refuse_open(problem: Problem, conditioning: Conditioning, most_mm: float) -> FitFailure | None:
-    """Refuse postures that leave a combination of the unknowns open, or known worse than that."""
+    """Refuse postures that leave a combination of the unknowns open, or known worse than that.
+
+    What the arm errs in turning is no turn: of a tool that never turned it would tell a hand-eye.
+    """
     cause, remedy = ": the tool hardly turns, or about one axis only", TURN_THE_TOOL
+    if not turns_about_two_axes(problem.observations, LEAST_TURN_DEG):
+        return FitFailure(f"the postures do not determine the hand-eye{cause}", remedy)
     if turns_about_two_axes(problem.observations):
         cause, remedy = (
             ", though the tool turns: the scatter of arm and stripes or the sensor leaves it open",

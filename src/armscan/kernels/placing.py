@@ -122,6 +122,7 @@ def _know_behind(
     vx, vy, vz = bow[6] * scale, bow[7] * scale, bow[8] * scale
     p1, p2 = lens[6], lens[7]
     lean = bow[18]
+    middle = math.sqrt(1.0 + lean * lean)
     for i in range(points.shape[0] // 3):
         depth = points[3 * i + 2]
         x = points[3 * i] / depth
@@ -159,11 +160,13 @@ def _know_behind(
         w = 1.0 + bow[19] * v
         w = w if w > NEAREST_SOURCE else NEAREST_SOURCE
         u0 = (u - lean * v) / w
-        root = math.sqrt(1.0 + bow[19] * u0 * (bow[19] * u0))
+        ray = lean + bow[19] * u0
+        root = math.sqrt(1.0 + ray * ray)
+        square = 2.0 * (middle * middle) * u0 * u0 / (1.0 + middle * root + lean * ray)
         rows[OF_SHEET * LANES + i] = u * per_mm
         rows[(OF_SHEET + 1) * LANES + i] = v * per_mm
         rows[(OF_SHEET + 2) * LANES + i] = per_mm
-        rows[(OF_SHEET + 3) * LANES + i] = w * (2.0 * u0 * u0 / (1.0 + root)) * per_mm
+        rows[(OF_SHEET + 3) * LANES + i] = w * square * per_mm
         rows[(OF_SHEET + 4) * LANES + i] = u * v * per_mm
         rows[(OF_SHEET + 5) * LANES + i] = v * v * per_mm
         rows[(OF_SHEET + 6) * LANES + i] = w * (u0 * u0 * u0) * per_mm

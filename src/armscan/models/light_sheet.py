@@ -37,8 +37,10 @@ class LightSheet(ArrayRecord):
     and widens with the distance from it. With ``fan = (lean, spread)`` the ray through ``(u0, 0)``
     runs along ``(lean + spread u0, 1)``; a point ``(u, v)`` lies on that of
     ``u0 = (u - lean v) / w``, ``w = 1 + spread v``, and the terms of u alone are ``w u0**3`` and
-    ``w 2 u0**2 / (1 + sqrt(1 + (spread u0)**2))``: a cone, as a line lens that is tilted, or a
-    grating, makes. A fan of zeros gives the powers of u.
+    ``w 2 a**2 u0**2 / (1 + a b + lean t)`` with the ray's slope ``t = lean + spread u0``,
+    ``b = sqrt(1 + t**2)`` and ``a = sqrt(1 + lean**2)``: a cone, as a line lens that is tilted, or
+    a grating, makes, less its tangent plane along the ray through the origin. A fan of zeros gives
+    the powers of u.
 
     Parameters
     ----------
@@ -133,9 +135,11 @@ class LightSheet(ArrayRecord):
         w = np.maximum(1.0 + spread * v, NEAREST_SOURCE)
         dw_dv = np.where(w > NEAREST_SOURCE, spread, 0.0)
         u0 = (u - lean * v) / w
-        root = np.sqrt(1.0 + (spread * u0) ** 2)
+        ray = lean + spread * u0
+        middle, root = np.sqrt(1.0 + lean**2), np.sqrt(1.0 + ray**2)
+        share = 2.0 * middle**2 * u0 / (root * (1.0 + middle * root + lean * ray))
         for k, (shape, slope) in {
-            BOW_TERMS.index((2, 0)): (2.0 * u0**2 / (1.0 + root), 2.0 * u0 / root),
+            BOW_TERMS.index((2, 0)): (u0 * root * share, (middle + root) * share),
             BOW_TERMS.index((3, 0)): (u0 * u0 * u0, 3.0 * u0**2),
         }.items():
             terms[:, k] = w * shape

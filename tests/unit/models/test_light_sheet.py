@@ -78,7 +78,7 @@ def test_height_derivatives_by_differences() -> None:
 
 def test_derivatives_along_a_fan_by_differences() -> None:
     """The terms of u alone follow the rays; the second point lies beside the region."""
-    sheet = replace(bowed_sheet(), fan=np.array([0.2, 0.6]))
+    sheet = replace(bowed_sheet(), fan=np.array([0.5, 0.6]))
     points = np.array([[5.0, 6.0, 140.0], [-22.0, 13.0, 128.0], [3.0, -2.0, 135.0]])
     straight, _, _ = bowed_sheet().height_with_jacobian(points)
     height, by_point, by_parameters = sheet.height_with_jacobian(points)
@@ -91,6 +91,26 @@ def test_derivatives_along_a_fan_by_differences() -> None:
         d = STEP * np.eye(8)[k]
         up, down = (sheet.updated(s * d).height_with_jacobian(points)[0] for s in (1, -1))
         np.testing.assert_allclose(by_parameters[:, k], (up - down) / (2 * STEP), atol=DIFFERENCE)
+
+
+@pytest.mark.parametrize("lean", [-1.2, -0.4, 0.9])
+def test_a_cone_whose_rays_lean_is_met_exactly(lean: float) -> None:
+    """Rays from (-lean d, -d, 0) in u, v, n: plane and ``u^2`` along the fan leave nothing."""
+    distance, slope, scale = 1.8, np.tan(0.02), 90.0
+    u, v = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-0.7, 0.7, 15)))
+    height = slope * scale * np.hypot(u + lean * distance, v + distance)
+    points = np.column_stack([scale * u, scale * v, height])
+    sheet = LightSheet(
+        origin_mm=np.zeros(3),
+        axes=np.eye(3),
+        scale_mm=scale,
+        bow_mm=np.zeros(5),
+        fan=np.array([lean, 1.0 / distance]),
+    )
+    _, _, by_parameters = sheet.height_with_jacobian(points)
+    design = -by_parameters[:, :4]
+    left_mm = height - design @ np.linalg.lstsq(design, height, rcond=None)[0]
+    assert np.abs(left_mm).max() < 1e-10
 
 
 def test_a_cone_is_met_exactly_by_a_fan_and_not_by_powers() -> None:

@@ -609,7 +609,9 @@ class _OneSheet:
         sideways = 2.0 * lean * bow - sheet.bow_mm[UV]
         leans = 0.5 * bow * sideways / (bow**2 + 0.25 * variance[UV] / USUAL_FAN**2)
         leans = float(np.clip(leans, -MAX_FAN[0], MAX_FAN[0]))
-        weaker = spread * bow - sheet.bow_mm[U2V] - 3.0 * (leans - lean) * sheet.bow_mm[U3]
+        # a cone whose rays lean has a cubic part of its own
+        cubic = sheet.bow_mm[U3] - lean * spread / (1.0 + lean**2) * bow
+        weaker = spread * bow - sheet.bow_mm[U2V] - 3.0 * (leans - lean) * cubic
         spreads = bow * weaker / (bow**2 + variance[U2V] / USUAL_FAN**2)
         return np.array([leans, np.clip(spreads, -MAX_FAN[1], MAX_FAN[1])])
 

@@ -372,9 +372,10 @@ SHARP_MM = 0.3
 AMID_MM, MOST_PULL, LEAST_AMID = 2.0, 0.5, 3
 """A place is seen again if so many known points lie within this of it, and not on one side: the
 mean of the unit vectors to them is shorter than this (of a half disc it is 0.64)."""
-MOST_ROUGH = 1.0
+MOST_ROUGH, ROUGHER, N_ROUGH = 1.0, 3.0, 200
 """Chi-square, over its degrees of freedom, of the plane through a place that is seen again and the
-known points around it. Between two levels a plane fits the points of neither."""
+known points around it. Between two levels a plane fits the points of neither. Known surfaces may
+have so many times what their smooth quarter has, told from so many of their points."""
 
 
 @dataclass(slots=True, eq=False)
@@ -468,22 +469,33 @@ class SurfaceMemory:
         towards = near / np.where(is_near & (distance > 0.0), distance, np.inf)[..., None]
         n_near = is_near.sum(axis=1)
         pull = np.linalg.norm(towards.sum(axis=1), axis=1) / np.maximum(n_near, 1)
-        with_place = np.pad(near, ((0, 0), (1, 0), (0, 0))), np.pad(distance, ((0, 0), (1, 0)))
-        chi2 = np.linalg.eigvalsh(_scatter(*with_place)[2])[:, 0] / np.maximum(n_near - 2, 1)
         is_amid = (n_near >= LEAST_AMID) & (pull < MOST_PULL)
-        usual = float(np.median(chi2[is_amid])) if is_amid.any() else 0.0
-        return np.asarray(is_amid & (chi2 < MOST_ROUGH * max(1.0, 2.0 * usual)))
+        return np.asarray(is_amid & (_roughness(near, distance) < self._most_rough()))
+
+    def _most_rough(self) -> float:
+        """Most roughness about a place on one surface: what known surfaces have, if that is more.
+
+        An arm that errs more than is expected scatters them all; the quarter that is least rough
+        has no steps.
+        """
+        known = np.concatenate(self._kept)
+        some = known[:: max(len(known) // N_ROUGH, 1)]
+        usual = np.quantile(_roughness(*self._around(some, AMID_MM)), 0.25)
+        return max(MOST_ROUGH, ROUGHER * float(usual))
 
     def _neighbours(
         self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor], reach_mm: float
     ) -> tuple[FloatArray, FloatArray]:
-        """From each place to known points around it: (S, K, 3) in Base, and distances (S, K),
+        """From each place to known points around it, see `_around`."""
+        in_sensor: Points[Sensor] = Points(points_sensor_mm)
+        return self._around((base_from_sensor @ in_sensor).xyz_mm / self.scale, reach_mm)
+
+    def _around(self, places: FloatArray, reach_mm: float) -> tuple[FloatArray, FloatArray]:
+        """From places (S, 3) to known points around each: (S, K, 3) in Base, and distances (S, K),
         infinite where there are no more.
         """
         if self._tree is None:
             self._tree = cKDTree(np.concatenate(self._kept))
-        in_sensor: Points[Sensor] = Points(points_sensor_mm)
-        places = (base_from_sensor @ in_sensor).xyz_mm / self.scale
         found = self._tree.query(places, k=N_NEAR, distance_upper_bound=reach_mm)
         distance, index = np.asarray(found[0]), np.asarray(found[1])
         near = self._tree.data[np.where(np.isfinite(distance), index, 0)] - places[:, None]
@@ -502,6 +514,14 @@ def _scatter(
     middle = np.einsum("sk,ski->si", weight, near) / total[:, None]
     off = near - middle[:, None]
     return total, middle, (off * weight[..., None]).transpose(0, 2, 1) @ off
+
+
+def _roughness(near_mm: FloatArray, distance_mm: FloatArray) -> FloatArray:
+    """(S,) chi-square over its freedom of the plane through each place and its neighbours."""
+    near = np.pad(near_mm, ((0, 0), (1, 0), (0, 0)))
+    scatter = _scatter(near, np.pad(distance_mm, ((0, 0), (1, 0))))[2]
+    n_near = np.isfinite(distance_mm).sum(axis=1)
+    return np.asarray(np.linalg.eigvalsh(scatter)[:, 0] / np.maximum(n_near - 2, 1))
 
 
 def _continued(

@@ -188,14 +188,32 @@ def test_a_plane_along_the_sheet_tells_nothing() -> None:
     assert plane[1][0] > 0.9
 
 
-def test_between_two_levels_nothing_is_seen_again() -> None:
-    """A plane through the edge of each is near both, and continues neither."""
-    memory = SurfaceMemory()
+def two_levels(scatter_mm: float = 0.0) -> SurfaceMemory:
+    """Eleven stripes over a step of 2 mm, each off by its own arm error."""
+    memory, rng = SurfaceMemory(), np.random.default_rng(3)
     for y in np.arange(-2.0, 2.01, 0.4):
         x = np.linspace(0.0, 6.0, 121)
-        level = np.stack([x, np.full_like(x, y), np.where(x < 3.0, 140.0, 142.0)], axis=1)
-        in_sensor: Points[Sensor] = Points(level)
+        z = np.where(x < 3.0, 140.0, 142.0) + rng.normal(0.0, scatter_mm)
+        in_sensor: Points[Sensor] = Points(np.stack([x, np.full_like(x, y), z], axis=1))
         memory.remember((BASE_FROM_SENSOR @ in_sensor).xyz_mm)
+    return memory
+
+
+def test_between_two_levels_nothing_is_seen_again() -> None:
+    """A plane through the edge of each is near both, and continues neither, however many ask."""
+    memory = two_levels()
     places = np.array([[0.8, 0.1, 140.0], [5.2, 0.1, 142.0], [3.0, 0.1, 141.0]])
-    again = memory.sees_again(places, BASE_FROM_SENSOR)
-    assert again.tolist() == [True, True, False]
+    assert memory.sees_again(places, BASE_FROM_SENSOR).tolist() == [True, True, False]
+    between = np.stack([np.full(9, 3.0), np.linspace(-0.8, 0.8, 9), np.full(9, 141.0)], axis=1)
+    assert not memory.sees_again(between, BASE_FROM_SENSOR).any()
+
+
+def test_surfaces_that_the_arm_scatters_are_seen_again() -> None:
+    """By 0.08 mm, twice what is expected of stripe, arm and calibration together."""
+    memory = two_levels(0.08)
+    x, y = np.meshgrid([0.6, 0.9, 5.1, 5.4], np.linspace(-0.8, 0.8, 9))
+    level = np.where(x < 3.0, 140.0, 142.0)
+    places = np.stack([x.ravel(), y.ravel(), level.ravel()], axis=1)
+    assert memory.sees_again(places, BASE_FROM_SENSOR).mean() > 0.8
+    between = np.stack([np.full(9, 3.0), np.linspace(-0.8, 0.8, 9), np.full(9, 141.0)], axis=1)
+    assert not memory.sees_again(between, BASE_FROM_SENSOR).any()

@@ -307,7 +307,7 @@ SCATTER_SETTLED = 0.06
 """A step of the factors that are tried."""
 MAX_RAISES = 10
 FAN_ROUNDS = 8
-FAN_SETTLED = 1e-3
+FAN_SETTLED, FAN_SLACK = 1e-3, 4.0
 MOST_AHEAD = 3.0
 """Steps by which a round may go on beyond what it asks for."""
 USUAL_FAN = 0.5
@@ -578,27 +578,28 @@ class _OneSheet:
 
         Where the rays come from shows in how the bow along the stripe changes with depth: to first
         order a fan adds ``-2 lean u v - spread u^2 v`` to ``u^2`` and ``-3 lean u^2 v`` to ``u^3``.
-        A bow too weak to show it can lead astray: a fan by which the stripes fit worse is halved.
+        The stripes' fit tells little of a fan beside these two: it may be worse by chance, and from
+        there on halfway fans are tried that fit better.
         """
-        best: SheetSolution | None = None
-        least, best_fan = np.inf, start.fan
+        kept: SheetSolution | None = None
         before: tuple[FloatArray, FloatArray] | None = None
+        least, slack = np.inf, 0.0
         for _ in range(FAN_ROUNDS):
             solution = self.solve(start, sigma_factor, is_bowed=True)
             if isinstance(solution, FitFailure):
-                return solution if best is None else best
-            cost = solution.chi2 + float(((start.fan / USUAL_FAN) ** 2).sum())
-            if cost >= least:
-                before, start = None, replace(start, fan=0.5 * (best_fan + start.fan))
+                return solution if kept is None else kept
+            if kept is not None and solution.chi2 > least + slack:
+                halfway = 0.5 * (kept.sheets[0].fan + start.fan)
+                before, slack, start = None, 0.0, replace(start, fan=halfway)
                 continue
-            best, least, best_fan = solution, cost, start.fan
+            kept, least = solution, min(least, solution.chi2)
             asked = self._fan_of(solution)
-            step = asked - best_fan
+            step = asked - start.fan
             if float(np.abs(step).max()) < FAN_SETTLED:
                 break
-            start = replace(start, fan=_ahead(asked, step, before))
+            slack, start = FAN_SLACK, replace(start, fan=_ahead(asked, step, before))
             before = asked, step
-        return best if best is not None else solution
+        return solution if kept is None else kept
 
     def _fan_of(self, solution: SheetSolution) -> FloatArray:
         """(2,) the fan by which a bow's terms ``u v`` and ``u^2 v`` would vanish."""

@@ -151,7 +151,10 @@ def test_stereo_pairs_are_judged_along_the_curve_of_their_errors() -> None:
 
 
 def hand_eye(seed: int, *, on_sphere: bool) -> Outcome:
-    made = draw_instrument(seed)
+    return hand_eye_of(draw_instrument(seed), on_sphere=on_sphere)
+
+
+def hand_eye_of(made: Instrument, *, on_sphere: bool) -> Outcome:
     camera = run_camera(made)
     sheets = run_sheets(made, camera.calibration, camera.information)
     assert sheets.fit is not None
@@ -203,6 +206,21 @@ def test_balls_that_every_exposure_throws_are_solved(seed: int) -> None:
 def test_a_large_ball_that_no_turn_tells_from_a_shift_is_refused() -> None:
     """The arm only shifted: 18 mm open, less than a fifth of the ball's diameter."""
     assert hand_eye(1400002, on_sphere=True).result == "rightly refused"
+
+
+def test_what_the_arm_throws_along_a_small_ball_is_no_geometry() -> None:
+    """Derivatives at the thrown places stated 0.58 of the bound, and a chi2 of 36 of 6."""
+    found = hand_eye(8200739, on_sphere=True)
+    assert found.result == "right"
+    assert found.over_bound > 0.8
+
+
+def test_what_the_arm_errs_in_turning_is_no_turn() -> None:
+    """An arm that only shifted and turns by 0.04 to 0.2 degrees by mistake: 290 mm off, 7 stated."""
+    made = replace(draw_instrument(9700006), fault="pure translation")
+    for scatter_mm in (0.02, 0.1):
+        arm = replace(made.arm, position_mm=scatter_mm, lever_mm=30.0, n_postures=8)
+        assert hand_eye_of(replace(made, arm=arm), on_sphere=True).result == "rightly refused"
 
 
 @pytest.mark.parametrize("seed", [2100356, 2101610])

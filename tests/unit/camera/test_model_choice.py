@@ -25,6 +25,8 @@ from armscan.geometry.estimate import FitFailure
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.vision.targets.target import Chessboard, TargetView
 from rigs.camera_scene import CAMERA, GRID, Scene, make_views, normalised_error
+from rigs.instrument_stages import run_camera
+from rigs.instruments import draw_instrument
 from rigs.plain_scanner import plain_camera
 
 FREE = PARAMETER_NAMES
@@ -188,6 +190,11 @@ def test_a_long_lens_that_bends_its_small_field_as_others_do_is_not_held_to_less
         errors.append(normalised_error(lens.parameters, fit.camera.parameters, fit.covariance))
     low, high = stats.chi2.ppf([0.0005, 0.9995], 9 * len(errors)) / len(errors)
     assert low < np.mean(errors) < high
+
+
+def test_beside_the_sizes_the_adjustment_starts_at_the_free_solution_too() -> None:
+    """From both closed forms it ended at a focal length of 41 px (8988 px is true)."""
+    assert run_camera(draw_instrument(8200198)).outcome.result == "right"
 
 
 def test_a_point_at_the_limit_of_outliers_frees_nothing() -> None:

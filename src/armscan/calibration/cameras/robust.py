@@ -272,7 +272,7 @@ def better_fit(
     """Of two solutions over the same points the one that all of them fit better; else the first.
 
     By Cauchy's cost at the level of the typical view of the better one, so that neither outliers
-    nor which of them were left out decide.
+    nor which of them were left out decide, and by what is known beforehand.
     """
     if isinstance(second, FitFailure):
         return first
@@ -280,7 +280,11 @@ def better_fit(
         return second
     squares = [chi2_of_points(each.observations, each.state) for each in (first, second)]
     typical = min(_typical(_view_levels(first.observations, chi2)) for chi2 in squares)
-    cost = [float(np.log1p(chi2 / (CAUCHY_SCALE**2 * typical)).sum()) for chi2 in squares]
+    one = CAUCHY_SCALE**2 * typical
+    cost = [
+        float(np.log1p(chi2 / one).sum() + each.observations.known @ each.state.shared**2 / one)
+        for each, chi2 in zip((first, second), squares, strict=True)
+    ]
     return second if cost[1] < (1.0 - SAME_FIT) * cost[0] else first
 
 

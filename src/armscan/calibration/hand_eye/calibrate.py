@@ -228,7 +228,7 @@ def _fit_on_plate(
 
 
 def _conditioning(fit: HandEyeSolution) -> Conditioning:
-    return conditioning_at(fit.problem.at_rest, fit.state, fit.noise.sigmas)
+    return conditioning_at(fit.problem.about_common_centre, fit.state, fit.noise.sigmas)
 
 
 def _evidence(
@@ -303,7 +303,7 @@ def calibrate_on_sphere(
     if refused is not None:
         return refused
     thinned = tuple(section.thinned(START_POINTS) for section in sections)
-    few = Problem(condense_sphere(thinned, START_PIECES), surface, options).at_rest
+    few = Problem(condense_sphere(thinned, START_PIECES), surface, options).about_common_centre
     refused = refuse_few_postures(few, TURN_THE_TOOL)
     if refused is not None:
         return refused
@@ -386,7 +386,7 @@ def _refuse_open(problem: Problem, conditioning: Conditioning, most_mm: float) -
 
 def _refuse_far(problem: Problem, state: HandEyeState) -> FitFailure | None:
     """Refuse points that stay away from any sphere; say whether another diameter would do."""
-    problem = problem.at_rest
+    problem = problem.about_common_centre
     limit_mm = problem.far_mm(problem.place(state))
     typical_mm = _typical_mm(problem, state)
     if not typical_mm > limit_mm:

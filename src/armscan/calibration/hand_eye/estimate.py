@@ -15,7 +15,7 @@ from numpy.linalg import LinAlgError
 from scipy.special import chdtrc
 
 from armscan.calibration.hand_eye.noise import (
-    AtRest,
+    CommonCentre,
     LinearSolution,
     NoiseComponent,
     NoiseEstimate,
@@ -98,7 +98,7 @@ class Problem:
         return place(self.observations, self.surface, state)
 
     @property
-    def at_rest(self) -> Problem:
+    def about_common_centre(self) -> Problem:
         """With distances about the sphere's common centre, not where the arm throws each stripe."""
         if not isinstance(self.surface, SphereSurface):
             return self
@@ -455,7 +455,7 @@ def joint_covariance(solution: HandEyeSolution) -> JointCovariance:
             solution.components,
             solution.known,
             solution.noise,
-            at_rest=_at_rest(solution),
+            common=_about_common_centre(solution),
         )
         follow = None if by_sensor is None else -solution.linear.gain[hand_eye] @ by_sensor
         own = whole.matrix[hand_eye, hand_eye]
@@ -468,7 +468,7 @@ def joint_covariance(solution: HandEyeSolution) -> JointCovariance:
         solution.problem.surface_covariance(placed),
         solution.noise,
         n_unit=len(units),
-        at_rest=_at_rest(solution, root),
+        common=_about_common_centre(solution, root),
     )
     after, between = whole.matrix[n:, n:], whole.matrix[hand_eye, n:]
     by_units = np.linalg.solve(after, between.T).T
@@ -483,12 +483,14 @@ def joint_covariance(solution: HandEyeSolution) -> JointCovariance:
     )
 
 
-def _at_rest(solution: HandEyeSolution, root: FloatArray | None = None) -> AtRest | None:
+def _about_common_centre(
+    solution: HandEyeSolution, root: FloatArray | None = None
+) -> CommonCentre | None:
     """About a sphere's common centre; None for a plate.
 
     ``root`` (P, U) is what the sensor errs by for each of the last U unknowns, if it is solved for.
     """
-    problem = solution.problem.at_rest
+    problem = solution.problem.about_common_centre
     if problem is solution.problem:
         return None
     placed = problem.place(solution.state)
@@ -497,7 +499,7 @@ def _at_rest(solution: HandEyeSolution, root: FloatArray | None = None) -> AtRes
         jacobian = np.concatenate([jacobian, placed.by_sensor @ root], axis=1)
     elif solution.state.sensor is not None:
         known = known + problem.sensor_covariance(placed)
-    return AtRest(jacobian, problem.components(placed), known)
+    return CommonCentre(jacobian, problem.components(placed), known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -601,11 +601,11 @@ class SolutionCovariance:
     region_factor: float = 1.0
 
 
-class AtRest(NamedTuple):
-    """Derivatives (M, K), causes of scatter and known covariance (M, M) without what errors do.
+class CommonCentre(NamedTuple):
+    """Derivatives (M, K), causes of scatter and known covariance (M, M) about a ball's one centre.
 
-    An estimate about places that errors have moved takes these for a part of its geometry: a stripe
-    on a ball that the arm throws off a great circle would tell how far off the hand-eye put it.
+    About the centre that each stripe itself asks for, where the arm threw it, the throw passes for
+    geometry: a stripe near a great circle would tell of what lies beside its sheet.
     """
 
     jacobian: FloatArray
@@ -621,7 +621,7 @@ def covariance_over_noise(
     estimate: NoiseEstimate,
     *,
     n_unit: int = 0,
-    at_rest: AtRest | None = None,
+    common: CommonCentre | None = None,
 ) -> SolutionCovariance:
     """Covariance of the solution with the estimated scatter not taken as known.
 
@@ -631,7 +631,7 @@ def covariance_over_noise(
     scatter is uncertain: of few postures, more than 5 % of them lie outside the usual 95 % region,
     which therefore has its own factor. The last ``n_unit`` unknowns of the ``jacobian`` are known
     beforehand, to a variance of 1, and are not in ``known``, the covariance of the residuals. The
-    covariances are those of ``at_rest`` where it is given; how likely they are, and what the
+    covariances are those of ``common`` where it is given; how likely they are, and what the
     solutions move by, are not.
 
     Raises
@@ -640,11 +640,11 @@ def covariance_over_noise(
         If the covariance of the residuals is not positive definite.
     """
     posterior = _Posterior.of(residual, jacobian, components, known)
-    rest = AtRest(jacobian, components, known) if at_rest is None else at_rest
-    of_rest = _Posterior.of(residual, rest.jacobian, rest.components, rest.known)
+    about = CommonCentre(jacobian, components, known) if common is None else common
+    of_stated = _Posterior.of(residual, about.jacobian, about.components, about.known)
     free, mode = posterior.free, posterior.logs(estimate.sigmas)
     centre = _solve(residual, jacobian, posterior.covariance(mode), n_unit)
-    stated = _solve(residual, rest.jacobian, of_rest.covariance(mode), n_unit)
+    stated = _solve(residual, about.jacobian, of_stated.covariance(mode), n_unit)
     if centre is None or stated is None:
         raise EstimationError(
             "the covariance of the hand-eye's residuals is not positive definite",
@@ -665,8 +665,8 @@ def covariance_over_noise(
         logs = mode + factor @ draw
         one = _solve(residual, jacobian, posterior.covariance(logs), n_unit)
         own = one
-        if at_rest is not None:
-            own = _solve(residual, rest.jacobian, of_rest.covariance(logs), n_unit)
+        if common is not None:
+            own = _solve(residual, about.jacobian, of_stated.covariance(logs), n_unit)
         if one is not None and own is not None:
             likelihood = one.log_likelihood - 0.5 * float(logs @ posterior.precision @ logs)
             parts.append(own.covariance)

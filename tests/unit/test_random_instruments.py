@@ -216,7 +216,7 @@ def test_what_the_arm_throws_along_a_small_ball_is_no_geometry() -> None:
 
 
 def test_what_the_arm_errs_in_turning_is_no_turn() -> None:
-    """An arm that only shifted and turns by 0.04 to 0.2 degrees by mistake: 290 mm off, 7 stated."""
+    """It only shifted, and erred by 0.04 to 0.2 degrees: 290 mm off where 7 were stated."""
     made = replace(draw_instrument(9700006), fault="pure translation")
     for scatter_mm in (0.02, 0.1):
         arm = replace(made.arm, position_mm=scatter_mm, lever_mm=30.0, n_postures=8)

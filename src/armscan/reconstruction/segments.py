@@ -372,10 +372,10 @@ SHARP_MM = 0.3
 AMID_MM, MOST_PULL, LEAST_AMID = 2.0, 0.5, 3
 """A place is seen again if so many known points lie within this of it, and not on one side: the
 mean of the unit vectors to them is shorter than this (of a half disc it is 0.64)."""
-MOST_ROUGH, ROUGHER, N_ROUGH = 1.0, 3.0, 200
+MOST_ROUGH, ROUGHER, ROUGHEST, N_ROUGH = 1.0, 3.0, 3.0, 200
 """Chi-square, over its degrees of freedom, of the plane through a place that is seen again and the
 known points around it. Between two levels a plane fits the points of neither. Known surfaces may
-have so many times what their smooth quarter has, told from so many of their points."""
+have so many times what their smooth quarter has, up to a most, told from so many points."""
 
 
 @dataclass(slots=True, eq=False)
@@ -481,7 +481,7 @@ class SurfaceMemory:
         known = np.concatenate(self._kept)
         some = known[:: max(len(known) // N_ROUGH, 1)]
         usual = np.quantile(_roughness(*self._around(some, AMID_MM)), 0.25)
-        return max(MOST_ROUGH, ROUGHER * float(usual))
+        return float(np.clip(ROUGHER * usual, MOST_ROUGH, ROUGHEST))
 
     def _neighbours(
         self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor], reach_mm: float

@@ -15,6 +15,7 @@ from armscan.calibration.hand_eye.alternatives import (
     other_readings,
 )
 from armscan.calibration.hand_eye.checks import (
+    ALIKE_DEG,
     LIKELIER,
     MOST_OPEN_MM,
     VARY_POSTURES,
@@ -27,11 +28,11 @@ from armscan.calibration.hand_eye.checks import (
     influence_warnings,
     likeliest_start,
     point_warnings,
+    principal_turns_deg,
     refuse_few_postures,
     refuse_hardly_determined,
     refuse_underdetermined,
     scatter_warnings,
-    turns_about_two_axes,
 )
 from armscan.calibration.hand_eye.estimate import (
     Conditioning,
@@ -95,8 +96,9 @@ LIKELY_DIAMETER = 0.2
 NAMED_STRIPES = 3
 MOST_READ = 24
 """Stripes on a sphere, evenly spread, that other readings of the poses are tried on."""
-LEAST_TURN_DEG = 1.0
-"""A tool that turns by less about a second axis may not turn at all: robots err by some tenths."""
+TURN_ERROR_DEG, TURN_OVER_ERROR = 0.3, 5.0
+"""A tool of which no posture turns by more than so many times what arms and robots err by, unless
+that is given, about a second axis may not turn at all."""
 UNDERDETERMINED_PART, UNDERDETERMINED_MM = 0.2, 2.0
 """A combination known less well than this part of the diameter and than this is not determined."""
 TURN_THE_TOOL = (
@@ -374,9 +376,12 @@ def _refuse_open(problem: Problem, conditioning: Conditioning, most_mm: float) -
     What the arm errs in turning is no turn: of a tool that never turned it would tell a hand-eye.
     """
     cause, remedy = ": the tool hardly turns, or about one axis only", TURN_THE_TOOL
-    if not turns_about_two_axes(problem.observations, LEAST_TURN_DEG):
+    about_second_deg = principal_turns_deg(problem.observations)[:, 1]
+    given_rad = problem.options.arm_rotation_rad
+    error_deg = TURN_ERROR_DEG if given_rad is None else float(np.degrees(given_rad))
+    if np.abs(about_second_deg).max() < TURN_OVER_ERROR * error_deg:
         return FitFailure(f"the postures do not determine the hand-eye{cause}", remedy)
-    if turns_about_two_axes(problem.observations):
+    if np.sqrt((about_second_deg**2).mean()) > ALIKE_DEG:
         cause, remedy = (
             ", though the tool turns: the scatter of arm and stripes or the sensor leaves it open",
             SCAN_MORE,

@@ -231,13 +231,13 @@ def conditioning_warnings(
     return tuple(warnings)
 
 
-def turns_about_two_axes(observations: CondensedObservations, by_deg: float = ALIKE_DEG) -> bool:
-    """Whether the postures' orientations spread about two axes, by so much each (rms)."""
+def principal_turns_deg(observations: CondensedObservations) -> FloatArray:
+    """(P, 3) turns of postures from their mean, about the axes of their spread, widest first."""
     stripes = observations.stripe[np.unique(observations.posture, return_index=True)[1]]
     rotations = observations.rotations[stripes]
     turns = Rotation.from_matrix(rotations[0].T @ rotations).as_rotvec()
-    extent = np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False) / np.sqrt(len(turns))
-    return len(extent) > 1 and float(np.degrees(extent[1])) > by_deg
+    turns -= turns.mean(axis=0)
+    return np.asarray(np.degrees(turns @ np.linalg.svd(turns)[2].T))
 
 
 def common_to_postures(observations: CondensedObservations, plane: Plane) -> str:

@@ -546,7 +546,8 @@ class _OneSheet:
         """
         scatter = scatter or self.board_scatter(solution, noise)
         wider = replace(self, errors=self.errors.with_boards(scatter.of_boards))
-        other = wider.solve(solution.sheets[0], noise.sigma_factor, is_bowed=is_bowed)
+        solve = wider.solve_bowed if is_bowed else wider.solve
+        other = solve(solution.sheets[0], noise.sigma_factor)
         if isinstance(other, FitFailure):
             return solution, scatter
         found = self.board_scatter(other, noise)
@@ -578,26 +579,25 @@ class _OneSheet:
 
         Where the rays come from shows in how the bow along the stripe changes with depth: to first
         order a fan adds ``-2 lean u v - spread u^2 v`` to ``u^2`` and ``-3 lean u^2 v`` to ``u^3``.
-        The stripes' fit tells little of a fan beside these two: it may be worse by chance, and from
-        there on halfway fans are tried that fit better.
+        A right fan of a weak bow may fit worse by one or two; else halfway ones are tried.
         """
         kept: SheetSolution | None = None
         before: tuple[FloatArray, FloatArray] | None = None
-        least, slack = np.inf, 0.0
+        least = limit = np.inf
         for _ in range(FAN_ROUNDS):
             solution = self.solve(start, sigma_factor, is_bowed=True)
             if isinstance(solution, FitFailure):
                 return solution if kept is None else kept
-            if kept is not None and solution.chi2 > least + slack:
-                halfway = 0.5 * (kept.sheets[0].fan + start.fan)
-                before, slack, start = None, 0.0, replace(start, fan=halfway)
+            if kept is not None and solution.chi2 > limit:
+                start = replace(start, fan=0.5 * (kept.sheets[0].fan + start.fan))
+                before, limit = None, max(least, kept.chi2)
                 continue
             kept, least = solution, min(least, solution.chi2)
             asked = self._fan_of(solution)
             step = asked - start.fan
             if float(np.abs(step).max()) < FAN_SETTLED:
                 break
-            slack, start = FAN_SLACK, replace(start, fan=_ahead(asked, step, before))
+            limit, start = least + FAN_SLACK, replace(start, fan=_ahead(asked, step, before))
             before = asked, step
         return solution if kept is None else kept
 

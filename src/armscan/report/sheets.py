@@ -185,9 +185,12 @@ def _largest_bow_mm(calibrated: SheetCalibration) -> float:
 
 
 def _light_source(fit: SheetFit) -> Quantity:
-    spread = float(fit.sheet.fan[1])
-    distance = fit.sheet.scale_mm / spread if spread else math.inf
-    return fact("The bow's light comes from", f"about {distance:.0f} mm before the middle")
+    lean, spread = fit.sheet.fan.tolist()
+    along = math.hypot(1.0, lean)
+    distance_mm = fit.sheet.scale_mm * along / spread if spread > 0.0 else 0.0
+    where = f"about {distance_mm:.0f} mm before the middle" if spread > 0.0 else "far away"
+    lean_deg = math.degrees(math.atan(abs(lean)))
+    return fact("The bow's light comes from", f"{where}, {lean_deg:.0f} degrees aside of the depth")
 
 
 def _point_quantities(fit: SheetFit) -> list[Quantity]:

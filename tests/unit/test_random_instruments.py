@@ -175,6 +175,15 @@ def test_postures_that_only_scatter_stay_in_a_hand_eye(seed: int) -> None:
     assert not any("left out" in text for text in found.warnings)
 
 
+@pytest.mark.parametrize("seed", [8400660, 8400822])
+def test_nearly_parallel_postures_end_at_no_hand_eye_through_the_plate(seed: int) -> None:
+    """Starts that end in one long valley hid the other minimum: the head was turned by 87 degrees,
+    the camera behind the plate in five of seven exposures. A plate that is the light sheet itself
+    has all points on it, and took their scatter to nothing.
+    """
+    assert hand_eye(seed, on_sphere=False).result == "right"
+
+
 @pytest.mark.parametrize("seed", [900019, 900041])
 def test_points_stay_as_far_from_a_sphere_as_the_sensor_is_known(seed: int) -> None:
     """0.6 mm, more than arm, poses or ball could be blamed for, and what the sensor states."""

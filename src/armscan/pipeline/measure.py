@@ -51,6 +51,7 @@ from armscan.reconstruction.points import MeasuredProfile, measure_points, point
 from armscan.reconstruction.triangulate import (
     CALIBRATED_DEPTHS,
     LABEL_DEPTHS,
+    SOUGHT_DEPTHS,
     DepthRange,
     StripePoints,
     cloud_in_sensor,
@@ -156,7 +157,7 @@ def labeller_for(
                 where="--sheet",
                 remedy="leave --sheet out",
             )
-        return StereoLabeller(sensor, options.depths or LABEL_DEPTHS)
+        return StereoLabeller(sensor, SOUGHT_DEPTHS.or_wider(options.depths))
     if n_sheets > 1 and not options.sheet and (is_scan or stripes_apart(sensor).any()):
         return CrossLabeller(sensor, options.depths or LABEL_DEPTHS)
     depths = options.accepted_depths(sensor)
@@ -378,7 +379,7 @@ def measured_again(
     for k in range(0, len(profiles) - 1, 2):
         both = profiles[k].profile, profiles[k + 1].profile
         labels = labeller.label(both, lasers[k] or lasers[k + 1])
-        for camera, found in enumerate(measure_points(labels, sensor, labeller.depths)):
+        for camera, found in enumerate(measure_points(labels, sensor, LABEL_DEPTHS)):
             yield k + camera, found.points
 
 

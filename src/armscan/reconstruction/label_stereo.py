@@ -49,7 +49,7 @@ from armscan.reconstruction.segments import (
     cut_segments,
     take_samples,
 )
-from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange
+from armscan.reconstruction.triangulate import SOUGHT_DEPTHS, DepthRange
 from armscan.records.profile import Profile
 
 BytesArray: TypeAlias = NDArray[np.uint8]
@@ -386,7 +386,7 @@ class StereoLabeller:
     """
 
     sensor: SensorCalibration
-    depths: DepthRange = LABEL_DEPTHS
+    depths: DepthRange = SOUGHT_DEPTHS
     _prior: EpipolarOffset = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -62,6 +62,10 @@ class DepthRange:
                 remedy=f"give 0 to {MOST_MARGIN:g} widths of the calibrated depths: 0.8 for 80 %",
             )
 
+    def or_wider(self, other: DepthRange | None) -> DepthRange:
+        """The wider of both; itself if there is no other."""
+        return self if other is None or other.margin <= self.margin else other
+
     def limits_mm(self, sheet: SheetCalibration) -> tuple[float, float]:
         """Smallest and largest Z accepted."""
         low, high = sheet.depth_range_mm
@@ -83,6 +87,10 @@ LABEL_DEPTHS = DepthRange(0.5)
 """Depths in which a sheet is looked for where several may have drawn a stripe, unless a person says
 otherwise. Two cameras accept them too: the second one sees whether the sheet goes on as it was
 calibrated."""
+SOUGHT_DEPTHS = DepthRange(3.0)
+"""Depths in which two cameras look for sheets, and more where a person accepts more. All lines of a
+plate beyond its own sheets' depths lie, moved by one line, on the sheets beside them, a fraction of
+a pixel off: where only these are asked for, they have every name wrong."""
 
 
 def intersect_sheets(

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import stdtr
 
 from armscan.calibration.cameras.adjustment import (
     SHARED_NAMES,
@@ -181,9 +182,10 @@ class ChosenModel:
 
 WIDE = 0.6
 """Ideal radius X/Z up to which a fisheye's terms do what a pinhole's do."""
-LENS_SIGMAS = 2.0
-"""A fisheye takes a pinhole's place if the logarithms of unseen views' residuals fall, in the mean,
-by so many of its standard errors; it has fewer coefficients. Less than that is a doubt."""
+LENS_CHANCE = 0.003
+"""A fisheye takes a pinhole's place if the logarithms of unseen views' residuals fall by more than
+they would by chance once in so many times, by Student's t of the views. Less than that is a doubt:
+of seven views two standard errors are met by chance one time in twenty."""
 
 
 def choose_lens(
@@ -205,11 +207,11 @@ def choose_lens(
         reason = "fisheye: no pinhole with five coefficients explains the views"
         return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, TANGENTIAL)
     both = replace(fisheye, weights=fisheye.weights * pinhole.solution.weights)
-    fall, error = _fall_of_residuals(validate(pinhole.solution, both), validate(both, both))
+    fall, chance = _fall_of_residuals(validate(pinhole.solution, both), validate(both, both))
     if not fall > 0.0:
         return pinhole
     factor = float(np.exp(fall))
-    if fall < LENS_SIGMAS * error:
+    if not chance < LENS_CHANCE:
         doubt = (
             "the lens is wide, and unseen views do not tell this pinhole from a fisheye, which "
             f"predicts them {factor:.3f} times as well: where no target points lie the two may "
@@ -231,14 +233,15 @@ def _is_wide(solution: Solution) -> bool:
 def _fall_of_residuals(
     pinhole: CrossValidation | None, fisheye: CrossValidation | None
 ) -> tuple[float, float]:
-    """Mean over views of the fall of held-out residuals' logarithms, and its standard error.
+    """Mean over views of the fall of held-out residuals' logarithms; how likely it is by chance.
 
     Of logarithms, for one view that a pinhole cannot describe would hide in its own scatter.
     """
     if pinhole is None or fisheye is None:
-        return 0.0, np.inf
+        return 0.0, 1.0
     fall = np.log(pinhole.view_rms_px) - np.log(fisheye.view_rms_px)
-    return float(np.mean(fall)), float(np.std(fall, ddof=1) / np.sqrt(len(fall)))
+    error = max(float(np.std(fall, ddof=1)) / np.sqrt(len(fall)), 1e-300)
+    return float(np.mean(fall)), float(stdtr(len(fall) - 1, -np.mean(fall) / error))
 
 
 SIGNIFICANT_SIGMAS = 4.0

@@ -157,7 +157,10 @@ def find_alternatives(fit: HandEyeSolution) -> tuple[Alternative, ...]:
     """Every kind of alternative to a solution on a plate at its best, likeliest first."""
     placed = fit.placed
     known = fit.problem.surface_covariance(placed) + fit.problem.sensor_covariance(placed)
-    found = [_weighed(fit, known, unknowns) for unknowns in _all_unknowns(fit)]
+    found = [
+        _weighed(fit, known, replace(one, jacobian=fit.problem.of_smooth_stripes(one.jacobian)))
+        for one in _all_unknowns(fit)
+    ]
     return tuple(sorted((one for one in found if one is not None), key=lambda o: -o.likelihood))
 
 

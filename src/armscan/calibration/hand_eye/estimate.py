@@ -35,6 +35,7 @@ from armscan.calibration.hand_eye.surface import (
     SphereSurface,
     free_columns,
     place,
+    smooth_along_stripes,
 )
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import (
@@ -113,6 +114,15 @@ class Problem:
         """Which entries of a step are solved for."""
         return free_columns(self.surface, self.options)
 
+    def jacobian(self, placed: Placed) -> FloatArray:
+        """(M, F) derivative of the distances by what is solved for, of points without errors."""
+        return self.of_smooth_stripes(placed.jacobian[:, self.columns])
+
+    def of_smooth_stripes(self, derivative: FloatArray) -> FloatArray:
+        """(M, F) of distances, without what the points' own errors do to it on a plate."""
+        is_plate = isinstance(self.surface, PlateSurface)
+        return smooth_along_stripes(self.observations, derivative) if is_plate else derivative
+
     def components(self, placed: Placed) -> tuple[NoiseComponent, ...]:
         """Causes of scatter."""
         observations, surface, options = self.observations, self.surface, self.options
@@ -179,7 +189,7 @@ class HandEyeSolution:
     @property
     def jacobian(self) -> FloatArray:
         """(M, F) derivative of the residuals by the unknowns solved for."""
-        return np.asarray(self.placed.jacobian[:, self.problem.columns])
+        return self.problem.jacobian(self.placed)
 
     @property
     def log_likelihood(self) -> float:
@@ -350,7 +360,7 @@ def estimate(
             elif hold_noise:
                 noise = NoiseEstimate(sigmas, np.zeros((len(sigmas), len(sigmas))))
             else:
-                jacobian = placed.jacobian[:, problem.columns]
+                jacobian = problem.jacobian(placed)
                 known = prior + problem.sensor_covariance(placed)
                 noise = estimate_noise(placed.residual_mm, jacobian, components, known, sigmas)
                 sigmas = noise.sigmas
@@ -396,7 +406,7 @@ def _solution(
         return None
     placed = problem.place(found.state)
     known = prior if found.state.sensor is None else prior + problem.sensor_covariance(placed)
-    linear = solve_linear(placed.residual_mm, placed.jacobian[:, problem.columns], scatter + known)
+    linear = solve_linear(placed.residual_mm, problem.jacobian(placed), scatter + known)
     if linear is None:
         return None
     return HandEyeSolution(
@@ -494,7 +504,7 @@ def _about_common_centre(
     if problem is solution.problem:
         return None
     placed = problem.place(solution.state)
-    jacobian, known = placed.jacobian[:, problem.columns], problem.surface_covariance(placed)
+    jacobian, known = problem.jacobian(placed), problem.surface_covariance(placed)
     if root is not None and placed.by_sensor is not None:
         jacobian = np.concatenate([jacobian, placed.by_sensor @ root], axis=1)
     elif solution.state.sensor is not None:
@@ -652,7 +662,7 @@ def conditioning_at(
     else:
         known = problem.surface_covariance(placed) + problem.sensor_covariance(placed)
         total = total_covariance(components, sigmas) + known
-    whitened = Whitening(total)(placed.jacobian[:, problem.columns])
+    whitened = Whitening(total)(problem.jacobian(placed))
     return conditioning_of(whitened[:, :N_HAND_EYE], whitened[:, N_HAND_EYE:])
 
 

@@ -31,10 +31,11 @@ _PSI = 1.533751168755204288118041
 """Positive root of psi^4 = psi + 4."""
 N_ON_PLATE, N_ON_SPHERE = 240, 200
 """Rotations to start from; on a sphere each thrice, for the sides of the sheets."""
-N_FIRST, N_LAST = 8, 40
-"""Steps of every start; steps of the best of them."""
-N_GO_ON = 40
-N_GO_ON_SPHERE = 60
+N_STEPS_ON_PLATE = 88
+"""Of every start: where postures are nearly parallel, most of those that are best after a few steps
+are on their way down one long valley, and another minimum would be lost."""
+N_FIRST, N_LAST, N_GO_ON_SPHERE = 8, 40, 60
+"""On a sphere: steps of every start, of the best of them, and how many these are."""
 N_DESCENT = 25
 N_MINIMA = 12
 SAME_RAD = float(np.radians(1.0))
@@ -197,23 +198,6 @@ def descend_all(
     return np.asarray(u @ vt), others, cost
 
 
-def _minima(
-    place: ManyPlaced,
-    rotations: FloatArray,
-    others: FloatArray,
-    scale: FloatArray,
-    *,
-    n_go_on: int,
-    apart_rad: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Rotations and further unknowns of at most `N_MINIMA` distinct minima, least first."""
-    rotations, others, cost = descend_all(place, rotations, others, N_FIRST, scale)
-    best = np.argsort(cost)[:n_go_on]
-    rotations, others, cost = descend_all(place, rotations[best], others[best], N_LAST, scale)
-    kept = distinct(rotations, cost, apart_rad, N_MINIMA)
-    return rotations[kept], others[kept]
-
-
 def distinct(rotations: FloatArray, cost: FloatArray, apart_rad: float, count: int) -> IntArray:
     """Numbers of the ``count`` least costly of (K, 3, 3) rotations that differ from each other."""
     kept: list[int] = []
@@ -343,8 +327,9 @@ def minima_on_plate(
     shifts = np.asarray(-heights @ np.linalg.pinv(normals, rcond=1e-6).T)
     scale = unit_steps(few.points_mm, 3)
     place = placed_on_plate(few.points_mm, normals, constants)
-    ends = _minima(place, rotations, shifts, scale, n_go_on=N_GO_ON, apart_rad=SAME_RAD)
-    return tuple(Pose(rotation, shift) for rotation, shift in zip(*ends, strict=True))
+    rotations, shifts, cost = descend_all(place, rotations, shifts, N_STEPS_ON_PLATE, scale)
+    kept = distinct(rotations, cost, SAME_RAD, N_MINIMA)
+    return tuple(Pose(rotations[k], shifts[k]) for k in kept)
 
 
 def posture_rms(observations: CondensedObservations, residual_mm: FloatArray) -> FloatArray:
@@ -523,17 +508,14 @@ def minima_on_sphere(
     every = rotations_all_over(N_ON_SPHERE)
     circles = _Circles.of(sections, radius_mm)
     others = np.concatenate([circles.complete(every, side) for side in (1, -1, 0)])
-    rotations, others = _minima(
-        place,
-        np.tile(every, (3, 1, 1)),
-        others,
-        unit_steps(points, 6),
-        n_go_on=N_GO_ON_SPHERE,
-        apart_rad=APART_ON_SPHERE_RAD,
-    )
+    rotations, scale = np.tile(every, (3, 1, 1)), unit_steps(points, 6)
+    rotations, others, cost = descend_all(place, rotations, others, N_FIRST, scale)
+    best = np.argsort(cost)[:N_GO_ON_SPHERE]
+    rotations, others, cost = descend_all(place, rotations[best], others[best], N_LAST, scale)
+    kept = distinct(rotations, cost, APART_ON_SPHERE_RAD, N_MINIMA)
     return tuple(
-        HandEyeState(Pose(rotation, other[:3]), np.array([*other[3:], radius_mm]))
-        for rotation, other in zip(rotations, others, strict=True)
+        HandEyeState(Pose(rotations[k], others[k, :3]), np.array([*others[k, 3:], radius_mm]))
+        for k in kept
     )
 
 

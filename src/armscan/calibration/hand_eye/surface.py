@@ -306,6 +306,27 @@ def place(
     )
 
 
+def smooth_along_stripes(observations: CondensedObservations, values: FloatArray) -> FloatArray:
+    """(M, F) values on a plate, each line's replaced by their parabola along it.
+
+    A distance's derivative holds the error of its point: with it, a large turn moves the points'
+    errors out of the distances, as if the plate were the light sheet, in which all points lie
+    whatever they err by. Along a line the derivatives of points without errors are smooth.
+    """
+    points = observations.points_mm
+    lines = np.column_stack([observations.stripe, observations.sheet])
+    is_first = np.ones(len(lines), dtype=np.bool_)
+    is_first[1:] = (np.diff(lines, axis=0) != 0).any(axis=1)
+    starts, line = np.flatnonzero(is_first), np.cumsum(is_first) - 1
+    along = np.linalg.norm(points - points[starts][line], axis=1)
+    along /= np.maximum(np.maximum.reduceat(along, starts), 1e-12)[line]
+    basis = np.column_stack([np.ones(len(along)), along, along**2])
+    squares = np.add.reduceat(basis[:, :, None] * basis[:, None, :], starts)
+    products = np.add.reduceat(basis[:, :, None] * values[:, None, :], starts)
+    parabolas = np.linalg.pinv(squares, rcond=1e-10, hermitian=True) @ products
+    return np.asarray(np.einsum("mi,mif->mf", basis, parabolas[line]))
+
+
 def free_columns(surface: ReferenceSurface, options: HandEyeOptions) -> IntArray:
     """Which entries of a step are solved for."""
     last = N_HAND_EYE + len(surface.start)

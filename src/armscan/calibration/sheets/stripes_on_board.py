@@ -188,6 +188,9 @@ noise one in 16,000."""
 LINE_TOLERANCE_MM = 1.0
 """Half width of the band on the board in which points belong to one straight stripe, before robust
 statistics tighten it: lines of a fan lie further apart, bows and bent boards less."""
+LINE_TOLERANCE = 0.01
+"""The same as a part of the print's longer side, for boards of less than 100 mm: on them lines may
+lie a millimetre apart. It holds what `OUTLIER_SIGMA` lets pass."""
 TOLERANCE_PX = 2.0
 """The least half width of this band, where a pixel is coarser."""
 TRIALS = 300
@@ -386,14 +389,18 @@ def _with_stripes(image: BoardImage, is_open: BoolArray, n_lines: int) -> BoardI
     From top to bottom where they lie flatter than 45 degrees.
     """
     candidates = np.flatnonzero(is_open)
-    coarse_mm = TOLERANCE_PX * image.mm_per_px(candidates) if len(candidates) else 0.0
     width_mm, height_mm = np.ptp(image.data.view.points_board_mm[:, :2], axis=0).tolist()
+    tolerance_mm = LINE_TOLERANCE * max(width_mm, height_mm)
+    if len(candidates):
+        scatter_mm = OUTLIER_SIGMA * float(np.median(image.sigma_mm[candidates]))
+        tolerance_mm = min(max(tolerance_mm, scatter_mm), LINE_TOLERANCE_MM)
+        tolerance_mm = max(tolerance_mm, TOLERANCE_PX * image.mm_per_px(candidates))
     found = find_straight_stripes(
         image.on_board_mm()[candidates],
         image.sigma_mm[candidates],
         image.data.profile.segment[candidates],
         shortest_mm=MIN_SPAN * min(width_mm, height_mm),
-        tolerance_mm=max(LINE_TOLERANCE_MM, coarse_mm),
+        tolerance_mm=tolerance_mm,
         n_lines=n_lines,
     )
     use = image.use.copy()

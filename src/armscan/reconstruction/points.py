@@ -250,9 +250,12 @@ def measure_stereo(
     )
     other = right.sheet[crossings.row]
     is_pair = (other == crossings.sheet) | (other == -1)
+    is_inside = depths.holds(projected.points_mm, projected.sheet, sensor)
+    is_beyond = is_pair & ~is_inside[crossings.at]
+    is_pair &= ~is_beyond
     residual, sigma = residual_and_sigma(Residuals.of(crossings, sensor), offset)
     is_fused = is_pair & (np.abs(residual) <= CONSISTENCY_SIGMAS * sigma)
-    is_alone = depths.holds(projected.points_mm, projected.sheet, sensor)
+    is_alone = is_inside.copy()
     is_alone[crossings.at[is_pair]] = False
     left_status = np.where(left.sheet >= 0, PointStatus.NO_RAY, left.status)
     left_status[row] = PointStatus.OUT_OF_DEPTH
@@ -269,8 +272,9 @@ def measure_stereo(
         sensor=sensor,
         offset=offset,
     )
+    rows = crossings.row
     right_points, right_status = _right_alone(
-        right, crossings.row[is_pair], crossings.row[is_fused], sensor, depths
+        right, (rows[is_pair], rows[is_fused], rows[is_beyond]), sensor, depths
     )
     left_status.setflags(write=False)
     right_status.setflags(write=False)
@@ -282,24 +286,26 @@ def measure_stereo(
 
 def _right_alone(
     right: LabelledProfile,
-    paired: IntArray,
-    fused: IntArray,
+    beside: tuple[IntArray, IntArray, IntArray],
     sensor: SensorCalibration,
     depths: DepthRange,
 ) -> tuple[StripePoints, IntArray]:
     """Points that the left camera does not see, and the status (N,) of all right points.
 
-    ``paired`` and ``fused`` are rows beside which left points fell, and those of them that agreed.
+    ``beside`` are rows beside which left points within the depths fell, those of them that agreed,
+    and those beside which left points beyond the depths fell.
     """
     is_labelled = right.sheet >= 0
-    is_beside = _beside(paired, right.profile)
+    paired, fused, beyond = (is_labelled & _beside(rows, right.profile) for rows in beside)
+    is_beside = paired | beyond
     found = triangulate_right(
         right.profile, np.flatnonzero(is_labelled & ~is_beside), right.sheet, sensor
     )
     is_inside = depths.holds(found.points_mm, found.sheet, sensor)
     status = np.where(is_labelled, PointStatus.NO_RAY, right.status)
-    status[is_labelled & is_beside] = PointStatus.INCONSISTENT
-    status[is_labelled & _beside(fused, right.profile)] = PointStatus.SHARED
+    status[beyond] = PointStatus.OUT_OF_DEPTH
+    status[paired] = PointStatus.INCONSISTENT
+    status[fused] = PointStatus.SHARED
     status[found.row] = np.where(is_inside, PointStatus.MEASURED, PointStatus.OUT_OF_DEPTH)
     return found.select(is_inside), status
 

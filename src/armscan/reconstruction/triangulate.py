@@ -67,10 +67,10 @@ class DepthRange:
         return self if other is None or other.margin <= self.margin else other
 
     def limits_mm(self, sheet: SheetCalibration) -> tuple[float, float]:
-        """Smallest and largest Z accepted."""
+        """Smallest and largest Z accepted, before the camera."""
         low, high = sheet.depth_range_mm
         slack = self.margin * (high - low)
-        return low - slack, high + slack
+        return max(low - slack, 0.0), high + slack
 
     def holds(
         self, points_mm: FloatArray, sheet: IntArray | int, sensor: SensorCalibration

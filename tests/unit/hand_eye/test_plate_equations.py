@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,7 +15,12 @@ from armscan.calibration.hand_eye.observations import (
     condense_plate,
     straight_stripes,
 )
-from armscan.calibration.hand_eye.surface import HandEyeState, PlateSurface, place
+from armscan.calibration.hand_eye.surface import (
+    HandEyeState,
+    PlateSurface,
+    place,
+    smooth_along_stripes,
+)
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Points, Pose, Tool
@@ -144,3 +151,30 @@ def test_the_minimum_of_the_objective_is_found_from_afar() -> None:
             for way in (-1.0, 1.0):
                 beside = pose.retract(way * 1e-4 * np.eye(6)[k] * (1.0 if k < 3 else 100.0))
                 assert objective(PLANE, poses, points, beside) > least
+
+
+def test_derivatives_along_a_stripe_are_those_of_points_without_errors() -> None:
+    """Of errors across the stripe; of six observations a parabola keeps three parts of six."""
+    observations, _ = _nodes()
+    state = HandEyeState(TOOL_FROM_SENSOR, SURFACE.start)
+    exact = place(observations, SURFACE, state).jacobian
+    np.testing.assert_allclose(smooth_along_stripes(observations, exact), exact, atol=2e-3)
+    points = observations.points_mm
+    along = np.repeat(points[5::6] - points[::6], 6, axis=0)
+    across = np.cross(along, [0.3, 0.5, 0.8])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    errors = np.random.default_rng(1).normal(0.0, 0.1, (len(points), 1)) * across
+    erring = replace(observations, points_mm=points + errors)
+    noisy = place(erring, SURFACE, state).jacobian
+    smooth = smooth_along_stripes(erring, noisy)
+    left = np.square(smooth - exact)[:, :3].sum() / np.square(noisy - exact)[:, :3].sum()
+    assert left == pytest.approx(3 / 6, abs=0.2)
+
+
+def test_stripes_of_one_to_three_observations_keep_their_derivatives() -> None:
+    observations, _ = _nodes()
+    values = np.random.default_rng(2).normal(size=(len(observations), 4))
+    for n in (1, 2, 3):
+        kept = np.arange(len(observations)) % 6 < n
+        few, own = observations.select(kept), values[kept]
+        np.testing.assert_allclose(smooth_along_stripes(few, own), own, atol=1e-6)

@@ -68,6 +68,30 @@ def test_few_lines_an_image_are_named_over_all(seed: int) -> None:
     assert sum(k >= 0 for row in names.sheets for k in row) >= 0.85 * sum(map(len, truth))
 
 
+def test_stripes_are_told_apart_on_boards_of_any_size() -> None:
+    """The same images are those of a head and boards of a quarter of the size: of 9 mm, with lines
+    1.7 mm apart, of which the band for large boards holds two.
+    """
+    rig = fan_rig(1, 4)
+    camera = rig.stereo().left
+    boards, truth = rig.boards(camera, np.random.default_rng(1))
+    for board, of_segment in zip(boards, truth, strict=True):
+        view, found = board.view, board.sensor_from_board
+        pose = Pose(found.value.rotation, 0.25 * found.value.translation_mm)
+        units = np.diag([1.0] * 3 + [0.25] * 3)
+        small = replace(
+            board,
+            view=replace(view, points_board_mm=0.25 * view.points_board_mm),
+            placed=None,
+            sensor_from_board=replace(
+                found, value=pose, covariance=units @ found.covariance @ units
+            ),
+        )
+        stripes = observe_board_stripes(small, HeadCameras.of(camera)).stripes
+        shown = [set(of_segment[k] for k in board.profile.segment[one.rows]) for one in stripes]
+        assert [len(one) for one in shown] == [1] * len(set(of_segment))
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_lost_lines_and_stray_stripes_mislead_no_one(seed: int) -> None:
     """A sixth of the stripes is not found, and each image has a straight stripe of no sheet."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +12,7 @@ import pytest
 from armscan.errors import InputError
 from armscan.geometry.arrays import IntArray
 from armscan.models.calibration import SensorCalibration
+from armscan.pipeline.measure import MeasureOptions, labeller_for
 from armscan.pipeline.scan import measure_scan
 from armscan.pipeline.simulate import SimulatedPart, TwinName
 from armscan.pipeline.truth import naming_errors, true_names
@@ -19,7 +20,7 @@ from armscan.reconstruction.epipolar import EpipolarOffset
 from armscan.reconstruction.label_stereo import StereoLabeller, log_ratio
 from armscan.reconstruction.labels import LabelledInstant, PointStatus
 from armscan.reconstruction.points import MeasuredProfile, measure_points
-from armscan.reconstruction.triangulate import sensor_covariance
+from armscan.reconstruction.triangulate import LABEL_DEPTHS, sensor_covariance
 from armscan.records.profile import Profile
 from rigs.placing_rig import scanner
 from rigs.stereo_head import StereoHead
@@ -85,6 +86,26 @@ def test_shared_points_get_their_sheets_and_hardly_any_a_wrong_one(kind: str) ->
         named += found.n_labelled()
     assert right_names >= LEAST_NAMED * shared
     assert wrong <= MOST_WRONG * named
+
+
+def test_a_plate_nearer_than_all_sheets_were_calibrated_has_no_wrong_names() -> None:
+    """At 134 to 149 mm, where 150 to 162 mm were calibrated.
+
+    Where a sheet was looked for over half of these depths beyond them, 900 points bore the name of
+    the line beside. What lies farther beyond than that is still no point.
+    """
+    rng = np.random.default_rng([5, KINDS.index("plate")])
+    drawn = head().drawn_calibration(rng)
+    sensor = replace(
+        drawn, sheets=tuple(replace(one, depth_range_mm=(150.0, 162.0)) for one in drawn.sheets)
+    )
+    left, right = expose(head(), draw_surfaces("plate", rng), QUIET, rng)
+    labels = labeller_for(sensor, MeasureOptions()).label([left.profile, right.profile])
+    named = labels.profiles[0].sheet
+    assert n_wrong(named, left) == 0
+    assert (named >= 0).mean() > LEAST_NAMED
+    points = measure_points(labels, sensor, LABEL_DEPTHS)[0].points
+    assert points.points_mm[:, 2].min() > 143.5
 
 
 def test_a_line_that_goes_on_as_the_next_one_behind_an_edge_does_not_take_its_name() -> None:

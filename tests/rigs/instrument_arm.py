@@ -23,9 +23,9 @@ from armscan.calibration.hand_eye.calibrate import (
     calibrate_on_sphere,
 )
 from armscan.calibration.hand_eye.checks import LIKELIER, MOST_ARM_MM, MOST_OPEN_MM
-from armscan.calibration.hand_eye.estimate import LEVER_MM
 from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.surface import LEVER_MM
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray, IntArray, homogeneous
 from armscan.geometry.estimate import Estimate, FitFailure

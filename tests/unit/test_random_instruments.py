@@ -179,9 +179,12 @@ def test_postures_that_only_scatter_stay_in_a_hand_eye(seed: int) -> None:
 def test_nearly_parallel_postures_end_at_no_hand_eye_through_the_plate(seed: int) -> None:
     """Starts that end in one long valley hid the other minimum: the head was turned by 87 degrees,
     the camera behind the plate in five of seven exposures. A plate that is the light sheet itself
-    has all points on it, and took their scatter to nothing.
+    has all points on it, and took their scatter to nothing. What the points err by pulls the least
+    sum of squares there: by two sigmas, to a chi2 of 10 where the second is at 4 of 6.
     """
-    assert hand_eye(seed, on_sphere=False).result == "right"
+    found = hand_eye(seed, on_sphere=False)
+    assert found.result == "right"
+    assert found.chi2 < 8.0
 
 
 @pytest.mark.parametrize("seed", [900019, 900041])

@@ -30,9 +30,12 @@ from armscan.inspection.selection import (
 from armscan.inspection.uncertainty import FitErrors, FitLinearised, worst_sigma
 from armscan.records.cloud import PointCloud
 
-LARGEST_MISFIT = 0.02
+LARGEST_MISFIT, MOST_MISFIT = 0.02, 0.1
 """Largest difference of fitted and nominal diameter, as a part of it, that may be the same ball;
-points that scatter so much that the search's band is wider add twice what it is wider by."""
+points that scatter so much that the search's band is wider add twice what it is wider by. A fit
+whose diameter is known that badly may differ by `MISFIT_SIGMAS` more, up to the second part: of any
+patch some ball's diameter is known to nothing."""
+MISFIT_SIGMAS = 3.0
 
 SETTLING_ROUNDS = 3
 PLACES = 4
@@ -210,7 +213,12 @@ def _settled(
         sphere, is_fitted = fit
         misfit = 2.0 * sphere.radius_mm - diameter_mm
         wider_mm = float(np.median(band_mm[chosen])) - SEARCH_BAND_MM
-        if abs(misfit) > LARGEST_MISFIT * diameter_mm + 2.0 * wider_mm:
+        most_mm = LARGEST_MISFIT * diameter_mm + 2.0 * wider_mm
+        if abs(misfit) > most_mm:
+            described = _described(selection, chosen, is_fitted, sphere, diameter_mm)
+            known_mm = LARGEST_MISFIT * diameter_mm + MISFIT_SIGMAS * described.diameter.sigma_mm
+            most_mm = max(most_mm, min(known_mm, MOST_MISFIT * diameter_mm))
+        if abs(misfit) > most_mm:
             return FitFailure(
                 f"the points that a ball of {diameter_mm:g} mm could have lie on one of "
                 f"{2.0 * sphere.radius_mm:.4g} mm",

@@ -73,7 +73,10 @@ class Projections:
 def possible_sheets(
     points_px: FloatArray, sensor: SensorCalibration, depths: DepthRange
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of point and sheet whose planes meet within the depths accepted, widened for the bow.
+    """Pairs of point and sheet whose planes meet within the depths, widened for the bow.
+
+    Those of all sheets together: one that was calibrated in few depths is looked for wherever its
+    neighbours are, which else would have its name.
 
     Returns
     -------
@@ -81,8 +84,9 @@ def possible_sheets(
         (H,) indices, ordered by sheet.
     """
     sheets = sheet_numbers(sensor)
-    limits = np.array([depths.limits_mm(one) for one in sensor.sheets])
-    limits *= [1.0 - BOW_DEPTH_SHARE, 1.0 + BOW_DEPTH_SHARE]
+    low, high = np.array([depths.limits_mm(one) for one in sensor.sheets]).T
+    limits = np.array([low.min(), high.max()]) * [1.0 - BOW_DEPTH_SHARE, 1.0 + BOW_DEPTH_SHARE]
+    limits = np.tile(limits, (len(sheets), 1))
     point, sheet = np.zeros((2, len(points_px) * len(sheets)), np.int64)
     pixels = np.ascontiguousarray(points_px)
     count = list_possible(pixels, lens_numbers(sensor), sheets, limits, point, sheet)

@@ -171,10 +171,10 @@ def test_derivatives_along_a_stripe_are_those_of_points_without_errors() -> None
     assert left == pytest.approx(3 / 6, abs=0.2)
 
 
-def test_stripes_of_one_to_three_observations_keep_their_derivatives() -> None:
+def test_stripes_of_one_or_two_observations_keep_their_derivatives() -> None:
     observations, _ = _nodes()
     values = np.random.default_rng(2).normal(size=(len(observations), 4))
-    for n in (1, 2, 3):
+    for n in (1, 2):
         kept = np.arange(len(observations)) % 6 < n
         few, own = observations.select(kept), values[kept]
         np.testing.assert_allclose(smooth_along_stripes(few, own), own, atol=1e-6)

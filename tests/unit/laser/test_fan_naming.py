@@ -88,7 +88,7 @@ def test_stripes_are_told_apart_on_boards_of_any_size() -> None:
             ),
         )
         stripes = observe_board_stripes(small, HeadCameras.of(camera)).stripes
-        shown = [set(of_segment[k] for k in board.profile.segment[one.rows]) for one in stripes]
+        shown = [{of_segment[k] for k in board.profile.segment[one.rows]} for one in stripes]
         assert [len(one) for one in shown] == [1] * len(set(of_segment))
 
 

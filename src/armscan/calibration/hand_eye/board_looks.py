@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from armscan.calibration.cameras.start import estimate_board_poses
 from armscan.calibration.hand_eye.alternatives import other_readings
-from armscan.calibration.hand_eye.estimate import LEVER_MM
+from armscan.calibration.hand_eye.surface import LEVER_MM
 from armscan.calibration.sheets.board_points import BoardBow, dpose_dcamera
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, floats
 from armscan.geometry.estimate import FitFailure

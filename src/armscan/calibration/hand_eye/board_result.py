@@ -9,7 +9,7 @@ import numpy as np
 
 from armscan.calibration.hand_eye.board_looks import BoardLook, BoardPose, resized
 from armscan.calibration.hand_eye.checks import MOST_OPEN_MM
-from armscan.calibration.hand_eye.estimate import LEVER_MM, Conditioning
+from armscan.calibration.hand_eye.surface import LEVER_MM, Conditioning
 from armscan.errors import InputError
 from armscan.geometry.arrays import ArrayRecord, FloatArray, floats
 from armscan.geometry.estimate import FitFailure

@@ -35,7 +35,6 @@ from armscan.calibration.hand_eye.checks import (
     scatter_warnings,
 )
 from armscan.calibration.hand_eye.estimate import (
-    Conditioning,
     HandEyeSolution,
     JointCovariance,
     LeftOut,
@@ -78,6 +77,7 @@ from armscan.calibration.hand_eye.search import (
 )
 from armscan.calibration.hand_eye.surface import (
     N_HAND_EYE,
+    Conditioning,
     HandEyeState,
     PlateSurface,
     SphereSurface,

@@ -27,7 +27,6 @@ from armscan.calibration.hand_eye.alternatives import (
     plane_in_words,
 )
 from armscan.calibration.hand_eye.estimate import (
-    Conditioning,
     HandEyeSolution,
     LeftOut,
     Problem,
@@ -51,7 +50,7 @@ from armscan.calibration.hand_eye.search import (
     thinned,
     turn_between_rad,
 )
-from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface
+from armscan.calibration.hand_eye.surface import N_HAND_EYE, Conditioning, PlateSurface
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool

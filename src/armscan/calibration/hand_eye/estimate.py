@@ -27,12 +27,15 @@ from armscan.calibration.hand_eye.noise import (
 )
 from armscan.calibration.hand_eye.observations import CondensedObservations, HandEyeOptions
 from armscan.calibration.hand_eye.surface import (
+    LEVER_MM,
     N_HAND_EYE,
+    Conditioning,
     HandEyeState,
     Placed,
     PlateSurface,
     ReferenceSurface,
     SphereSurface,
+    conditioning_of,
     free_columns,
     place,
     smooth_along_stripes,
@@ -59,13 +62,10 @@ sigmas stated; the posterior's own spread, over which the covariance is integrat
 arm's scatter for twelve postures and 29 % for five (one over the root of twice the freedom). The
 limit is of the scatter, not of the hand-eye: where the sensor is weakly known, a hand-eye called
 settled was once half a sigma from where further rounds take it."""
-LEVER_MM = 100.0
-"""Turns are compared with shifts by what they move at this distance."""
-RANK_RATIO = 1e-4
-"""Singular values below this part of the largest are taken as zero: a posture that was meant to
-repeat another still turns by a hundredth of a degree."""
-NAMED_SHARE = 0.3
-"""Parts of the weakest combination above this are named."""
+PULL_STEPS, PULL_SETTLED = 12, 0.01
+"""Steps, and sigmas that are none, from the least sum of squares to where derivatives of points
+without errors are at right angles to the distances. That sum turns the points' errors out of the
+distances: nearly parallel postures were pulled by two sigmas. Where it leads nowhere, it stays."""
 FAR_SIGMAS = 3.0
 """Of the points' typical error by the sensor, which may lie that far from the reference."""
 ROBUST_ROUNDS = 10
@@ -404,14 +404,22 @@ def _solution(
     found = minimise_distances(problem, start, scatter + prior)
     if found is None:
         return None
-    placed = problem.place(found.state)
-    known = prior if found.state.sensor is None else prior + problem.sensor_covariance(placed)
-    linear = solve_linear(placed.residual_mm, problem.jacobian(placed), scatter + known)
-    if linear is None:
-        return None
+    state, n_steps = found.state, 0
+    while True:
+        placed = problem.place(state)
+        known = prior if state.sensor is None else prior + problem.sensor_covariance(placed)
+        linear = solve_linear(placed.residual_mm, problem.jacobian(placed), scatter + known)
+        if linear is None:
+            return None
+        step_sigmas = np.abs(linear.step) / np.sqrt(np.diag(linear.covariance))
+        if float(step_sigmas.max()) < PULL_SETTLED or n_steps == PULL_STEPS:
+            break
+        n_steps += 1
+        is_lost = n_steps == PULL_STEPS
+        state = found.state if is_lost else _stepped(problem, state, placed, linear)
     return HandEyeSolution(
         problem=problem,
-        state=found.state,
+        state=state,
         placed=placed,
         components=components,
         noise=noise,
@@ -419,6 +427,19 @@ def _solution(
         linear=linear,
         is_settled=found.is_settled,
     )
+
+
+def _stepped(
+    problem: Problem, state: HandEyeState, placed: Placed, linear: LinearSolution
+) -> HandEyeState:
+    """Where a linearised solution leads, the sensor's most likely error with it."""
+    whole = np.zeros(placed.jacobian.shape[1])
+    whole[problem.columns] = linear.step
+    moved, sensor = state.retract(whole), problem.observations.sensor_covariance
+    if moved.sensor is None or placed.by_sensor is None or sensor is None:
+        return moved
+    explained = linear.projected @ placed.residual_mm
+    return replace(moved, sensor=-sensor @ placed.by_sensor.T @ explained)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -610,39 +631,6 @@ def estimate_robustly(problem: Problem, start: HandEyeState) -> HandEyeSolution 
     return solution
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Conditioning:
-    """How well the hand-eye's six parameters are determined.
-
-    Parameters
-    ----------
-    singular_values
-        (6,) of the whitened system, largest first, in 1/mm: turns are scaled by what they move at
-        100 mm (`LEVER_MM`).
-    rank, condition
-        Of that system; the condition is infinite below rank 6.
-    weakest
-        The combination of parameters that is known least, in words.
-    """
-
-    singular_values: FloatArray
-    rank: int
-    condition: float
-    weakest: str
-
-    def under(self, covariance: FloatArray) -> Conditioning:
-        """With the least known combination by a covariance (6, 6) of the hand-eye.
-
-        The system is whitened by the likeliest scatter and knows no sensor that errs; what is
-        stated of a hand-eye is its covariance, and no parameter may be known worse than the worst
-        combination.
-        """
-        scale = np.array([LEVER_MM] * 3 + [1.0] * 3)
-        values, vectors = np.linalg.eigh(covariance * scale[:, None] * scale)
-        sigma_mm = float(np.sqrt(max(values[-1], 0.0)))
-        return replace(self, weakest=_weakest(vectors[:, -1], sigma_mm))
-
-
 def conditioning_at(
     problem: Problem, state: HandEyeState, sigmas: FloatArray | None = None
 ) -> Conditioning:
@@ -664,32 +652,3 @@ def conditioning_at(
         total = total_covariance(components, sigmas) + known
     whitened = Whitening(total)(problem.jacobian(placed))
     return conditioning_of(whitened[:, :N_HAND_EYE], whitened[:, N_HAND_EYE:])
-
-
-def conditioning_of(hand_eye: FloatArray, others: FloatArray) -> Conditioning:
-    """From whitened derivatives (M, 6) by the hand-eye and (M, K) by unknowns to eliminate."""
-    if others.shape[1]:
-        basis, _ = np.linalg.qr(others)
-        hand_eye = hand_eye - basis @ (basis.T @ hand_eye)
-    scaled = hand_eye / np.array([LEVER_MM] * 3 + [1.0] * 3)
-    values, vectors = np.linalg.eigh(scaled.T @ scaled)
-    singular = np.sqrt(np.maximum(values[::-1], 0.0))
-    rank = int((singular > RANK_RATIO * singular[0]).sum()) if singular[0] > 0.0 else 0
-    is_full = rank == N_HAND_EYE
-    condition = float(singular[0] / singular[-1]) if is_full else float("inf")
-    sigma_mm = 1.0 / float(singular[-1]) if is_full else float("inf")
-    return Conditioning(
-        singular_values=singular,
-        rank=rank,
-        condition=condition,
-        weakest=_weakest(vectors[:, 0], sigma_mm),
-    )
-
-
-def _weakest(direction: FloatArray, sigma_mm: float) -> str:
-    names = [f"turning about tool {axis}" for axis in "xyz"]
-    names += [f"shifting along tool {axis}" for axis in "xyz"]
-    order = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) >= NAMED_SHARE]
-    parts = [f"{names[k]} ({abs(direction[k]):.2f})" for k in order]
-    known = "not determined" if not np.isfinite(sigma_mm) else f"known to {sigma_mm:.3g} mm"
-    return f"{' with '.join(parts)}: {known}, turns counted at {LEVER_MM:.0f} mm"

@@ -47,11 +47,7 @@ from armscan.calibration.hand_eye.checks import (
     influence_warnings,
     refuse_hardly_determined,
 )
-from armscan.calibration.hand_eye.estimate import (
-    Conditioning,
-    LeftOut,
-    conditioning_of,
-)
+from armscan.calibration.hand_eye.estimate import LeftOut
 from armscan.calibration.hand_eye.noise import (
     NoiseComponent,
     NoiseEstimate,
@@ -64,6 +60,7 @@ from armscan.calibration.hand_eye.noise import (
 )
 from armscan.calibration.hand_eye.observations import HandEyeOptions, check_postures
 from armscan.calibration.hand_eye.result import FINITE_CONDITION
+from armscan.calibration.hand_eye.surface import Conditioning, conditioning_of
 from armscan.calibration.sheets.board_points import BoardBow
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import BoolArray, FloatArray

@@ -11,7 +11,6 @@ from scipy.special import chdtri
 
 from armscan.calibration.hand_eye.checks import CheckedFit
 from armscan.calibration.hand_eye.estimate import (
-    Conditioning,
     HandEyeSolution,
     JointCovariance,
     LeftOut,
@@ -26,7 +25,7 @@ from armscan.calibration.hand_eye.noise import (
     total_covariance,
 )
 from armscan.calibration.hand_eye.observations import CircleSection, PosedStripe
-from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface
+from armscan.calibration.hand_eye.surface import N_HAND_EYE, Conditioning, PlateSurface
 from armscan.errors import InputError
 from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, RowRecord, floats
 from armscan.geometry.estimate import FitFailure

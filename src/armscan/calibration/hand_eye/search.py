@@ -31,9 +31,10 @@ _PSI = 1.533751168755204288118041
 """Positive root of psi^4 = psi + 4."""
 N_ON_PLATE, N_ON_SPHERE = 240, 200
 """Rotations to start from; on a sphere each thrice, for the sides of the sheets."""
-N_STEPS_ON_PLATE = 88
-"""Of every start: where postures are nearly parallel, most of those that are best after a few steps
-are on their way down one long valley, and another minimum would be lost."""
+N_STEPS_ON_PLATE, N_APART, N_FURTHER = 88, 40, 200
+"""Steps of every start: where postures are nearly parallel, most of those that are best after a few
+are on their way down one long valley, and another minimum would be lost. And how many different
+ends go on by how many more, for some are in that valley still."""
 N_FIRST, N_LAST, N_GO_ON_SPHERE = 8, 40, 60
 """On a sphere: steps of every start, of the best of them, and how many these are."""
 N_DESCENT = 25
@@ -328,6 +329,8 @@ def minima_on_plate(
     scale = unit_steps(few.points_mm, 3)
     place = placed_on_plate(few.points_mm, normals, constants)
     rotations, shifts, cost = descend_all(place, rotations, shifts, N_STEPS_ON_PLATE, scale)
+    apart = distinct(rotations, cost, SAME_RAD, N_APART)
+    rotations, shifts, cost = descend_all(place, rotations[apart], shifts[apart], N_FURTHER, scale)
     kept = distinct(rotations, cost, SAME_RAD, N_MINIMA)
     return tuple(Pose(rotations[k], shifts[k]) for k in kept)
 

@@ -28,6 +28,15 @@ NOISE_OVER_SHIFT = 0.01
 """Of a stripe on a sphere: its noise over what arm and sensor shift it by; a direction in which it
 tells its own centre less well is left to the common one. Where the noise is the larger of both, the
 distances are nearly linear anyway."""
+LEVER_MM = 100.0
+"""Turns are compared with shifts by what they move at this distance."""
+RANK_RATIO = 1e-4
+"""Singular values below this part of the largest are taken as zero: a posture that was meant to
+repeat another still turns by a hundredth of a degree."""
+NAMED_SHARE = 0.3
+"""Parts of the weakest combination above this are named."""
+LEAST_BENT = 5
+"""Observations of a line of which a parabola leaves some for their errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,6 +318,8 @@ def place(
 def smooth_along_stripes(observations: CondensedObservations, values: FloatArray) -> FloatArray:
     """(M, F) values on a plate, each line's replaced by their parabola along it.
 
+    Fewer than five by their straight line.
+
     A distance's derivative holds the error of its point: with it, a large turn moves the points'
     errors out of the distances, as if the plate were the light sheet, in which all points lie
     whatever they err by. Along a line the derivatives of points without errors are smooth.
@@ -320,7 +331,8 @@ def smooth_along_stripes(observations: CondensedObservations, values: FloatArray
     starts, line = np.flatnonzero(is_first), np.cumsum(is_first) - 1
     along = np.linalg.norm(points - points[starts][line], axis=1)
     along /= np.maximum(np.maximum.reduceat(along, starts), 1e-12)[line]
-    basis = np.column_stack([np.ones(len(along)), along, along**2])
+    is_bent = (np.diff(starts, append=len(along)) >= LEAST_BENT)[line]
+    basis = np.column_stack([np.ones(len(along)), along, along**2 * is_bent])
     squares = np.add.reduceat(basis[:, :, None] * basis[:, None, :], starts)
     products = np.add.reduceat(basis[:, :, None] * values[:, None, :], starts)
     parabolas = np.linalg.pinv(squares, rcond=1e-10, hermitian=True) @ products
@@ -332,3 +344,65 @@ def free_columns(surface: ReferenceSurface, options: HandEyeOptions) -> IntArray
     last = N_HAND_EYE + len(surface.start)
     extra = [N_HAND_EYE + k for k in surface.free_parameters(options)]
     return np.array([*range(N_HAND_EYE), *extra, *[last] * options.solve_scale], dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Conditioning:
+    """How well the hand-eye's six parameters are determined.
+
+    Parameters
+    ----------
+    singular_values
+        (6,) of the whitened system, largest first, in 1/mm: turns are scaled by what they move at
+        100 mm (`LEVER_MM`).
+    rank, condition
+        Of that system; the condition is infinite below rank 6.
+    weakest
+        The combination of parameters that is known least, in words.
+    """
+
+    singular_values: FloatArray
+    rank: int
+    condition: float
+    weakest: str
+
+    def under(self, covariance: FloatArray) -> Conditioning:
+        """With the least known combination by a covariance (6, 6) of the hand-eye.
+
+        The system is whitened by the likeliest scatter and knows no sensor that errs; what is
+        stated of a hand-eye is its covariance, and no parameter may be known worse than the worst
+        combination.
+        """
+        scale = np.array([LEVER_MM] * 3 + [1.0] * 3)
+        values, vectors = np.linalg.eigh(covariance * scale[:, None] * scale)
+        sigma_mm = float(np.sqrt(max(values[-1], 0.0)))
+        return replace(self, weakest=_weakest(vectors[:, -1], sigma_mm))
+
+
+def conditioning_of(hand_eye: FloatArray, others: FloatArray) -> Conditioning:
+    """From whitened derivatives (M, 6) by the hand-eye and (M, K) by unknowns to eliminate."""
+    if others.shape[1]:
+        basis, _ = np.linalg.qr(others)
+        hand_eye = hand_eye - basis @ (basis.T @ hand_eye)
+    scaled = hand_eye / np.array([LEVER_MM] * 3 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    singular = np.sqrt(np.maximum(values[::-1], 0.0))
+    rank = int((singular > RANK_RATIO * singular[0]).sum()) if singular[0] > 0.0 else 0
+    is_full = rank == N_HAND_EYE
+    condition = float(singular[0] / singular[-1]) if is_full else float("inf")
+    sigma_mm = 1.0 / float(singular[-1]) if is_full else float("inf")
+    return Conditioning(
+        singular_values=singular,
+        rank=rank,
+        condition=condition,
+        weakest=_weakest(vectors[:, 0], sigma_mm),
+    )
+
+
+def _weakest(direction: FloatArray, sigma_mm: float) -> str:
+    names = [f"turning about tool {axis}" for axis in "xyz"]
+    names += [f"shifting along tool {axis}" for axis in "xyz"]
+    order = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) >= NAMED_SHARE]
+    parts = [f"{names[k]} ({abs(direction[k]):.2f})" for k in order]
+    known = "not determined" if not np.isfinite(sigma_mm) else f"known to {sigma_mm:.3g} mm"
+    return f"{' with '.join(parts)}: {known}, turns counted at {LEVER_MM:.0f} mm"

@@ -188,9 +188,9 @@ noise one in 16,000."""
 LINE_TOLERANCE_MM = 1.0
 """Half width of the band on the board in which points belong to one straight stripe, before robust
 statistics tighten it: lines of a fan lie further apart, bows and bent boards less."""
-LINE_TOLERANCE = 0.01
-"""The same as a part of the print's longer side, for boards of less than 100 mm: on them lines may
-lie a millimetre apart. It holds what `OUTLIER_SIGMA` lets pass."""
+LINE_TOLERANCE = 0.02
+"""The same as a part of the longer side of what is seen of the print, for boards of less than 50
+mm: on them lines may lie a millimetre apart. It holds what `OUTLIER_SIGMA` lets pass."""
 TOLERANCE_PX = 2.0
 """The least half width of this band, where a pixel is coarser."""
 TRIALS = 300

@@ -21,10 +21,10 @@ ELSEWHERE = Limits(5e-2, 0.1)
 figures of the smallest differences; a share of points, by one point of some hundred. On the newer
 model a bow of 2e-5 mm differs by 4.5 % of itself."""
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]?\d+)?")
-# The noise's rounds of a hand-eye end where no scatter changes by 2 %: on another machine than that
-# of golden/ values moved by up to 6e-5 of themselves.
 # Those of cameras and pairs were written on another maker's processor (k1 of 0.004 by 3e-6 of it).
-LIMITS = {name: Limits(1e-4, 1e-2) for name in ("hand-eye", "camera", "stereo")}
+LIMITS = {name: Limits(1e-4, 1e-2) for name in ("camera", "stereo")}
+WRITTEN_ELSEWHERE = {"hand-eye", "old"}
+"""Written anew on another maker's processor, where all differs by more."""
 # Its second recording repeats the first, so that the scatter is hardly determined: two ways of
 # running it on one machine moved its sigmas by 5 %. Why is not known.
 UNSETTLED = "hand-eye/several/"
@@ -51,7 +51,7 @@ def is_rounding(one: Difference) -> bool:
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_nothing_that_a_command_writes_has_changed(group: str, tmp_path: Path) -> None:
-    is_home = is_processor_of_golden()
+    is_home = is_processor_of_golden() and group not in WRITTEN_ELSEWHERE
     limits = LIMITS.get(group, Limits(1e-6, 1e-2)) if is_home else ELSEWHERE
     found = [one for one in compare_group(group, tmp_path, limits) if not one.is_warning]
     wrong = [str(one) for one in found if UNSETTLED not in str(one)]

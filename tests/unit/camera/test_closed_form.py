@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from armscan.calibration.cameras.start import (
+    _refine,
     constraint_rows,
     estimate_homography,
     intrinsics_from_homographies,
@@ -121,3 +122,12 @@ def test_closed_form_start_survives_real_distortion() -> None:
     matrix = intrinsics_from_homographies(good, 2048, 1536)
     assert not isinstance(matrix, FitFailure)
     assert abs(matrix[0, 0] / CAMERA.fx_px - 1.0) < 0.05
+
+
+def test_a_point_at_infinity_ends_the_refinement() -> None:
+    """A row of the board at no distance from the camera: LAPACK never came back from the step."""
+    board = np.stack(np.meshgrid(np.arange(-2.0, 3.0), np.arange(-2.0, 3.0)), -1).reshape(-1, 2)
+    at_infinity = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = _refine(at_infinity, board, board)
+    np.testing.assert_array_equal(found, at_infinity)

@@ -53,8 +53,9 @@ def estimate_homography(board_xy: FloatArray, image_xy: FloatArray) -> FloatArra
     board_norm, image_norm = _normaliser(board_xy), _normaliser(image_xy)
     board = map_points(board_norm, board_xy)
     image = map_points(image_norm, image_xy)
-    inner = _refine(_linear(board, image), board, image)
-    homography = np.linalg.inv(image_norm) @ inner @ board_norm
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        inner = _refine(_linear(board, image), board, image)
+        homography = np.linalg.inv(image_norm) @ inner @ board_norm
     depth = homography[2, :2] @ board_xy.mean(axis=0) + homography[2, 2]
     homography = homography / np.linalg.norm(homography) * (1.0 if depth > 0.0 else -1.0)
     if not np.isfinite(homography).all():
@@ -96,7 +97,11 @@ def _linear(board: FloatArray, image: FloatArray) -> FloatArray:
 
 
 def _refine(homography: FloatArray, board: FloatArray, image: FloatArray) -> FloatArray:
-    """Gauss-Newton on the image distances; the points are centred, so that h33 is not zero."""
+    """Gauss-Newton on the image distances; the points are centred, so that h33 is not zero.
+
+    Of points that no homography maps it may be, or a point may come to lie at infinity: no step
+    leads on from there (and LAPACK would never return from one).
+    """
     h = homography / homography[2, 2]
     rows = homogeneous(board)
     best: FloatArray = h
@@ -110,6 +115,8 @@ def _refine(homography: FloatArray, board: FloatArray, image: FloatArray) -> Flo
         jacobian[0::2, 6:] = -predicted[:, :1] * board / w
         jacobian[1::2, 6:] = -predicted[:, 1:] * board / w
         error = (image - predicted).reshape(-1)
+        if not (np.isfinite(jacobian).all() and np.isfinite(error).all()):
+            break
         step = np.linalg.lstsq(jacobian, error, rcond=None)[0]
         h = h + np.append(step, 0.0).reshape(3, 3)
         cost = float(np.sum((map_points(h, board) - image) ** 2))

@@ -404,7 +404,8 @@ def _solution(
     found = minimise_distances(problem, start, scatter + prior)
     if found is None:
         return None
-    state, n_steps = found.state, 0
+    is_plate = isinstance(problem.surface, PlateSurface)
+    state, n_steps = found.state, 0 if is_plate else PULL_STEPS
     while True:
         placed = problem.place(state)
         known = prior if state.sensor is None else prior + problem.sensor_covariance(placed)

@@ -123,6 +123,7 @@ class PlateRig:
     noise: RigNoise = field(default_factory=RigNoise)
     exposures_per_posture: int = 1
     points_per_stripe: int = 150
+    half_stripe_mm: float = STRIPE_MM
     bow_mm: float = 0.0
     form_mm: float = 0.0
     sheet_turn_rad: float = 0.0
@@ -173,14 +174,14 @@ class PlateRig:
         start = np.linalg.solve(
             np.stack([normal, sheet[:3], along]), [height, -sheet[3], along[2] * height / normal[2]]
         )
-        s = np.linspace(-STRIPE_MM, STRIPE_MM, self.points_per_stripe)
+        s = np.linspace(-1.0, 1.0, self.points_per_stripe) * self.half_stripe_mm
         points = start + s[:, None] * along
         if self.form_mm:
             flat, in_plate = points, np.cross(normal, along)
             for _ in range(4):
                 rise = self.rise_mm(points) / (in_plate @ sheet[:3])
                 points = flat + rise[:, None] * in_plate
-        bow = self.bow_mm * (s / STRIPE_MM) ** 2
+        bow = self.bow_mm * (s / self.half_stripe_mm) ** 2
         points = points + bow[:, None] * sheet[:3]
         points -= (bow * (normal @ sheet[:3]) / (normal @ across))[:, None] * across
         places = (points @ rotation.T + origin - PLATE_CENTRE) @ self.plate_axes[:2].T

@@ -2,8 +2,9 @@
 """The estimator of the hand-eye: generalised least squares in turn with the scatter's estimate.
 
 One for all reference surfaces: it minimises the distances of the condensed observations from the
-surface (eq. 2.76) under their covariance, tells how well the postures determine each parameter, and
-what changes without a posture.
+surface (eq. 2.76) under their covariance, on a plate without what the points' own errors pull
+(decision 27), tells how well the postures determine each parameter, and what changes without a
+posture.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ settled was once half a sigma from where further rounds take it."""
 PULL_STEPS, PULL_SETTLED = 12, 0.01
 """Steps, and sigmas that are none, from the least sum of squares to where derivatives of points
 without errors are at right angles to the distances. That sum turns the points' errors out of the
-distances: nearly parallel postures were pulled by two sigmas. Where it leads nowhere, it stays."""
+distances: nearly parallel postures were pulled by two sigmas. Where the steps come to no end, it
+stays, and is not settled."""
 FAR_SIGMAS = 3.0
 """Of the points' typical error by the sensor, which may lie that far from the reference."""
 ROBUST_ROUNDS = 10
@@ -163,7 +165,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandEyeSolution:
-    """A minimum with its noise model.
+    """Where the estimate came to rest, with its noise model.
 
     Parameters
     ----------
@@ -171,7 +173,7 @@ class HandEyeSolution:
         (M, M) covariance of the residuals by what errs alike in all postures: a probed plane and
         the sensor.
     linear
-        Linearised at the minimum, in the columns solved for.
+        Linearised there, in the columns solved for.
     is_settled
         False if the steps ran out: of the least squares, of the scatter's estimate, or of the
         rounds of both.
@@ -227,7 +229,7 @@ class HandEyeSolution:
 
     @property
     def chi2(self) -> float:
-        """Sum of squared whitened residuals."""
+        """Sum of squared whitened residuals, less what a step along the unknowns would take."""
         return float(self.placed.residual_mm @ self.explained)
 
     @property
@@ -352,11 +354,10 @@ def estimate(
         for is_solving in (is_solved_first, not is_solved_first):
             prior = problem.surface_covariance(placed)
             if is_solving:
-                total = total_covariance(components, sigmas) + prior
-                found = minimise_distances(problem, state, total)
-                if found is None:
+                rested = _rest(problem, state, total_covariance(components, sigmas), prior)
+                if rested is None:
                     return None
-                state, placed = found.state, problem.place(found.state)
+                state, placed = rested[0], problem.place(rested[0])
             elif hold_noise:
                 noise = NoiseEstimate(sigmas, np.zeros((len(sigmas), len(sigmas))))
             else:
@@ -401,23 +402,15 @@ def _solution(
 ) -> HandEyeSolution | None:
     scatter = total_covariance(components, noise.sigmas)
     prior = problem.surface_covariance(problem.place(start))
-    found = minimise_distances(problem, start, scatter + prior)
-    if found is None:
+    rested = _rest(problem, start, scatter, prior)
+    if rested is None:
         return None
-    is_plate = isinstance(problem.surface, PlateSurface)
-    state, n_steps = found.state, 0 if is_plate else PULL_STEPS
-    while True:
-        placed = problem.place(state)
-        known = prior if state.sensor is None else prior + problem.sensor_covariance(placed)
-        linear = solve_linear(placed.residual_mm, problem.jacobian(placed), scatter + known)
-        if linear is None:
-            return None
-        step_sigmas = np.abs(linear.step) / np.sqrt(np.diag(linear.covariance))
-        if float(step_sigmas.max()) < PULL_SETTLED or n_steps == PULL_STEPS:
-            break
-        n_steps += 1
-        is_lost = n_steps == PULL_STEPS
-        state = found.state if is_lost else _stepped(problem, state, placed, linear)
+    state, is_settled = rested
+    placed = problem.place(state)
+    known = prior if state.sensor is None else prior + problem.sensor_covariance(placed)
+    linear = solve_linear(placed.residual_mm, problem.jacobian(placed), scatter + known)
+    if linear is None:
+        return None
     return HandEyeSolution(
         problem=problem,
         state=state,
@@ -426,21 +419,63 @@ def _solution(
         noise=noise,
         known=known,
         linear=linear,
-        is_settled=found.is_settled,
+        is_settled=is_settled,
     )
 
 
+def _rest(
+    problem: Problem, start: HandEyeState, scatter: FloatArray, prior: FloatArray
+) -> tuple[HandEyeState, bool] | None:
+    """State that a scatter (M, M) and a known surface (M, M) lead to, and whether it is settled.
+
+    On a sphere it is the least sum of squares; on a plate where its derivatives are at right angles
+    to the distances (decision 27).
+    """
+    found = minimise_distances(problem, start, scatter + prior)
+    if found is None or not isinstance(problem.surface, PlateSurface):
+        return None if found is None else (found.state, found.is_settled)
+    state = _without_pull(problem, found.state, scatter, prior)
+    return (found.state, False) if state is None else (state, found.is_settled)
+
+
+def _without_pull(
+    problem: Problem, start: HandEyeState, scatter: FloatArray, prior: FloatArray
+) -> HandEyeState | None:
+    """Where steps by derivatives of points without errors lead; None if to no end.
+
+    Steps that turn back are damped by what they turn back by; undamped, some alternated for ever.
+    """
+    state, share = start, 1.0
+    last: FloatArray | None = None
+    weighed_last: FloatArray = np.zeros(0)
+    for _ in range(PULL_STEPS + 1):
+        placed = problem.place(state)
+        known = prior if state.sensor is None else prior + problem.sensor_covariance(placed)
+        linear = solve_linear(placed.residual_mm, problem.jacobian(placed), scatter + known)
+        if linear is None:
+            return None
+        weighed = np.asarray(np.linalg.solve(linear.covariance, linear.step))
+        if float(weighed @ linear.step) < PULL_SETTLED**2:
+            return state
+        if last is not None:
+            ratio = float(weighed @ last) / float(weighed_last @ last)
+            share = min(1.0, share / max(1.0 - ratio, share))
+        last, weighed_last = linear.step, weighed
+        state = _stepped(problem, state, placed, linear, share)
+    return None
+
+
 def _stepped(
-    problem: Problem, state: HandEyeState, placed: Placed, linear: LinearSolution
+    problem: Problem, state: HandEyeState, placed: Placed, linear: LinearSolution, share: float
 ) -> HandEyeState:
-    """Where a linearised solution leads, the sensor's most likely error with it."""
+    """A share of the way to a linearised solution, and to the sensor's most likely error."""
     whole = np.zeros(placed.jacobian.shape[1])
-    whole[problem.columns] = linear.step
+    whole[problem.columns] = share * linear.step
     moved, sensor = state.retract(whole), problem.observations.sensor_covariance
     if moved.sensor is None or placed.by_sensor is None or sensor is None:
         return moved
-    explained = linear.projected @ placed.residual_mm
-    return replace(moved, sensor=-sensor @ placed.by_sensor.T @ explained)
+    likeliest = -sensor @ placed.by_sensor.T @ (linear.projected @ placed.residual_mm)
+    return replace(moved, sensor=moved.sensor + share * (likeliest - moved.sensor))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

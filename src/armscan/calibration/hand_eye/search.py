@@ -202,7 +202,7 @@ def descend_all(
 def distinct(rotations: FloatArray, cost: FloatArray, apart_rad: float, count: int) -> IntArray:
     """Numbers of the ``count`` least costly of (K, 3, 3) rotations that differ from each other."""
     kept: list[int] = []
-    for k in np.argsort(cost):
+    for k in np.argsort(cost, kind="stable"):
         traces = np.einsum("nij,ij->n", rotations[kept], rotations[k])
         if (traces < 1.0 + 2.0 * np.cos(apart_rad)).all():
             kept.append(int(k))

@@ -318,7 +318,8 @@ def place(
 def smooth_along_stripes(observations: CondensedObservations, values: FloatArray) -> FloatArray:
     """(M, F) values on a plate, each line's replaced by their parabola along it.
 
-    Fewer than five by their straight line.
+    Fewer than five by their straight line. Observations of a line stand side by side, the first at
+    an end, as they are condensed.
 
     A distance's derivative holds the error of its point: with it, a large turn moves the points'
     errors out of the distances, as if the plate were the light sheet, in which all points lie

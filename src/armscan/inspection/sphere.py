@@ -32,9 +32,9 @@ from armscan.records.cloud import PointCloud
 
 LARGEST_MISFIT, MOST_MISFIT = 0.02, 0.1
 """Largest difference of fitted and nominal diameter, as a part of it, that may be the same ball;
-points that scatter so much that the search's band is wider add twice what it is wider by. A fit
-whose diameter is known that badly may differ by `MISFIT_SIGMAS` more, up to the second part: of any
-patch some ball's diameter is known to nothing."""
+points that scatter so much that the search's band is wider add twice what it is wider by. A
+diameter that is known badly may differ by the first part and `MISFIT_SIGMAS`, by the second part at
+most, and not where one sigma leads there: of any patch some ball's diameter is known to nothing."""
 MISFIT_SIGMAS = 3.0
 
 SETTLING_ROUNDS = 3
@@ -162,11 +162,13 @@ def _found(selection: Selection, diameter_mm: float) -> SphereInspection | FitFa
 
     A post or another ball of nearly that size may have more points in the band: places that turn
     out to be no ball are left out of the search in turn. Each is judged by all points about it:
-    what the search has left of a post may be as round as a ball.
+    what the search has left of a post may be as round as a ball. One that is of another size unless
+    its diameter is known badly is taken where no place has a ball of the size that was asked for.
     """
     rest, radius_mm = selection, diameter_mm / 2.0
     refused: list[FitFailure] = []
-    while len(refused) < PLACES and len(rest.rows) >= MIN_POINTS:
+    unsure: list[SphereInspection] = []
+    while len(refused) + len(unsure) < PLACES and len(rest.rows) >= MIN_POINTS:
         place = find_ball(rest.points_mm, radius_mm, rest.search_band_mm)
         if isinstance(place, FitFailure):
             refused.append(place)
@@ -176,12 +178,50 @@ def _found(selection: Selection, diameter_mm: float) -> SphereInspection | FitFa
             refused.append(_no_place(n_near, len(rest.rows), diameter_mm))
             break
         found = _settled(selection, ball, diameter_mm)
-        if isinstance(found, SphereInspection):
+        if isinstance(found, FitFailure):
+            refused.append(found)
+        elif _misfit_mm(found) <= _usual_misfit_mm(
+            selection.search_band_mm[np.isin(selection.rows, found.rows)], diameter_mm
+        ):
             return found
-        refused.append(found)
+        else:
+            unsure.append(found)
         is_away = np.abs(ball.distance_mm(rest.points_mm)) > rest.feature_mm
         rest = replace(rest, rows=rest.rows[is_away])
+    if unsure:
+        return min(unsure, key=lambda one: _misfit_mm(one) / one.diameter.sigma_mm)
     return refused[0]
+
+
+def _misfit_mm(found: SphereInspection) -> float:
+    return abs(found.diameter.value_mm - found.nominal_diameter_mm)
+
+
+def _usual_misfit_mm(band_mm: FloatArray, diameter_mm: float) -> float:
+    """Of a ball whose diameter is known well, whose points are sought in bands (N,)."""
+    return LARGEST_MISFIT * diameter_mm + 2.0 * (float(np.median(band_mm)) - SEARCH_BAND_MM)
+
+
+def _another_size(found: SphereInspection) -> FitFailure | None:
+    """Why a ball that is not of the usual size is none of the size that was asked for."""
+    diameter_mm, sigma_mm = found.nominal_diameter_mm, found.diameter.sigma_mm
+    least_mm, most_mm = LARGEST_MISFIT * diameter_mm, MOST_MISFIT * diameter_mm
+    # NaN, a sigma that nothing tells, is in none of these
+    is_open = MISFIT_SIGMAS * sigma_mm > most_mm - least_mm
+    allowed_mm = min(most_mm, least_mm + MISFIT_SIGMAS * sigma_mm)
+    if _misfit_mm(found) <= allowed_mm and sigma_mm <= most_mm - least_mm:
+        return None
+    lie = (
+        f"the points that a ball of {diameter_mm:g} mm could have lie on one of "
+        f"{found.diameter.value_mm:.4g} mm"
+    )
+    if not is_open:
+        return FitFailure(lie, "check the diameter, or show where the ball is with --region")
+    return FitFailure(
+        f"{lie}, whose diameter they tell to {sigma_mm:.2g} mm only",
+        "scan more of the ball, from more postures; else check the diameter, or show where the "
+        "ball is with --region",
+    )
 
 
 def _no_place(n_near: int, n_points: int, diameter_mm: float) -> FitFailure:
@@ -211,19 +251,12 @@ def _settled(
                 "check the diameter, or show where the ball is with --region",
             )
         sphere, is_fitted = fit
-        misfit = 2.0 * sphere.radius_mm - diameter_mm
-        wider_mm = float(np.median(band_mm[chosen])) - SEARCH_BAND_MM
-        most_mm = LARGEST_MISFIT * diameter_mm + 2.0 * wider_mm
-        if abs(misfit) > most_mm:
+        if abs(2.0 * sphere.radius_mm - diameter_mm) > _usual_misfit_mm(
+            band_mm[chosen], diameter_mm
+        ):
             described = _described(selection, chosen, is_fitted, sphere, diameter_mm)
-            known_mm = LARGEST_MISFIT * diameter_mm + MISFIT_SIGMAS * described.diameter.sigma_mm
-            most_mm = max(most_mm, min(known_mm, MOST_MISFIT * diameter_mm))
-        if abs(misfit) > most_mm:
-            return FitFailure(
-                f"the points that a ball of {diameter_mm:g} mm could have lie on one of "
-                f"{2.0 * sphere.radius_mm:.4g} mm",
-                "check the diameter, or show where the ball is with --region",
-            )
+            if (another := _another_size(described)) is not None:
+                return another
     near = np.abs(sphere.distance_mm(points[is_feature])) <= band_mm[is_feature]
     middle_mm = float(np.median(band_mm[is_feature]))
     if float(near.mean()) < least_concentration(middle_mm, feature_mm):

@@ -304,6 +304,39 @@ def test_a_small_cap_of_a_ball_is_no_other_ball() -> None:
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.3
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_cap_of_another_ball_with_more_points_hides_none(seed: int) -> None:
+    """30 degrees of a 20 mm ball, 2.5 times the points, beside 60 of one of 19 mm: it is one of
+    19 mm within the three sigmas that a cap's diameter is known to, and was measured in 7 of 10.
+    """
+    rng = np.random.default_rng(seed)
+    cap, whole = ball_stripes(50, 60, 30.0) * 10.0, ball_stripes(20, 60, 60.0) * 9.5 + CENTRE
+    points = np.concatenate([cap, whole])
+    exposure = np.concatenate(
+        [np.arange(len(cap)) * 8 // len(cap), np.arange(len(whole)) * 8 // len(whole) + 8]
+    )
+    thrown = points + rng.normal(0.0, 0.005, points.shape)
+    thrown += rng.normal(0.0, 0.03, (16, 3))[exposure]
+    found = inspected(inspect_sphere(cloud_of(thrown, exposure, sigma_mm=0.03), 19.0))
+    assert np.linalg.norm(found.sphere.centre_mm - CENTRE) < 1.0
+
+
+@pytest.mark.parametrize("half_opening", [15.0, 25.0])
+def test_a_cap_of_a_much_larger_ball_is_refused_with_what_its_points_tell(
+    half_opening: float,
+) -> None:
+    """24.7 mm where 19 are asked for: a tenth at most, however badly a cap's diameter is known."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        cap = CENTRE + ball_stripes(20, 60, half_opening) * 12.35
+        exposure = np.arange(len(cap)) * 8 // len(cap)
+        thrown = cap + rng.normal(0.0, 0.08, (8, 3))[exposure]
+        found = inspect_sphere(cloud_of(thrown, exposure, sigma_mm=0.08), 19.0)
+        assert isinstance(found, FitFailure)
+        assert "whose diameter they tell to" in found.reason
+        assert "scan more of the ball" in found.remedy
+
+
 def test_points_that_scatter_too_much_are_not_called_another_diameter() -> None:
     """Shifts of 1 mm within a band of 1 mm: refused for the scatter, with the band that it takes.
 

@@ -84,8 +84,7 @@ def possible_sheets(
         (H,) indices, ordered by sheet.
     """
     sheets = sheet_numbers(sensor)
-    low, high = np.array([depths.limits_mm(one) for one in sensor.sheets]).T
-    limits = np.array([low.min(), high.max()]) * [1.0 - BOW_DEPTH_SHARE, 1.0 + BOW_DEPTH_SHARE]
+    limits = np.array(depths.of_all_mm(sensor)) * [1.0 - BOW_DEPTH_SHARE, 1.0 + BOW_DEPTH_SHARE]
     limits = np.tile(limits, (len(sheets), 1))
     point, sheet = np.zeros((2, len(points_px) * len(sheets)), np.int64)
     pixels = np.ascontiguousarray(points_px)

@@ -485,7 +485,9 @@ class _Hypotheses:
             is_lit = np.isin(sheet, lit)
             at, sheet = at[is_lit], sheet[is_lit]
         projected = project_on_sheets(pixels[at], sheet, sensor)
-        kept = projected.is_met & depths.holds(projected.points_mm, sheet, sensor)
+        low, high = depths.of_all_mm(sensor)
+        depth = projected.points_mm[:, 2]
+        kept = projected.is_met & (depth >= low) & (depth <= high)
         at, projected = at[kept], projected.select(kept)
         right, own = sides[1], row[at]
         stripes = RightStripes.of(right.profile)

@@ -72,6 +72,11 @@ class DepthRange:
         slack = self.margin * (high - low)
         return max(low - slack, 0.0), high + slack
 
+    def of_all_mm(self, sensor: SensorCalibration) -> tuple[float, float]:
+        """Smallest and largest Z that any sheet of a sensor accepts."""
+        low, high = np.array([self.limits_mm(one) for one in sensor.sheets]).T
+        return float(low.min()), float(high.max())
+
     def holds(
         self, points_mm: FloatArray, sheet: IntArray | int, sensor: SensorCalibration
     ) -> BoolArray:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -187,7 +189,9 @@ def test_sheets_are_chosen_by_the_sum_of_scores() -> None:
 
 
 def test_possible_sheets_are_those_whose_planes_are_met_in_depth() -> None:
-    sensor = StereoHead.thesis().calibration()
+    head = StereoHead.thesis().calibration()
+    narrow = replace(head.sheets[4], depth_range_mm=(139.0, 141.0))
+    sensor = replace(head, sheets=(*head.sheets[:4], narrow, *head.sheets[5:]))
     pixels = np.random.default_rng(7).uniform([800.0, 500.0], [2200.0, 1600.0], (300, 2))
     point, sheet = possible_sheets(pixels, sensor, LABEL_DEPTHS)
     xy, _ = sensor.camera.camera.undistort(pixels)
@@ -196,7 +200,7 @@ def test_possible_sheets_are_those_whose_planes_are_met_in_depth() -> None:
     for k, one in enumerate(sensor.sheets):
         plane = one.sheet.plane
         depth = -plane[3] / (rays @ plane[:3])
-        low, high = LABEL_DEPTHS.limits_mm(one)
+        low, high = LABEL_DEPTHS.limits_mm(head.sheets[0])
         inside = (depth >= 0.97 * low) & (depth <= 1.03 * high)
         expected += [(int(i), k) for i in np.flatnonzero(inside)]
     assert list(zip(point.tolist(), sheet.tolist(), strict=True)) == expected

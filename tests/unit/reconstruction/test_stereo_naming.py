@@ -108,6 +108,23 @@ def test_a_plate_nearer_than_all_sheets_were_calibrated_has_no_wrong_names() -> 
     assert points.points_mm[:, 2].min() > 143.5
 
 
+def test_a_sheet_that_was_calibrated_in_few_depths_is_looked_for_in_those_of_all() -> None:
+    """One of eleven at 152 to 154 mm, the others at 118 to 162, and a plate before its depths."""
+    rng = np.random.default_rng([5, KINDS.index("plate")])
+    drawn = head().drawn_calibration(rng)
+    narrow = 5
+    sheets = [replace(one, depth_range_mm=(118.0, 162.0)) for one in drawn.sheets]
+    sheets[narrow] = replace(sheets[narrow], depth_range_mm=(152.0, 154.0))
+    sensor = replace(drawn, sheets=tuple(sheets))
+    left, right = expose(head(), draw_surfaces("plate", rng), QUIET, rng)
+    labels = labeller_for(sensor, MeasureOptions()).label([left.profile, right.profile])
+    named = labels.profiles[0].sheet
+    assert n_wrong(named, left) == 0
+    own = (left.sheet == narrow) & left.is_shared
+    assert own.sum() > 500
+    assert (named[own] == narrow).mean() > LEAST_NAMED
+
+
 def test_a_line_that_goes_on_as_the_next_one_behind_an_edge_does_not_take_its_name() -> None:
     """Rendered: line 8 on the floor goes on as line 7 on a block, with a step of 0.2 px.
 

@@ -46,6 +46,7 @@ from armscan.calibration.cameras.robust import (
 )
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import robust_sigma
 from armscan.models.camera import PARAMETER_NAMES, TANGENTIAL, CameraModel
 
 NO_SHARED = np.zeros((11, 0))
@@ -182,12 +183,13 @@ class ChosenModel:
 
 WIDE = 0.6
 """Ideal radius X/Z up to which a fisheye's terms do what a pinhole's do."""
-LENS_CHANCE, CLEAR_CHANCE, CLEAR_FALL = 0.003, 0.03, 1.1
+LENS_CHANCE, CLEAR_CHANCE, CLEAR_FALL, CLIPPED_FALL = 0.003, 0.03, 1.1, 3.0
 """A fisheye takes a pinhole's place if chance makes unseen views' residuals fall as they do in no
 more than this part of cases, by Student's t of their logarithms over the views; in the second part
 where they fall by the third factor or more. Less than that is a doubt. Pinholes of seven and ten
 views that were taken for fisheyes fell by factors of 1.002 and 1.013, by 2.6 and 3.4 standard
-errors; fisheyes mostly fall by more than 2."""
+errors; fisheyes mostly fall by more than 2. The chances are nominal: views of one fold share what
+the others told. A view counts up to the last number of robust sigmas beyond the middle one."""
 
 
 def choose_lens(
@@ -210,19 +212,22 @@ def choose_lens(
         return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, TANGENTIAL)
     both = replace(fisheye, weights=fisheye.weights * pinhole.solution.weights)
     fall, chance = _fall_of_residuals(validate(pinhole.solution, both), validate(both, both))
-    if not fall > 0.0:
+    if fall <= 0.0:
         return pinhole
     factor = float(np.exp(fall))
     if not chance < (CLEAR_CHANCE if factor > CLEAR_FALL else LENS_CHANCE):
-        doubt = (
-            "the lens is wide, and unseen views do not tell this pinhole from a fisheye, which "
-            f"predicts them {factor:.3f} times as well: where no target points lie the two may "
-            "differ by many pixels; compare "
-            "--distortion fisheye, and do not measure outside the covered part"
-        )
-        return replace(pinhole, doubt=doubt)
+        return replace(pinhole, doubt=_doubt(factor))
     reason = f"fisheye: unseen views are predicted {factor:.2f} times as well as by a pinhole"
     return ChosenModel("fisheye", fisheye, validate(fisheye, fisheye), reason, TANGENTIAL)
+
+
+def _doubt(factor: float) -> str:
+    better = f", which predicts them {factor:.3f} times as well" if np.isfinite(factor) else ""
+    return (
+        f"the lens is wide, and unseen views do not tell this pinhole from a fisheye{better}: "
+        "where no target points lie the two may differ by many pixels; compare "
+        "--distortion fisheye, and do not measure outside the covered part"
+    )
 
 
 def _is_wide(solution: Solution) -> bool:
@@ -237,11 +242,16 @@ def _fall_of_residuals(
 ) -> tuple[float, float]:
     """Mean over views of the fall of held-out residuals' logarithms; how likely it is by chance.
 
-    Of logarithms, for one view that a pinhole cannot describe would hide in its own scatter.
+    Of logarithms, for one view that a pinhole cannot describe would hide in its own scatter. NaN
+    and 1 where the views are too few for a hold-out test.
     """
     if pinhole is None or fisheye is None:
-        return 0.0, 1.0
+        return np.nan, 1.0
     fall = np.log(pinhole.view_rms_px) - np.log(fisheye.view_rms_px)
+    middle = float(np.median(fall))
+    spread = robust_sigma(fall - middle)
+    # a view that the fisheye alone describes would speak against it by its own scatter
+    fall = np.minimum(fall, middle + CLIPPED_FALL * spread)
     error = max(float(np.std(fall, ddof=1)) / np.sqrt(len(fall)), 1e-300)
     return float(np.mean(fall)), float(stdtr(len(fall) - 1, -np.mean(fall) / error))
 

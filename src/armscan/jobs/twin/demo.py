@@ -199,7 +199,7 @@ class _Run:
         self.place("").mkdir()
         record_touches(self.place("probing"), self.twin)
         is_single = len(self.twin.truth.sheet_points_mm) == 1
-        unused = ("mesh_search", "naming") if is_single else ("mesh_search",)
+        unused = ("mesh_search", "naming", "fusing") if is_single else ("mesh_search",)
         coming = recorded_scenes(
             {scene: self.place(scene) for scene in scenes},
             self.request.twin,

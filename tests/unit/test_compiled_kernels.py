@@ -18,6 +18,7 @@ import pytest
 
 from armscan.cli.run import VARIABLE, give_kernels_a_folder
 from armscan.jobs.live.doctor import kernel_modules
+from armscan.jobs.twin.demo import UNUSED, UNUSED_BY_ONE_LINE
 from armscan.kernels import arrays
 from armscan.kernels.arrays import load_kernels
 
@@ -176,10 +177,18 @@ def test_a_kernel_is_loaded_when_it_is_first_asked_for(
     assert [len(one.overloads) for one in kernels] == [1, 1, 0]
     with pytest.raises(TypeError):
         module.mean(np.zeros((2, 2)))
-    assert load_kernels(without=("kernels_of_a_test",)) == {}
-    assert len(module.unused.overloads) == 0
+    for left in ("kernels_of_a_test", "kernels_of_a_test.unused"):
+        assert load_kernels(without=(left,)) == {}
+        assert len(module.unused.overloads) == 0
     assert load_kernels() == {}
     assert len(module.unused.overloads) == 1
+
+
+def test_what_a_demo_leaves_uncompiled_is_there() -> None:
+    for name in (*UNUSED, *UNUSED_BY_ONE_LINE):
+        module, _, kernel = name.partition(".")
+        found = importlib.import_module(f"armscan.kernels.{module}")
+        assert not kernel or callable(getattr(found, kernel))
 
 
 def test_a_kernel_that_fails_is_named_and_the_others_are_loaded(

@@ -127,12 +127,13 @@ _WAITING: dict[str, Callable[[], Any]] = {}
 def load_kernels(*, without: Collection[str] = ()) -> dict[str, Exception]:
     """Load, or compile, all kernels imported so far, for work that must not wait for them later.
 
-    Those of the modules ``without`` are left, but what another kernel calls. Returns why a kernel
-    failed, by its name; it fails again when it is called.
+    Modules and kernels (``chains.best_states``) of ``without`` are left, but what another kernel
+    calls. Returns why a kernel failed, by its name; it fails again when it is called.
     """
     failures = {}
     for name, load in list(_WAITING.items()):
-        if name.split(".")[-2] in without:
+        module, kernel = name.split(".")[-2:]
+        if module in without or f"{module}.{kernel}" in without:
             continue
         try:
             load()

@@ -89,6 +89,26 @@ SCANS: tuple[TwinScene, ...] = ("plate", "ball", "steps", "part")
 PHOTO_SCENES: tuple[TwinScene, ...] = ("camera", "laser", "still-part")
 STILL_HEIGHT_MM, STEREO_STILL_HEIGHT_MM = 20.0, 5.0
 """Block of the scene ``still-step``: figures 5.19 and 5.33."""
+UNUSED = ("mesh_search",)
+"""Modules of kernels, and kernels, that no command of a demo calls, so that the first one need not
+wait for them. What is left out though it is needed is compiled when it is called."""
+UNUSED_BY_ONE_LINE = (
+    "naming",
+    "fusing",
+    "chains.best_states",
+    "chains.compare_light",
+    "chains.cut_at_largest",
+    "chains.sum_windows",
+    "grids.add_heights",
+    "grids.principal_axes",
+    "grids.voxel_values",
+    "placing.propagate_points",
+    "rays.sheet_gradients",
+    "target_edges.fit_crossings",
+    "target_edges.crossing_sums",
+    "target_edges.row_product",
+    "target_edges.invert_scaled",
+)
 STILL_MARGIN = 0.3
 """The block fills the view, and its lower face lies up to 13 mm beyond the 55 mm of depth in which
 the crossed lines are calibrated."""
@@ -199,7 +219,7 @@ class _Run:
         self.place("").mkdir()
         record_touches(self.place("probing"), self.twin)
         is_single = len(self.twin.truth.sheet_points_mm) == 1
-        unused = ("mesh_search", "naming", "fusing") if is_single else ("mesh_search",)
+        unused = (*UNUSED, *UNUSED_BY_ONE_LINE) if is_single else UNUSED
         coming = recorded_scenes(
             {scene: self.place(scene) for scene in scenes},
             self.request.twin,

@@ -162,8 +162,8 @@ def _found(selection: Selection, diameter_mm: float) -> SphereInspection | FitFa
 
     A post or another ball of nearly that size may have more points in the band: places that turn
     out to be no ball are left out of the search in turn. Each is judged by all points about it:
-    what the search has left of a post may be as round as a ball. One that is of another size unless
-    its diameter is known badly is taken where no place has a ball of the size that was asked for.
+    what the search has left of a post may be as round as a ball. One whose diameter is known badly
+    is taken where no place has one that is known to be of the size that was asked for.
     """
     rest, radius_mm = selection, diameter_mm / 2.0
     refused: list[FitFailure] = []
@@ -180,17 +180,29 @@ def _found(selection: Selection, diameter_mm: float) -> SphereInspection | FitFa
         found = _settled(selection, ball, diameter_mm)
         if isinstance(found, FitFailure):
             refused.append(found)
-        elif _misfit_mm(found) <= _usual_misfit_mm(
-            selection.search_band_mm[np.isin(selection.rows, found.rows)], diameter_mm
-        ):
+        elif _is_sure(selection, found):
             return found
         else:
             unsure.append(found)
         is_away = np.abs(ball.distance_mm(rest.points_mm)) > rest.feature_mm
         rest = replace(rest, rows=rest.rows[is_away])
     if unsure:
-        return min(unsure, key=lambda one: _misfit_mm(one) / one.diameter.sigma_mm)
+        return min(unsure, key=_unlikely)
     return refused[0]
+
+
+def _is_sure(selection: Selection, found: SphereInspection) -> bool:
+    """Whether the diameter is the one asked for, and is known so well that it could be no other."""
+    band_mm = selection.search_band_mm[np.isin(selection.rows, found.rows)]
+    usual_mm = _usual_misfit_mm(band_mm, found.nominal_diameter_mm)
+    # of a single exposure sigma is NaN
+    return _misfit_mm(found) <= usual_mm and not found.diameter.sigma_mm > usual_mm
+
+
+def _unlikely(found: SphereInspection) -> float:
+    """Twice the negative log-likelihood of a ball of the diameter asked for."""
+    sigma_mm = found.diameter.sigma_mm
+    return (_misfit_mm(found) / sigma_mm) ** 2 + 2.0 * math.log(sigma_mm)
 
 
 def _misfit_mm(found: SphereInspection) -> float:

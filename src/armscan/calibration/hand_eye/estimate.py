@@ -68,6 +68,8 @@ PULL_STEPS, PULL_SETTLED = 12, 0.01
 without errors are at right angles to the distances. That sum turns the points' errors out of the
 distances: nearly parallel postures were pulled by two sigmas. Where the steps come to no end, it
 stays, and is not settled."""
+MOST_SHARE = 4.0
+"""Of a step, where the one before was as far and went the same way."""
 FAR_SIGMAS = 3.0
 """Of the points' typical error by the sensor, which may lie that far from the reference."""
 ROBUST_ROUNDS = 10
@@ -266,7 +268,8 @@ class HandEyeSolution:
         """Standard deviation of the logarithm of `arm_mm`; 0 where the scatters were given."""
         share = self._arm_variances_mm2
         share = share / max(float(share.sum()), 1e-300)
-        return float(np.sqrt(share @ self.noise.log_covariance[:2, :2] @ share))
+        # rounding may leave less than nothing where the scatter has run off
+        return float(np.sqrt(max(float(share @ self.noise.log_covariance[:2, :2] @ share), 0.0)))
 
     @property
     def _arm_variances_mm2(self) -> FloatArray:
@@ -443,7 +446,8 @@ def _without_pull(
 ) -> HandEyeState | None:
     """Where steps by derivatives of points without errors lead; None if to no end.
 
-    Steps that turn back are damped by what they turn back by; undamped, some alternated for ever.
+    Steps that turn back are damped by what they turn back by, those that go on alike lengthened;
+    undamped, some alternated for ever.
     """
     state, share = start, 1.0
     last: FloatArray | None = None
@@ -458,8 +462,8 @@ def _without_pull(
         if float(weighed @ linear.step) < PULL_SETTLED**2:
             return state
         if last is not None:
-            ratio = float(weighed @ last) / float(weighed_last @ last)
-            share = min(1.0, share / max(1.0 - ratio, share))
+            ratio = float(weighed_last @ linear.step) / float(weighed_last @ last)
+            share = min(MOST_SHARE, share / max(1.0 - ratio, share / MOST_SHARE))
         last, weighed_last = linear.step, weighed
         state = _stepped(problem, state, placed, linear, share)
     return None
